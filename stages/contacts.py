@@ -7,8 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.absent import absent
-from tacpipe.channels.streams import COUNT, axes_of, unit_of
+from tacpipe.channels.streams import COUNT, absent, axes_of, unit_of
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
 from tacpipe.plugins.params import added

@@ -106,7 +106,7 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
-    from tacpipe.signals.contact_moment import Limits, contact_row, settled_rows
+    from tacpipe.signals.contact import Limits, contact_row, settled_rows
 
     fields = biotac_sp.fields()
     missing = [field.name for field in fields if field.name not in stream.column_names]

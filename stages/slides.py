@@ -108,7 +108,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     Example: tacpipe segment slides data/touched -o data/slides
     """
     from tacpipe.channels import arm
-    from tacpipe.channels.finger import finger, without_spikes
+    from tacpipe.channels.streams import finger, without_spikes
     from tacpipe.datasets.streams import streams_of
     from tacpipe.signals import slides as found
 
@@ -154,7 +154,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
     import numpy as np
 
     from tacpipe.channels import arm
-    from tacpipe.channels.finger import without_spikes
+    from tacpipe.channels.streams import without_spikes
     from tacpipe.signals import slides as found
     from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load_in_blocks, noise_thresholds
 

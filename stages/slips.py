@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.channels.absent import absent, entry
-from tacpipe.channels.pose import METRES
-from tacpipe.channels.streams import COUNT, of_quantity, unit_of
+from tacpipe.channels.arm import METRES
+from tacpipe.channels.streams import COUNT, absent, entry, of_quantity, unit_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.stage import stage

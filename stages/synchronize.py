@@ -92,14 +92,15 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.channels import masks
+    from tacpipe.channels import streams as masks
     from tacpipe.io.columns import release
     from tacpipe.io.mapped import MappedArrays
-    from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
+    from tacpipe.signals.repairs import fresh_rate_hz, mean_rate_hz
     from tacpipe.signals.resampling import default_gap_ns
-    from tacpipe.synchronization import grids, streams
+    from tacpipe.synchronization import streams
+    from tacpipe.synchronization import streams as grids
     from tacpipe.synchronization.columns import look_ahead_ns
-    from tacpipe.synchronization.methods import listed
+    from tacpipe.synchronization.streams import listed
 
     every = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     found = {name: columns for name, columns in every.items() if streams.is_signal(columns)} or every
@@ -112,7 +113,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     wanted = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in found.items()}
     master = placed[grids.master(recording.name, wanted, schemas)]
-    grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, held=hold_values)
+    grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, hold_values=hold_values)
     columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if left := [name for name in every if name not in found]:
@@ -134,7 +135,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
                 ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
             attributes[f"{name}{masks.GAP_MS}"] = gap_ns / 1e6
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
-            attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.held), 3)
+            attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.repeated), 3)
             attributes |= stream.attributes
         stream.columns.forget()
         if not storage.in_memory:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pyarrow as pa
 import pytest
 
-from tacpipe.channels import absent, components, pose
+from tacpipe.channels import arm as pose
+from tacpipe.channels import streams as absent
 from tacpipe.errors import TacpipeError, UsageError
 
 
@@ -30,17 +31,17 @@ def arm(stream: str, names: str = "xyz", unit: str = "m") -> list[pa.Field]:
     ],
 )
 def test_the_component_of_a_column_follows_from_its_name(name: str, part: str) -> None:
-    assert components.component(field(name, "position")) == part
+    assert pose.component(field(name, "position")) == part
 
 
 def test_metadata_states_the_component_before_the_name_does() -> None:
-    assert components.component(field("up_x", "position", component="z")) == "z"
-    assert components.component(field("taxel_x", "tactile", axis="Y")) == "y"
+    assert pose.component(field("up_x", "position", component="z")) == "z"
+    assert pose.component(field("taxel_x", "tactile", axis="Y")) == "y"
 
 
 def test_the_components_of_one_quaternion_share_a_name_and_those_of_two_do_not() -> None:
-    hand = {components.shared_name(field(f"hand_q{part}", "orientation")) for part in "xyzw"}
-    cup = {components.shared_name(field(f"cup_orientation_{part}", "orientation", component=part)) for part in "xyzw"}
+    hand = {pose.shared_name(field(f"hand_q{part}", "orientation")) for part in "xyzw"}
+    cup = {pose.shared_name(field(f"cup_orientation_{part}", "orientation", component=part)) for part in "xyzw"}
     assert len(hand) == len(cup) == 1 and hand != cup
 
 

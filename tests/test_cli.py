@@ -36,7 +36,7 @@ def test_what_people_type_is_understood_and_not_listed(lab: Lab, alias: str, com
     [
         ("polish", 2, "polish"),
         ("scale", 2, "Missing argument 'datasets'"),
-        ("scale nowhere -o x", 2, "nowhere is empty or not there"),
+        ("scale nowhere -o x", 2, "nowhere does not exist or is empty"),
         ("scale . -o x", 2, "has no manifest.json"),
         ("scale data/r -o x --factor many", 2, "--factor is 'many'; it must be a whole number."),
         ("scale data/r -o x --set factor=1.5", 2, "whole number"),

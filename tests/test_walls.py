@@ -32,7 +32,7 @@ def calls(tree: ast.AST, module: str) -> list[str]:
 
 def test_a_run_settles_its_output_in_one_call() -> None:
     (tree,) = (tree for name, tree in modules("engine") if name == "engine/pipeline.py")
-    assert calls(tree, "output") == ["shown", "settle"]  # the first changes nothing
+    assert calls(tree, "output") == ["existing_answer", "settle"]  # the first changes nothing
     assert calls(tree, "directory") == []
 
 

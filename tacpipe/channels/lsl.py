@@ -16,7 +16,7 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, plain
 
-FORMATS = {  # as LSL names them, and as numpy does; LSL has no unsigned ones
+FORMATS = {  # numpy types by LSL's names; LSL has no unsigned types
     "float32": "float32",
     "double64": "float64",
     "int8": "int8",
@@ -25,13 +25,13 @@ FORMATS = {  # as LSL names them, and as numpy does; LSL has no unsigned ones
     "int64": "int64",
     "string": "text",
 }
-UNITS = {  # as LSL's own recommendations write them
+UNITS = {  # units by the names of LSL's recommendations
     "microvolts": "uV", "millivolts": "mV", "volts": "V", "newtons": "N", "newton": "N", "meters": "m", "millimeters": "mm",
     "metres": "m", "degrees": "deg", "radians": "rad", "celsius": "degC", "seconds": "s", "milliseconds": "ms",
     "microtesla": "uT", "pascals": "Pa", "pascal": "Pa", "counts": "count", "normalized": "1", "none": "1",
     "meters/second": "m/s", "degrees/second": "deg/s", "radians/second": "rad/s", "meters/second^2": "m/s^2",
 }  # fmt: skip
-QUANTITIES = {  # of the type of a channel, or of a stream whose channels have none
+QUANTITIES = {  # quantities by the type of a channel, or of a stream whose channels have no type
     "tactile": "tactile", "touch": "tactile", "taxel": "tactile", "pressure": "tactile", "skin": "tactile",
     "force": "force", "torque": "torque", "moment": "torque", "position": "position", "orientation": "orientation",
     "velocity": "velocity", "acceleration": "acceleration", "accelerometer": "acceleration", "acc": "acceleration",
@@ -41,10 +41,10 @@ QUANTITIES = {  # of the type of a channel, or of a stream whose channels have n
     "eeg": "voltage", "emg": "voltage", "voltage": "voltage", "markers": "text", "current": "current",
 }  # fmt: skip
 COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
-LATEST_S = 9e9  # that nanoseconds in 64 bits hold
+LATEST_S = 9e9  # latest time that nanoseconds in 64 bits hold
 TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
 MOST_CHANNELS = 1 << 16
-MOST_BYTES = 1 << 24  # of a description
+MOST_BYTES = 1 << 24  # largest size of a description
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,22 @@ class Channel:
     quantity: str = ""
     component: str = ""
     taxel: str = ""  # number of a tactile channel in its array, from its label
-    axis: str = ""  # of a tactile channel
+    axis: str = ""  # axis of a tactile channel
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What a field of this channel states, without what is not known."""
-        found = {key: getattr(self, key) for key in ("unit", "quantity", "component", "taxel", "axis")}
-        return {key: value for key, value in found.items() if value}
+        """The field metadata of this channel, without unknown values."""
+        values = {key: getattr(self, key) for key in ("unit", "quantity", "component", "taxel", "axis")}
+        return {key: value for key, value in values.items() if value}
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a stream states of itself."""
+    """The description that a stream states."""
 
     name: str
     kind: str  # its type, as "EEG" or "Markers"
-    format: str  # of `FORMATS`
+    format: str  # key of `FORMATS`
     rate_hz: float  # 0: irregular
     channels: tuple[Channel, ...]
     source_id: str = ""
@@ -80,7 +80,7 @@ class Description:
 
     @property
     def is_text(self) -> bool:
-        """Whether samples are texts: a stream of markers."""
+        """True for a stream of markers, whose samples are texts."""
         return self.format == "string"
 
     @property
@@ -113,45 +113,45 @@ def parse(text: str | bytes) -> Description:
         rate_hz = -1.0
     if not 0 <= rate_hz < 1e9:
         raise TacpipeError(f"its nominal_srate is {excerpt(rate)}, not a rate in hertz")
-    found = {name: root.findtext(name, "").strip() for name in ("name", "type", "source_id", "uid", "hostname")}
-    channels = _channels(root.findall("desc/channels/channel"), int(count), found["type"], text=form == "string")
+    texts = {name: root.findtext(name, "").strip() for name in ("name", "type", "source_id", "uid", "hostname")}
+    channels = _channels(root.findall("desc/channels/channel"), int(count), texts["type"], text=form == "string")
     return Description(
-        found["name"], found["type"], form, rate_hz, channels, found["source_id"], found["uid"], found["hostname"]
+        texts["name"], texts["type"], form, rate_hz, channels, texts["source_id"], texts["uid"], texts["hostname"]
     )
 
 
 def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[Channel, ...]:
     """Return ``count`` channels: as described where there are as many descriptions, or else numbered."""
-    labels = [one.findtext("label", "").strip() for one in described] if len(described) == count else []
+    labels = [element.findtext("label", "").strip() for element in described] if len(described) == count else []
     if not all(labels) or not labels:
         digits = max(2, len(str(count)))
         plain_name = "event" if text else "value"
         labels = [plain_name] if count == 1 else [f"{plain_name}{number:0{digits}d}" for number in range(1, count + 1)]
     names = identifiers(labels)
-    found = []
+    channels = []
     for place, name in enumerate(names):
-        own = described[place] if len(described) == count else None
-        unit = "" if own is None else own.findtext("unit", "").strip()
-        quantity, component = _quantity("" if own is None else own.findtext("type", ""), kind, labels[place])
-        known = UNITS.get(unit.lower(), unit)
+        element = described[place] if len(described) == count else None
+        unit = "" if element is None else element.findtext("unit", "").strip()
+        quantity, component = _quantity("" if element is None else element.findtext("type", ""), kind, labels[place])
+        unit_name = UNITS.get(unit.lower(), unit)
         if text:
-            found.append(Channel(name, "1", "text"))
+            channels.append(Channel(name, "1", "text"))
             continue
         taxel = TAXEL.fullmatch(labels[place].lower()) if quantity == "tactile" and described else None
-        found.append(Channel(name, known, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ())))
-    return tuple(found)
+        channels.append(Channel(name, unit_name, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ())))
+    return tuple(channels)
 
 
-def _quantity(own: str, kind: str, label: str) -> tuple[str, str]:
+def _quantity(type_text: str, kind: str, label: str) -> tuple[str, str]:
     """Return quantity and component of a channel by its type (PositionX), else by that of its stream.
 
     >>> _quantity("PositionX", "MoCap", "left.x"), _quantity("", "Force", "Fz"), _quantity("", "", "a")
     (('position', 'x'), ('force', 'z'), ('', ''))
     """
-    parted = COMPONENT.fullmatch(own.strip())
+    parted = COMPONENT.fullmatch(type_text.strip())
     if parted and parted[1].lower() in QUANTITIES:
         return QUANTITIES[parted[1].lower()], parted[2].lower()
-    quantity = QUANTITIES.get(own.strip().lower()) or QUANTITIES.get(kind.strip().lower(), "")
+    quantity = QUANTITIES.get(type_text.strip().lower()) or QUANTITIES.get(kind.strip().lower(), "")
     parted = COMPONENT.fullmatch(label.strip())
     vector = quantity in ("force", "torque", "position", "orientation", "velocity", "acceleration", "angular_velocity")
     return quantity, parted[2].lower() if parted and vector else ""
@@ -163,9 +163,9 @@ def nanoseconds(seconds: Floats) -> Int64s:
     >>> nanoseconds(np.array([1.5, 41037.236252649])).tolist()
     [1500000000, 41037236252649]
     """
-    whole = np.floor(seconds)
-    found: Int64s = whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
-    return found
+    whole_s = np.floor(seconds)
+    total_ns: Int64s = whole_s.astype(np.int64) * 10**9 + np.rint((seconds - whole_s) * 1e9).astype(np.int64)
+    return total_ns
 
 
 def identifiers(labels: Sequence[str]) -> list[str]:
@@ -174,12 +174,12 @@ def identifiers(labels: Sequence[str]) -> list[str]:
     >>> identifiers(["Fx (N)", "fx_n", "3"])
     ['fx_n', 'fx_n_2', 'c3']
     """
-    made: list[str] = []
+    names: list[str] = []
     for label in labels:
         name = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_") or "channel"
         name = name if name[0].isalpha() else f"c{name}"
         candidate, number = name, 2
-        while candidate in made:
+        while candidate in names:
             candidate, number = f"{name}_{number}", number + 1
-        made.append(candidate)
-    return made
+        names.append(candidate)
+    return names

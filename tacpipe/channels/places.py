@@ -1,4 +1,4 @@
-"""Where the taxels of a sensor lie: published positions where there are any, else a grid by row and column numbers."""
+"""Place the taxels of a sensor: at published positions, or on a grid by row and column numbers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tacpipe.channels import biotac_sp, schema
 if TYPE_CHECKING:
     import pyarrow as pa
 
-USKIN_PITCH_M = 0.0047  # of the taxels of a XELA uSkin 4x4; an assumption
-ROBOSKIN_PITCH_M = 0.0067  # of the taxels of a RoboSkin triangle
-ROBOSKIN_SIDE_M = 0.030  # of a RoboSkin triangle
+USKIN_PITCH_M = 0.0047  # distance of the taxels of a XELA uSkin 4x4, an assumption
+ROBOSKIN_PITCH_M = 0.0067  # distance of the taxels of a RoboSkin triangle
+ROBOSKIN_SIDE_M = 0.030  # side of a RoboSkin triangle
 BIOTAC_M = (
     0.001
     * np.array(  # (electrode, axis) of a BioTac; x along the finger to its tip, z from the pad into the finger
@@ -99,32 +99,32 @@ def of_taxels(fields: Sequence[pa.Field]) -> tuple[Floats, str]:
     Row and column numbers in the field metadata come first, then the layouts of the sensors that are known by how their
     columns are numbered: XELA uSkin, BioTac, BioTac SP, RoboSkin. All others lie row by row on a grid of unit pitch.
     """
-    about = [{key.decode(): value.decode() for key, value in (one.metadata or {}).items()} for one in fields]
-    if about and all(one.get("row", "").isdigit() and one.get("column", "").isdigit() for one in about):
-        return grid([int(one["row"]) for one in about], [int(one["column"]) for one in about]), "grid"
-    known = _known(about)
-    if known is None:
+    about = [{key.decode(): value.decode() for key, value in (entry.metadata or {}).items()} for entry in fields]
+    if about and all(entry.get("row", "").isdigit() and entry.get("column", "").isdigit() for entry in about):
+        return grid([int(entry["row"]) for entry in about], [int(entry["column"]) for entry in about]), "grid"
+    layout = _sensor_layout(about)
+    if layout is None:
         return near_square(len(about)), "grid"
-    places_m, numbers = known
+    places_m, numbers = layout
     if not numbers or min(numbers) < 1 or max(numbers) > len(places_m):
         return near_square(len(about)), "grid"
     return places_m[np.array(numbers) - 1] * 1e3, "mm"
 
 
-def _known(about: Sequence[dict[str, str]]) -> tuple[Floats, list[int]] | None:
+def _sensor_layout(about: Sequence[dict[str, str]]) -> tuple[Floats, list[int]] | None:
     """Return the layout of a known sensor and the number of each taxel in it, from 1; None for an unknown one."""
-    if all("electrode" in one for one in about):
+    if all("electrode" in entry for entry in about):
         if len(about) == biotac_sp.ELECTRODES:
             return biotac_sp.unrolled_m()[:, ::-1], _numbers(about, "electrode")  # the tip is at the top
         return unrolled_m(BIOTAC_M)[:, ::-1], _numbers(about, "electrode")
-    if all("triangle" in one and "taxel" in one for one in about):
+    if all("triangle" in entry and "taxel" in entry for entry in about):
         pairs = zip(_numbers(about, "triangle"), _numbers(about, "taxel"), strict=True)
-        whole = len(about) == schema.TRIANGLES * schema.TRIANGLE_TAXELS
-        return (roboskin_m(), [(t - 1) * schema.TRIANGLE_TAXELS + n for t, n in pairs]) if whole else None
-    if len(about) == schema.TAXELS and all("taxel" in one for one in about):
+        complete = len(about) == schema.TRIANGLES * schema.TRIANGLE_TAXELS
+        return (roboskin_m(), [(t - 1) * schema.TRIANGLE_TAXELS + n for t, n in pairs]) if complete else None
+    if len(about) == schema.TAXELS and all("taxel" in entry for entry in about):
         return uskin_m(), _numbers(about, "taxel")
     return None
 
 
 def _numbers(about: Sequence[dict[str, str]], name: str) -> list[int]:
-    return [int(one[name]) if one[name].isdigit() else 0 for one in about]
+    return [int(entry[name]) if entry[name].isdigit() else 0 for entry in about]

@@ -1,15 +1,18 @@
-"""What the table of a stream holds: its rate, its columns of a quantity, and which are ground truth."""
+"""Find in the tables of streams: rates, columns of a quantity, ground truth, gaps, and the stream of a finger."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Indices, Int64s, Times
+    from tacpipe.arrays import AnyArray, Bools, Indices, Int64s, Times
     from tacpipe.io.columns import Columns
 
 COUNT = "count"  # the unit of readings as a sensor gives them
@@ -120,3 +123,137 @@ def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyA
             values = np.column_stack([table.column(name).to_numpy() for name in names])
             return table.column("t_ns").to_numpy(), values
     return None
+
+
+_NO_CHANNELS = ("time", "mask", "label", "latent", "prediction")  # quantities of columns that no sensor gave
+_SHOWN = 6  # quantities
+
+
+def entry(stream: str) -> str:
+    """Return where a layout file declares the columns of a stream.
+
+    >>> entry("skin"), entry("")
+    ('[streams.skin] columns', '[streams.…] columns')
+    """
+    return f"[streams.{plain(stream) if stream else '…'}] columns"
+
+
+def absent(
+    recording: str, quantity: str, fields: Iterable[pa.Field] | Mapping[str, Iterable[pa.Field]], *, unit: str = ""
+) -> TacpipeError:
+    """Return the error of a recording without a channel of ``quantity``; ``fields`` are those of all its columns, or of each
+    stream.
+
+    It names the quantities that are there, the columns without one, and the line of a layout file that sets it.
+    """
+    undeclared: list[str] = []
+    counts: dict[str, int] = {}
+    streams: set[str] = set()
+    owned: list[tuple[str, pa.Field]]
+    if isinstance(fields, Mapping):
+        owned = [(stream, field) for stream, members in fields.items() for field in members]
+    else:
+        owned = [("", field) for field in fields]
+    for stream, field in owned:
+        metadata = field.metadata or {}
+        own_quantity = metadata.get(b"quantity", b"").decode()
+        if own_quantity in _NO_CHANNELS or field.name in ("t_ns", "seq", "t_device_ns"):
+            continue
+        if own_quantity:
+            counts[own_quantity] = counts.get(own_quantity, 0) + 1
+        else:
+            undeclared.append(field.name)
+            streams.add(stream or metadata.get(b"stream", b"").decode())
+    descriptions = [f"{count} of {plain(name)}" for name, count in counts.items()]
+    descriptions += [f"{len(undeclared)} without a quantity ({listed(undeclared, 3)})"] if undeclared else []
+    table_name = entry(streams.pop() if len(streams) == 1 else "")
+    setting = f'quantity = "{quantity}"' + (f' and unit = "{unit}"' if unit else "")
+    summary = ", ".join(descriptions[-_SHOWN:]) or "none"
+    return TacpipeError(
+        f"Recording {recording} has no channel of the quantity {quantity}; its columns are {summary}. Set "
+        f"{setting} in {table_name} of the layout file, and ingest again."
+    )
+
+
+def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
+    """Return the only stream with tactile channels. Raises `TacpipeError`, naming the recording, for none or several."""
+    tactile_streams = [stream for stream, table in streams.items() if of_quantity(table, "tactile")]
+    if not tactile_streams:
+        raise absent(name, "tactile", {stream: table.schema for stream, table in streams.items()})
+    if len(tactile_streams) != 1:
+        raise TacpipeError(
+            f"Recording {name} has {len(tactile_streams)} streams with tactile channels: {', '.join(tactile_streams)}; a "
+            f"slide is cut from one. Give recordings of one finger, or of one patch of skin."
+        )
+    return streams[tactile_streams[0]]
+
+
+def without_spikes(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, Int64s]:
+    """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`."""
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.signals.repairs import hampel
+
+    names = of_quantity(table, "tactile")
+    values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
+    spikes, repaired = hampel(values, rows, deviations, floor_count)
+    for channel in np.flatnonzero(spikes.any(axis=0)):
+        field = table.schema.field(names[channel])
+        column = pa.array(repaired[:, channel].copy(), field.type)
+        table = table.set_column(table.column_names.index(field.name), field, column)
+    return table, spikes.sum(axis=1)
+
+
+GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
+GAP = "_gap"  # how the masks of gaps end
+GAP_MS = "_gap_ms"  # how the attributes of a synchronized recording end that hold the longest time without a gap
+LOOK_AHEAD_MEAN, LOOK_AHEAD_MAX = "look_ahead_mean_ms", "look_ahead_max_ms"  # attributes of a synchronized recording
+MANY = 0.05  # fraction of rows in gaps of a stream, above which a user is warned
+_APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: further apart, rows are missing between
+_UNIFORM = 1.5
+
+
+def gaps(table: pa.Table) -> Bools:
+    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
+    import numpy as np
+
+    gap = np.zeros(table.num_rows, dtype=bool)
+    for name in table.column_names:
+        if name.endswith(GAP):
+            gap |= table.column(name).to_numpy().astype(bool)
+    return gap
+
+
+def gap_shares(table: pa.Table | Columns) -> dict[str, float]:
+    """Return the fraction of rows that lie in a gap of each stream, by the name of the stream."""
+    masks = [name for name in table.column_names if name.endswith(GAP)]
+    return {name.removesuffix(GAP): float(table.column(name).to_numpy().mean()) for name in masks if table.num_rows}
+
+
+def describe_gaps(*tables: pa.Table | Columns) -> list[str]:
+    """Return one sentence for each stream with more than 5 % of its rows in gaps, in any of some recordings."""
+    shares: dict[str, float] = {}
+    for table in tables:
+        for stream, share in gap_shares(table).items():
+            shares[stream] = max(share, shares.get(stream, 0.0))
+    return [
+        f"More than {MANY:.0%} of the rows lie in gaps of stream {stream}, and no window crosses a gap; `tacpipe show` "
+        f"prints the fraction. Synchronize with a longer --gap-ms if its samples come that slowly."
+        for stream, share in shares.items()
+        if share > MANY
+    ]
+
+
+def apart(attributes: Mapping[str, Any]) -> float:
+    """Return how many times the median step two rows of a recording may be apart with no row missing between."""
+    return _APART.get(str(attributes.get(GRID, "uniform")), _UNIFORM)
+
+
+def times(table: pa.Table) -> Int64s:
+    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
+    import numpy as np
+
+    if "t_ns" not in table.column_names:
+        raise TacpipeError("There is no column t_ns, so the order of the rows in time is unknown.")
+    return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

@@ -71,7 +71,7 @@ def candidates(
     if predict is not None:
         rows = [row | predict(seen, each.grasp) for row, each in zip(rows, found, strict=True)]
     if picture is not None:
-        from tacpipe.clouds.picture import draw
+        from tacpipe.clouds.candidates import draw
 
         draw(seen, found, picture)
     if output is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.channels import streams
-from tacpipe.channels.masks import GAP, gap_shares
+from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.errors import UsageError
 from tacpipe.io.terminal import Group, Row, Table
 from tacpipe.metrics.headline import counted

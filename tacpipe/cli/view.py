@@ -74,7 +74,7 @@ def view(
         from tacpipe.viewer import session
 
         drawn = _drawn(shown, _predictions(predictions))
-        files = session.write(drawn, Path(folder), str(dataset), several=len(shown) > 1, all_rows=all_rows)
+        files = session.write(drawn, Path(folder), str(dataset), with_list=len(shown) > 1, all_rows=all_rows)
         if save is not None:
             _save(files, save)
             terminal.result(save)
@@ -199,9 +199,9 @@ def _in_browser(files: Sequence[Path], port: int | None) -> None:
     import time
     import webbrowser
 
-    from tacpipe.viewer import web
+    from tacpipe.viewer.session import served
 
-    with web.served(files, port) as address:
+    with served(files, port) as address:
         terminal.result(address)
         webbrowser.open(address)
         terminal.note("The viewer is served on this computer; press Ctrl-C to end.")

@@ -9,21 +9,28 @@ meets both surfaces most squarely, runs across the axis and the view, and stays 
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.arrays import Floats, Indices
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.frame import axes
-from tacpipe.clouds.grasp import Grasp
-from tacpipe.clouds.normals import CAMERA_M, normals
+from tacpipe.clouds.cloud import CAMERA_M, Cloud, normals
+from tacpipe.clouds.grasp import Grasp, axes
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io.files import readable_errors, write_whole
+from tacpipe.plugins import extras
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
 COUNT = 10
 SHIFT = 0.4  # fraction of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
-OPENING_M = (0.020, 0.130)  # of the published grasps 0.026 to 0.121
+OPENING_M = (0.020, 0.130)  # least and largest opening; the published grasps have 0.026 to 0.121
 FEWEST = 50  # points of a cloud that states a shape; published ones have 814 and more
 MOST = 20_000  # points that are looked at: more add time and no shape
 FEWEST_CUT = 6  # points of a cut
@@ -81,17 +88,17 @@ def candidates(
     cuts = _Cuts(cloud, frame, camera_m, opening_m)
     bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
     draws = np.random.default_rng(seed).uniform(size=(count, TRIES))
-    found = []
+    chosen = []
     for low, high, fractions in zip(bounds[:-1], bounds[1:], draws, strict=True):
         tried = [cuts.best(low + fraction * (high - low)) for fraction in (fractions if shift else fractions[:1])]
-        held = [candidate for candidate in tried if candidate is not None]
-        if held:
-            found.append(max(held, key=lambda candidate: candidate.score))
+        feasible = [candidate for candidate in tried if candidate is not None]
+        if feasible:
+            chosen.append(max(feasible, key=lambda candidate: candidate.score))
         if not shift:
             break  # every stretch is the same point
-    if not found:
+    if not chosen:
         raise TacpipeError(_too_wide(cuts.widths_m, opening_m))
-    return sorted(found, key=lambda candidate: -candidate.score)
+    return sorted(chosen, key=lambda candidate: -candidate.score)
 
 
 def _require_possible(count: int, shift: float, opening_m: tuple[float, float]) -> None:
@@ -128,8 +135,8 @@ def _thinned(cloud: Cloud, seed: int) -> Cloud:
         )
     if len(cloud) <= MOST:
         return cloud
-    kept = np.random.default_rng(seed).choice(len(cloud), MOST, replace=False)
-    return Cloud(cloud.points_m[kept])
+    rows = np.random.default_rng(seed).choice(len(cloud), MOST, replace=False)
+    return Cloud(cloud.points_m[rows])
 
 
 def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
@@ -152,8 +159,8 @@ def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
     view /= np.linalg.norm(view)
     along = axes[0]
     if abs(along @ view) > UPRIGHT:
-        seen = inner - np.outer(inner @ view, view)
-        along = np.linalg.eigh(seen.T @ seen)[1][:, -1]
+        across_view = inner - np.outer(inner @ view, view)
+        along = np.linalg.eigh(across_view.T @ across_view)[1][:, -1]
     positions = inner @ along
     along = along * np.sign((positions**3).sum() or 1.0)  # the cloud's own skew gives it a sign
     across = np.cross(view, along)
@@ -200,9 +207,9 @@ class _Cuts:
 
     def _scored(self, lefts: Indices, rights: Indices, shift_m: float) -> tuple[Floats, Floats]:
         """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
-        apart = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
-        opening = np.linalg.norm(apart, axis=2)
-        closing = apart / np.maximum(opening, 1e-9)[..., None]
+        offsets = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
+        opening = np.linalg.norm(offsets, axis=2)
+        closing = offsets / np.maximum(opening, 1e-9)[..., None]
         on_left = -(closing * self._normals[lefts][:, None]).sum(axis=2)
         on_right = (closing * self._normals[rights][None]).sum(axis=2)
         cosines = np.minimum(on_left, on_right)
@@ -217,3 +224,80 @@ def _grasp(left: Floats, right: Floats, camera_m: Floats) -> Grasp:
     """Return the grasp of two points whose wrist comes along the line of sight, as `frame.estimated_wrist` has it."""
     sight = (left + right) / 2 - camera_m
     return Grasp(left, right, axes(sight / np.linalg.norm(sight), (right - left) / np.linalg.norm(right - left)))
+
+
+G1, G2 = "#d55e00", "#0072b2"  # distinguished by eyes that do not distinguish red from green
+GREY, GROUND = (
+    "#707070",
+    "#ececec",
+)  # colour of points without colours, and of the ground behind all points, which shows white ones
+
+
+def draw(cloud: Cloud, grasp_candidates: Sequence[Candidate], path: Path) -> None:
+    """Write a picture to ``path``: the cloud in its colours from two sides, each grasp a line, its rank next to g1.
+
+    The ending states the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
+    cannot be written.
+    """
+    with extras.explain_missing("A picture"):
+        import matplotlib
+        from matplotlib.figure import Figure
+
+    with matplotlib.rc_context({"svg.hashsalt": "candidates"}):
+        figure = Figure(figsize=(11, 6), layout="constrained", dpi=150)
+        above, side = figure.subplots(1, 2)
+        _panel(above, cloud, grasp_candidates, (0, 1), ranks=True)
+        above.set_title("as the camera sees it", loc="left")
+        _panel(side, cloud, grasp_candidates, (_width(grasp_candidates), 2), ranks=False)
+        side.set_title("from the side", loc="left")
+        figure.legend(*_legend(), loc="outside lower center", ncols=2, frameon=False)
+        content, kind = io.BytesIO(), path.suffix.lower()[1:]
+        bare = {"png": ("Software",), "svg": ("Date", "Creator"), "pdf": ("CreationDate", "Creator", "Producer")}[kind]
+        figure.savefig(content, format=kind, metadata=dict.fromkeys(bare))  # the same grasps give the same bytes
+    with readable_errors(path.parent):
+        write_whole(str(path), content.getvalue(), f"{path}.draft")
+
+
+def _width(grasp_candidates: Sequence[Candidate]) -> int:
+    """Return along which of x and y the best grasp closes more: seen along the other one, it shows its depth."""
+    return int(np.argmax(np.abs(grasp_candidates[0].grasp.closing[:2]))) if grasp_candidates else 0
+
+
+def _panel(
+    axes: Axes, cloud: Cloud, grasp_candidates: Sequence[Candidate], plotted_axes: tuple[int, int], *, ranks: bool
+) -> None:
+    """Draw a cloud and its grasps on two of the axes x, y, z, in millimetres, the second downwards as in a picture."""
+    right, down = plotted_axes
+    depth_axis = 3 - right - down  # the axis that is looked along
+    order = np.argsort(-cloud.points_m[:, depth_axis], kind="stable")  # near points are drawn last
+    axes.set_facecolor(GROUND)
+    points_mm = cloud.points_m[order] * 1e3
+    colours = GREY if cloud.colours is None else cloud.colours[order] / 255
+    axes.scatter(points_mm[:, right], points_mm[:, down], c=colours, s=3, linewidths=0, rasterized=True)
+    for rank, candidate in reversed(list(enumerate(grasp_candidates, 1))):  # the best lies on top
+        ends_mm = np.stack([candidate.grasp.g1_m, candidate.grasp.g2_m]) * 1e3  # (finger, xyz)
+        _line(axes, ends_mm[:, [right, down]], rank, with_legend=ranks)
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
+    axes.set_xlabel(f"{'xyz'[right]} (mm)")
+    axes.set_ylabel(f"{'xyz'[down]} (mm)")
+
+
+def _line(axes: Axes, ends_mm: Floats, rank: int, *, with_legend: bool) -> None:
+    faint = 1.0 if rank == 1 else 0.75
+    axes.plot(*ends_mm.T, color="white", linewidth=3.5 if rank == 1 else 2.5, alpha=faint)  # a rim, seen on any colour
+    axes.plot(*ends_mm.T, color="black", linewidth=2 if rank == 1 else 1, alpha=faint)
+    for end, colour in zip(ends_mm, (G1, G2), strict=True):
+        axes.plot(*end, "o", color=colour, markeredgecolor="white", markersize=8 if rank == 1 else 6)
+    if not with_legend:
+        return
+    axes.annotate(
+        str(rank), ends_mm[0], (-9, 0), textcoords="offset points", ha="right", va="center", fontsize=9,
+        bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+    )  # fmt: skip
+
+
+def _legend() -> tuple[list[Artist], list[str]]:
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], marker="o", linestyle="", color=colour) for colour in (G1, G2)], ["g1", "g2"]

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from tacpipe.arrays import AnyArray
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.library import open3d
+from tacpipe.clouds.cloud import Cloud, open3d
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 
 TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
 SUFFIXES = (".pcd", ".ply", *TEXT)
-DIGITS = 18  # of a number of points
-LARGEST_M = 10.0  # of what a hand's camera sees; a cloud in millimetres is a thousand times as large as one in metres
+DIGITS = 18  # largest number of digits of a number of points
+LARGEST_M = 10.0  # largest distance that a hand's camera sees; a cloud in millimetres is a thousand times as large
 
 
 def read(path: Path | str) -> Cloud:
@@ -71,10 +70,10 @@ READERS = {".pcd": _pcd, ".ply": _ply}
 
 
 def _text(path: Path) -> Cloud:
-    return _by_open3d(path, _told(path))
+    return _by_open3d(path, _declared_points(path))
 
 
-def _told(path: Path) -> int:
+def _declared_points(path: Path) -> int:
     """Return how many points a file of text declares: its first line, or its lines."""
     lines = path.read_bytes().splitlines()
     filled = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
@@ -94,18 +93,18 @@ def _told(path: Path) -> int:
 def _by_open3d(path: Path, declared: int) -> Cloud:
     """Return the cloud that open3d reads, if it is what the file declares."""
     with open3d() as library:
-        found = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
-        with np.errstate(over="ignore"):  # what no float32 holds is not finite then
-            points = np.asarray(found.points).astype(np.float32)  # (point, xyz)
-        colours = np.asarray(found.colors)  # (point, rgb) from 0 to 1
-    held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
-    if min(held, len(points)) != declared or not declared:
+        cloud = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite
+            points = np.asarray(cloud.points).astype(np.float32)  # (point, xyz)
+        colours = np.asarray(cloud.colors)  # (point, rgb) from 0 to 1
+    count = _rows(path) if path.suffix.lower() == ".pts" else len(points)
+    if min(count, len(points)) != declared or not declared:
         raise TacpipeError(
-            f"{path} declares {declared} points, and {min(held, len(points))} can be read: it was cut off, or some are not "
+            f"{path} declares {declared} points, and {min(count, len(points))} can be read: it was cut off, or some are not "
             f"numbers. Copy it again from its source."
         )
     _require_finite(path, points)
-    if not found.has_colors():
+    if not cloud.has_colors():
         return Cloud(points)
     if not (colours.min() >= 0 and colours.max() <= 1):
         raise TacpipeError(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import Floats
+from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.clouds.cloud import require_columns
 from tacpipe.errors import TacpipeError
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{axis}_{component}" for axis in "xyz" for component in "xyz")
-ORTHONORMAL = 1e-3  # by which a wrist's rotation may miss being one: what files of five digits hold
+ORTHONORMAL = 1e-3  # largest error of a wrist's rotation matrix: the precision of files with five digits
 
 
 @dataclass(frozen=True)
@@ -105,3 +105,52 @@ class Grasp:
         schema = pa.schema([channels.time_field(), *fields])
         arrays = [pa.array([t_ns], pa.int64()), *(pa.array([float(value)], pa.float64()) for value in values)]
         return pa.Table.from_arrays(arrays, schema=schema)
+
+
+STEEPEST = 0.999  # cosine between closing axis and line of sight beyond which another direction is taken
+
+
+def estimated_wrist(grasp: Grasp) -> Floats:
+    """Return axes for a wrist that is not stated (component, axis): approach along the line of sight, closing, and third.
+
+    The camera, at the origin, looks down on the object as the hand comes down on it; the approach axis is the line of sight
+    to the middle of the grasp less its share along the closing axis. Where nothing is left, because the fingers close
+    along the line of sight or about the camera itself, the frame's axis that is most square to closing represents it.
+    """
+    sight = grasp.middle_m / max(float(np.linalg.norm(grasp.middle_m)), 1e-12)
+    if not sight.any() or abs(sight @ grasp.closing) > STEEPEST:
+        sight = np.eye(3)[np.argmin(np.abs(grasp.closing))]
+    return axes(sight, grasp.closing)
+
+
+def axes(approach: Floats, closing: Floats) -> Floats:
+    """Return right-handed axes (component, axis): ``approach`` made square to ``closing``, that, their product.
+
+    ``closing`` must be a unit vector, and ``approach`` not along it.
+    """
+    square = approach - (approach @ closing) * closing
+    square = square / np.linalg.norm(square)
+    return np.column_stack([square, closing, np.cross(square, closing)])
+
+
+def wrist_of(grasp: Grasp) -> Floats:
+    """Return the axes of a grasp (component, axis): approach, closing, third; the approach is the wrist's where it is given.
+
+    The closing axis is that from g1 to g2, whatever a wrist's second axis is; a wrist that approaches along it gives its
+    second axis for the first, so that the axes still turn with it.
+    """
+    if grasp.wrist is None:
+        return estimated_wrist(grasp)
+    approach = grasp.wrist[:, 0]
+    if abs(approach @ grasp.closing) > STEEPEST:
+        approach = grasp.wrist[:, 1]
+    return axes(approach, grasp.closing)
+
+
+def local_points(points_m: AnyFloats, grasp: Grasp) -> Floats:
+    """Return points (point, axis) in the axes of the grasp, about the middle between the fingers, metres.
+
+    g1 is at (0, -opening / 2, 0), g2 at (0, opening / 2, 0).
+    """
+    local_m: Floats = (points_m - grasp.middle_m) @ wrist_of(grasp)
+    return local_m

@@ -41,10 +41,10 @@ def _corners(points_m: AnyFloats) -> Indices:
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        found: Indices = ConvexHull(points_m).vertices
+        vertices: Indices = ConvexHull(points_m).vertices
     except QhullError:
         return np.arange(len(points_m))
-    return found
+    return vertices
 
 
 def minmax(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
@@ -105,5 +105,7 @@ def random_rotation(rng: np.random.Generator, largest_deg: float) -> AnyFloats:
 
     if not largest_deg:
         return np.eye(3)
-    found: AnyFloats = Rotation.from_euler("xyz", rng.uniform(-largest_deg, largest_deg, 3), degrees=True).as_matrix()
-    return found
+    rotation: AnyFloats = Rotation.from_euler(
+        "xyz", rng.uniform(-largest_deg, largest_deg, 3), degrees=True
+    ).as_matrix()
+    return rotation

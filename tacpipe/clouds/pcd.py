@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.arrays import Bytes, Float32s
-from tacpipe.clouds import text_points
+from tacpipe.clouds import cloud
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
@@ -26,14 +26,14 @@ KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
 POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
 LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
-DIGITS = 18  # of a number in a header
+DIGITS = 18  # largest number of digits of a number in a header
 LARGEST_POINT = 65_536  # bytes, fields that are skipped included
-LZF_MOST = 88  # by which compression makes points smaller at most: three bytes unpack to 264
+LZF_MOST = 88  # largest factor of compression: three bytes unpack to 264
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file declares about its points."""
+    """The points that a file declares."""
 
     point: np.dtype[np.void]  # the fields of a point, packed
     points: int
@@ -76,7 +76,7 @@ def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
     if header.points == 0:
         raise TacpipeError(f"{path} holds no point (POINTS 0). Copy the file again or leave its recording out.")
     points = _of_bytes(path, content, header) if header.data == "binary" else _of_text(path, content, header)
-    with np.errstate(over="ignore"):  # what no float32 holds is not finite then, and refused or left out as such
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused or left out
         xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
     if header.colour is None:
         return xyz, None
@@ -98,9 +98,9 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
         raise TacpipeError(
             f"{path} is a PCD file of version {plain(' '.join(lines['VERSION']))}; 0.7 can be read. Save it again as that."
         )
-    points = _whole(path, "POINTS", lines["POINTS"])
+    points = _whole_number(path, "POINTS", lines["POINTS"])
     if "WIDTH" in lines and "HEIGHT" in lines:
-        width, height = (_whole(path, keyword, lines[keyword]) for keyword in ("WIDTH", "HEIGHT"))
+        width, height = (_whole_number(path, keyword, lines[keyword]) for keyword in ("WIDTH", "HEIGHT"))
         if width * height != points:
             raise TacpipeError(
                 f"{path} states WIDTH {width}, HEIGHT {height} and POINTS {points}; points must be width times height. "
@@ -117,11 +117,11 @@ def require_compressed(path: Path, content: bytes, header: Header) -> None:
 
     In front of them stand their size and that of the points once unpacked, four bytes each.
     """
-    needed, there = header.points * header.point.itemsize, len(content) - header.length - 8
+    needed, available = header.points * header.point.itemsize, len(content) - header.length - 8
     size, declared = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
-    if there < size or declared != needed or needed > size * LZF_MOST:
+    if available < size or declared != needed or needed > size * LZF_MOST:
         raise TacpipeError(
-            f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes "
+            f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(available, 0)} bytes "
             f"follow that declare {size}, and {declared} once unpacked: it was cut off or its header is wrong. Copy the "
             "file again."
         )
@@ -160,7 +160,7 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
     return lines, place
 
 
-def _whole(path: Path, keyword: str, words: list[str]) -> int:
+def _whole_number(path: Path, keyword: str, words: list[str]) -> int:
     if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
         raise TacpipeError(
             f"{path} states {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
@@ -181,26 +181,28 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
             )
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     total = 0
-    for place, (name, kind, size, count) in enumerate(zip(names, lines["TYPE"], lines["SIZE"], counts, strict=True)):
+    for place, (name, kind, size, count_text) in enumerate(
+        zip(names, lines["TYPE"], lines["SIZE"], counts, strict=True)
+    ):
         letter, sizes = KINDS.get(kind, ("", ()))
-        width, many = _whole(path, "SIZE", [size]), _whole(path, "COUNT", [count])
+        width, count = _whole_number(path, "SIZE", [size]), _whole_number(path, "COUNT", [count_text])
         if width not in sizes:
             declared = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
             raise TacpipeError(f"{path} has {declared}; there is no such number.")
-        wrong_place = name in POSITION and (letter != "f" or many != 1)
-        if wrong_place or (name in COLOURS and (width != 4 or many != 1)):
+        wrong_place = name in POSITION and (letter != "f" or count != 1)
+        if wrong_place or (name in COLOURS and (width != 4 or count != 1)):
             right = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
             raise TacpipeError(
-                f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count}; it must be {right}."
+                f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count_text}; it must be {right}."
             )
-        total += width * many
-        if not many > 0 or total > LARGEST_POINT:
+        total += width * count
+        if not count > 0 or total > LARGEST_POINT:
             raise TacpipeError(
-                f"{path} has the field {plain(name)} of COUNT {count}; a point has {LARGEST_POINT} bytes at most, and each "
-                f"field one number or more. Copy the file again."
+                f"{path} has the field {plain(name)} of COUNT {count_text}; a point has {LARGEST_POINT} bytes at most, and "
+                f"each field one number or more. Copy the file again."
             )
-        own = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
-        fields.append((own, f"<{letter}{width}", () if many == 1 else (many,)))
+        field_name = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
+        fields.append((field_name, f"<{letter}{width}", () if count == 1 else (count,)))
     missing = [axis for axis in POSITION if names.count(axis) != 1]
     if missing or any(names.count(name) > 1 for name in COLOURS):
         raise TacpipeError(
@@ -212,15 +214,15 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
 def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
     """Return the points (point,) that follow a header; the library pads files with zeros to whole pages of memory."""
     size = header.point.itemsize
-    there, needed = len(content) - header.length, header.points * size
-    if there < needed:
+    available, needed = len(content) - header.length, header.points * size
+    if available < needed:
         raise TacpipeError(
             f"{path} was cut off or its header is wrong: it declares {header.points} points of {size} bytes, and "
-            f"{there // size} follow. Copy the file again."
+            f"{available // size} follow. Copy the file again."
         )
     if any(content[header.length + needed :]):
         raise TacpipeError(
-            f"{path} declares {header.points} points of {size} bytes, and behind them {there - needed} bytes follow "
+            f"{path} declares {header.points} points of {size} bytes, and behind them {available - needed} bytes follow "
             "that are not padding with zeros. Copy the file again."
         )
     return np.frombuffer(content, header.point, header.points, header.length)
@@ -228,10 +230,10 @@ def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
 
 def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
     """Return the points (point,) of the lines behind a header, a line a point."""
-    lines = text_points.filled(content[header.length :])
+    lines = cloud.filled(content[header.length :])
     if len(lines) != header.points:
         raise TacpipeError(
             f"{path} was cut off or its header is wrong: it declares {header.points} points, and {len(lines)} lines follow. "
             f"Copy the file again."
         )
-    return text_points.parsed(path, lines, header.point, (*POSITION, *COLOURS))
+    return cloud.parsed(path, lines, header.point, (*POSITION, *COLOURS))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s
-from tacpipe.clouds import text_points
+from tacpipe.clouds import cloud
 from tacpipe.clouds.cloud import COLOUR
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, listed
@@ -31,7 +31,7 @@ LETTERS = {
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 POSITION = ("x", "y", "z")
 LONGEST_HEADER = 65_536  # bytes
-DIGITS = 18  # of a number in a header
+DIGITS = 18  # largest number of digits of a number in a header
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class _Header:
     vertex: np.dtype[np.void]
     points: int
     length: int  # bytes, the line end behind end_header included
-    alone: bool  # nothing but vertices follows
-    skipped: int  # of other elements before the vertices: bytes, or lines where it is text
+    only_vertices: bool  # no other element follows
+    skipped: int  # size of other elements before the vertices: bytes, or lines of a text file
 
 
 def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
@@ -54,14 +54,14 @@ def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
     if not header.points:
         raise TacpipeError(f"{path} holds no point (element vertex 0). Copy it again or leave it out.")
     if header.form == "ascii":
-        lines = text_points.filled(content[header.length :])[header.skipped :]
+        lines = cloud.filled(content[header.length :])[header.skipped :]
         _require(path, header, len(lines), 1, "lines")
-        points = text_points.parsed(path, lines[: header.points], header.vertex, (*POSITION, *COLOUR))
+        points = cloud.parsed(path, lines[: header.points], header.vertex, (*POSITION, *COLOUR))
     else:
         body = content[header.length + header.skipped :]
         _require(path, header, len(body), header.vertex.itemsize, "bytes")
         points = np.frombuffer(body, header.vertex, header.points)
-    with np.errstate(over="ignore"):  # what no float32 holds is not finite then, and refused or left out as such
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused or left out
         xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)
     if not set(COLOUR) <= set(header.vertex.names or ()):
         return xyz, None
@@ -139,10 +139,10 @@ def _is_count(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) <= DIGITS
 
 
-def _require(path: Path, header: _Header, held: int, width: int, unit: str) -> None:
+def _require(path: Path, header: _Header, available: int, width: int, unit: str) -> None:
     """Raise `TacpipeError` where too little follows the header for its points, or too much though nothing else may."""
     needed = header.points * width
-    if held < needed or (header.alone and held > needed):
+    if available < needed or (header.only_vertices and available > needed):
         raise TacpipeError(
-            f"{path} declares {header.points} points, which are {needed} {unit}, and {held} follow. Copy it again."
+            f"{path} declares {header.points} points, which are {needed} {unit}, and {available} follow. Copy it again."
         )

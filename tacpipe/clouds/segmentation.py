@@ -13,30 +13,29 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import Floats, Indices, Int64s
-from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.cloud import Cloud, open3d
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.clouds.library import open3d
 from tacpipe.errors import TacpipeError
 
 PLANES = 4  # the largest ones, among which the table is looked for: a floor, walls and sides of boxes may be larger
-LONGEST_M = 0.4  # that an object may be along any axis; the published ones are 0.28 m at most
-DEEPEST_M = 0.1  # that an object can be above the middle of a grasp: 20 cm are more than a hand can lift so
+LONGEST_M = 0.4  # largest extent of an object along any axis; published objects have at most 0.28 m
+DEEPEST_M = 0.1  # largest height of an object above the middle of a grasp: a hand cannot lift 20 cm like that
 NOISES = 3.0  # standard deviations of the table's points about its plane, beyond which a point lies in front of it
 SAMPLED = 10_000  # points that state a plane as well as all of a view do
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as table, as one thing, and as the thing that was grasped."""
+    """Limits of the table, of one object, and of the grasped object."""
 
-    plane_m: float  # from a plane, within which points belong to it; more where they spread more
-    plane_fraction: float  # of all points, that the table must hold
+    plane_m: float  # largest distance of a point from its plane, larger where points spread more
+    plane_fraction: float  # least fraction of all points on the table
     plane_trials: int  # random samples for each plane
-    cluster_m: float  # between neighbours in one thing
-    cluster_points: int  # that a point must have so near, itself included, to be inside of a thing
-    object_points: int  # that a thing must have
-    near_m: float  # that the object may be from the grasp
-    outlier_neighbours: int  # whose mean distance states a stray point
+    cluster_m: float  # largest distance between neighbours in one object
+    cluster_points: int  # least number of points that near, itself included, for a point inside an object
+    object_points: int  # least number of points of an object
+    near_m: float  # largest distance of the object from the grasp
+    outlier_neighbours: int  # number of neighbours whose mean distance identifies a stray point
     outlier_deviations: float  # standard deviations of that distance above its mean, beyond which a point is stray
 
 
@@ -71,8 +70,8 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> In
             f"What is near the grasp is {1e3 * length_m:.0f} mm long, and what a hand lifts {1e3 * LONGEST_M:g} mm at most: "
             f"it has grown together with the table, or with things next to it. Raise --plane-mm or lower --cluster-mm."
         )
-    found: Indices = rows[_inliers(points_m[rows], limits)]
-    return found
+    object_points: Indices = rows[_inliers(points_m[rows], limits)]
+    return object_points
 
 
 def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -> Floats:
@@ -82,19 +81,19 @@ def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -
     grasp lies within it, behind what the camera sees. Raises `TacpipeError` if there is no such plane that holds
     ``plane_fraction`` of the points (point, xyz).
     """
-    left = np.arange(len(points_m))
-    found: list[tuple[float, Floats]] = []
+    remaining = np.arange(len(points_m))
+    planes: list[tuple[float, Floats]] = []
     fractions: list[float] = []
-    while len(fractions) < PLANES and len(left) >= max(3.0, limits.plane_fraction * len(points_m)):
-        plane = _largest_plane(points_m[left], limits, seed)
-        within = np.abs(heights_m(points_m[left], plane)) <= limits.plane_m
-        fractions.append(np.count_nonzero(within) / len(points_m))
+    while len(fractions) < PLANES and len(remaining) >= max(3.0, limits.plane_fraction * len(points_m)):
+        plane = _largest_plane(points_m[remaining], limits, seed)
+        in_plane = np.abs(heights_m(points_m[remaining], plane)) <= limits.plane_m
+        fractions.append(np.count_nonzero(in_plane) / len(points_m))
         height_m = float(heights_m(grasp.middle_m[None], plane)[0])
         if fractions[-1] >= limits.plane_fraction and height_m > limits.plane_m:
-            found.append((height_m, plane))
-        left = left[~within]
-    if found:
-        return min(found, key=lambda item: item[0])[1]
+            planes.append((height_m, plane))
+        remaining = remaining[~in_plane]
+    if planes:
+        return min(planes, key=lambda item: item[0])[1]
     percentages = ", ".join(f"{100 * fraction:.0f}" for fraction in fractions) or "0"
     raise TacpipeError(
         f"No table is found: the largest planes hold {percentages} % of {len(points_m)} points, and one with the grasp in "
@@ -105,8 +104,8 @@ def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -
 
 def heights_m(points_m: Floats, plane: Floats) -> Floats:
     """Return how far points (point, xyz) lie in front of a plane (4,), metres (point,); behind it negative."""
-    found: Floats = points_m @ plane[:3] + plane[3]
-    return found
+    distances_m: Floats = points_m @ plane[:3] + plane[3]
+    return distances_m
 
 
 def from_grasp_m(points_m: Floats, grasp: Grasp) -> Floats:
@@ -123,8 +122,8 @@ def from_grasp_m(points_m: Floats, grasp: Grasp) -> Floats:
 def _from_line_m(points_m: Floats, start_m: Floats, direction: Floats, length_m: float) -> Floats:
     """Return how far points (point, xyz) lie from a straight line with two ends, metres (point,)."""
     along_m = np.clip((points_m - start_m) @ direction, 0, length_m)
-    found: Floats = np.linalg.norm(points_m - start_m - along_m[:, None] * direction, axis=1)
-    return found
+    distances_m: Floats = np.linalg.norm(points_m - start_m - along_m[:, None] * direction, axis=1)
+    return distances_m
 
 
 def _cloud(library: Any, points_m: Floats) -> Any:
@@ -141,9 +140,9 @@ def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
         plane, _ = _cloud(library, sampled).segment_plane(
             limits.plane_m, 3, limits.plane_trials, probability=1.0
         )  # all trials are made: with fewer the result would depend on the number of threads
-    found = np.asarray(plane, dtype=np.float64)
-    found /= np.linalg.norm(found[:3])
-    return found if found[3] >= 0 else -found
+    normalised = np.asarray(plane, dtype=np.float64)
+    normalised /= np.linalg.norm(normalised[:3])
+    return normalised if normalised[3] >= 0 else -normalised
 
 
 def _clusters(points_m: Floats, limits: Limits) -> Int64s:
@@ -151,8 +150,8 @@ def _clusters(points_m: Floats, limits: Limits) -> Int64s:
     if not len(points_m):
         return np.zeros(0, dtype=np.int64)
     with open3d() as library:
-        found = _cloud(library, points_m).cluster_dbscan(limits.cluster_m, limits.cluster_points)
-    labels = np.asarray(found, np.int64)
+        cluster_of_points = _cloud(library, points_m).cluster_dbscan(limits.cluster_m, limits.cluster_points)
+    labels = np.asarray(cluster_of_points, np.int64)
     sizes = np.bincount(labels + 1)  # (cluster,), the first being that of no cluster
     return np.where(sizes[labels + 1] >= limits.object_points, labels, -1)
 
@@ -160,7 +159,7 @@ def _clusters(points_m: Floats, limits: Limits) -> Int64s:
 def _inliers(points_m: Floats, limits: Limits) -> Indices:
     """Return which points (point, xyz) are not a stray ones."""
     with open3d() as library:
-        _, kept = _cloud(library, points_m).remove_statistical_outlier(
+        _, inliers = _cloud(library, points_m).remove_statistical_outlier(
             limits.outlier_neighbours, limits.outlier_deviations
         )
-    return np.sort(np.asarray(kept, dtype=np.intp))
+    return np.sort(np.asarray(inliers, dtype=np.intp))

@@ -13,7 +13,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, plain
-from tacpipe.signals.windows import breaks as breaks
+from tacpipe.signals.runs import breaks as breaks
 
 LEVELS, INCREMENTS = "levels", "increments"
 

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bools
-from tacpipe.channels.masks import gaps as gaps
-from tacpipe.channels.masks import times as times
+from tacpipe.channels.streams import gaps as gaps
+from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import SOME_ROWS

@@ -55,7 +55,7 @@ def html(dataset: Dataset) -> str:
 
 def recording_html(recording: Recording) -> str:
     """Return a recording for a notebook: its labels and a small picture of its streams; every text is escaped."""
-    from tacpipe.traces import curves, sparkline, taxels
+    from tacpipe.traces import curves, drawing, taxels
 
     labels_shown = [
         f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)
@@ -66,7 +66,7 @@ def recording_html(recording: Recording) -> str:
         tables = (
             {} if recording.streams == ("",) and "t_ns" not in recording.table().column_names else streams_of(recording)
         )
-        picture = sparkline.svg(sparkline.rows(curves.of_streams(tables), taxels.of_streams(tables)))
+        picture = drawing.svg(drawing.rows(curves.of_streams(tables), taxels.of_streams(tables)))
         picture = picture or f"<pre>{escape(repr(recording))}</pre>"
     except TacpipeError as error:  # damaged
         picture = f"<pre>{escape(printable.lines([str(error)]))}</pre>"

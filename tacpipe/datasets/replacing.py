@@ -292,7 +292,7 @@ def returning_labels(
             back = {
                 recording
                 for recording in coming & set(former_manifest.recordings)
-                if not _is_gone(name, former_manifest, result)
+                if not _is_gone(recording, former_manifest, result)
             }
             labels |= {name: former_manifest.labels[name] for name in back & set(former_manifest.labels)}
             coming -= back

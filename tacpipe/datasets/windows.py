@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Int64s
-from tacpipe.channels import masks, streams
+from tacpipe.channels import streams
 from tacpipe.datasets import arrays
 from tacpipe.errors import UsageError
 from tacpipe.printable import listed, plain
 from tacpipe.signals.contact import rest_level
-from tacpipe.signals.windows import breaks, window_starts
+from tacpipe.signals.runs import breaks, window_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -252,7 +252,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     def _decoded(self, recording: Recording) -> _Rows:
         table = recording.table(self.stream)
-        t_ns = masks.times(table)
+        t_ns = streams.times(table)
         read = arrays.of_table(table)
         inputs, targets = (_matching(patterns, read, recording.name) for patterns in self._patterns)
         if self._channels is None:
@@ -269,8 +269,8 @@ class Windows(torch.utils.data.Dataset[Window]):
             values = _matrix(matrix, self.dtype, recording.name)
         else:
             values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
-        usable: Bools = ~masks.gaps(table) & np.isfinite(values).all(axis=1)
-        groups = np.cumsum(breaks(t_ns, masks.apart(recording.attributes)))
+        usable: Bools = ~streams.gaps(table) & np.isfinite(values).all(axis=1)
+        groups = np.cumsum(breaks(t_ns, streams.apart(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
         return _Rows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 

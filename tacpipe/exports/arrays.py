@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.arrays import AnyArray
-from tacpipe.channels.masks import GRID
+from tacpipe.channels.streams import GRID
 from tacpipe.exports import contents, frames
 from tacpipe.exports.contents import TIME, Loss
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray
-from tacpipe.channels.masks import GRID
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.streams import GRID, TRUTH
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Contents, Loss

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.channels.masks import GRID
+from tacpipe.channels.streams import GRID
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, Loss

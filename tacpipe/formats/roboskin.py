@@ -1,7 +1,7 @@
 """Slides of an iCub's forearm, RoboSkin, over the twenty materials that the BioTac slides have (IROS 2020).
 
 Published within dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, a file a fold, with a
-file of labels each. Their axes went through a wrong reshape before (`tacpipe.signals.scrambling`); which arrangement a file
+file of labels each. Their axes went through a wrong reshape before (`tacpipe.signals.array_order`); which arrangement a file
 has is derived from its values. The rate is not published.
 """
 
@@ -92,8 +92,8 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
 
     from tacpipe.channels import schema
     from tacpipe.formats import published
+    from tacpipe.signals.array_order import scramble
     from tacpipe.signals.resampling import uniform_grid
-    from tacpipe.signals.scrambling import scramble
 
     (block, place), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
     slide = _read_slide(block, place)  # (triangle, taxel, time)
@@ -184,8 +184,7 @@ def _read_slide(path: Path, place: int) -> Float32s:
     import numpy as np
 
     from tacpipe.channels.schema import TRIANGLE_TAXELS, TRIANGLES
-    from tacpipe.signals.axes import is_time, lag_one
-    from tacpipe.signals.scrambling import unscramble
+    from tacpipe.signals.array_order import is_time, lag_one, unscramble
 
     block = _cached_array(path)
     if block.dtype.kind not in "fiu" or block.shape[1:3] != (TRIANGLES, TRIANGLE_TAXELS) or block.shape[3] < 2:

@@ -41,7 +41,7 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.channels import schema
     from tacpipe.formats import published, xela
     from tacpipe.formats.csv_table import read_csv
-    from tacpipe.signals.holds import mean_rate_hz
+    from tacpipe.signals.repairs import mean_rate_hz
 
     trial = published.require(files, NAMES)
     meta = xela.TrialMeta(files[xela.META])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.link import Arrived, Opened
 from tacpipe.plugins import extras

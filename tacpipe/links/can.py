@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io.files import listed
-from tacpipe.links import serial_port
-from tacpipe.links.arrival import Arrivals
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links import ports
+from tacpipe.links.link import Arrivals, Arrived, Opened
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
@@ -45,7 +44,7 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
     with extras.explain_missing(name):
         import can
     if kind == "slcan":
-        serial_port.refuse_missing(channel, name)
+        ports.refuse_missing(channel, name)
     damaged: Arrived = []
     try:
         if kind == "slcan":
@@ -120,7 +119,7 @@ def parse_place(place: str) -> tuple[str, str, int | None]:
 def _open_error(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
     if kind == "slcan":
         cause = error if isinstance(error, OSError) else error.__cause__ or error.__context__
-        return serial_port.refused(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
+        return ports.refused(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
     interfaces = [path.name for path in listed(INTERFACES) if _hardware_type(path) == IS_CAN]
     if kind == "socketcan" and channel not in interfaces:
         return DeviceError(

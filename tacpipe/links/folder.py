@@ -11,8 +11,7 @@ import time
 from pathlib import Path
 
 from tacpipe.errors import DeviceError
-from tacpipe.links.arrival import Arrivals
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.link import Arrivals, Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
 
 LOOK_S = 0.02  # pause between scans of the folder

@@ -12,8 +12,7 @@ from typing import Any
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network, ports
-from tacpipe.links.arrival import Arrivals
-from tacpipe.links.link import Arrived, Descriptor, LinkLostError
+from tacpipe.links.link import Arrivals, Arrived, Descriptor, LinkLostError
 from tacpipe.printable import plain
 from tacpipe.sensors.sensor import Sensor
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Indices
 from tacpipe.recording.reading import Batch, Reading
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from tacpipe.live import wire
 from tacpipe.live.messages import Description, Message
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor

@@ -26,7 +26,7 @@ from tacpipe.live.messages import Message
 from tacpipe.live.publishing import Publishers
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 
 REPORT_NS = 250_000_000  # period of reports to the recording process
 FETCH_BYTES = 1 << 18  # read at once

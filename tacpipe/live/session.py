@@ -21,7 +21,7 @@ from tacpipe.live.settings import SessionOptions
 from tacpipe.live.wire import Tap
 from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.sensors.framing import Chunks
 
 MODULE = "tacpipe.live.process"  # runs as the model's process

@@ -15,8 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.recording import clock, spool_blocks
-from tacpipe.recording.spool_blocks import CHUNKS, HEAD, MARK, NOTE, WHOLE, Note
+from tacpipe.recording import clock, spool
+from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 
@@ -33,9 +33,9 @@ def block(stream: int | None, content: Chunks | Note) -> bytes:
     """Return one block as bytes; ``stream`` is the number of its stream, None for a note on all of them."""
     if isinstance(content, Chunks):
         body = content.t_ns.astype("<i8").tobytes() + content.size.astype("<u4").tobytes() + content.data
-        return spool_blocks.pack_block(CHUNKS, 0 if stream is None else stream, len(content.size), body)
+        return spool.pack_block(CHUNKS, 0 if stream is None else stream, len(content.size), body)
     note = json.dumps({"t_ns": content.t_ns, "what": content.what, "detail": content.detail}).encode()
-    return spool_blocks.pack_block(NOTE, WHOLE if stream is None else stream, 0, note)
+    return spool.pack_block(NOTE, WHOLE if stream is None else stream, 0, note)
 
 
 class Blocks:
@@ -60,7 +60,7 @@ class Blocks:
             if stop > len(self._text):
                 break
             stream = "" if number == WHOLE else self._streams[number]
-            content = spool_blocks.unpack_block(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
+            content = spool.unpack_block(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
             place = stop
             if content is not None:
                 yield stream, content

@@ -14,7 +14,7 @@ import numpy as np
 
 from tacpipe.arrays import Int64s, Times
 from tacpipe.recording.reading import Event
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 
 STALLED, CAUGHT_UP = "recorder_stalled", "caught_up"  # notes: this program was delayed; arrivals are certain again
 STALL_NS = 100_000_000  # delays below this are ordinary on a busy computer

@@ -18,8 +18,7 @@ from tacpipe.recording import rig as rigs
 from tacpipe.recording import spool as spool_of
 from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig, Stream
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.station import LOST, Station, explain_silence
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors import variants

@@ -12,7 +12,7 @@ from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import LOST, OPENED, OVERRUN
 from tacpipe.sensors.framing import Chunks

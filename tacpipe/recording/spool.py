@@ -14,6 +14,7 @@ torn or damaged block.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import mmap
@@ -21,16 +22,82 @@ import os
 import struct
 import time
 import uuid
+import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tacpipe.errors import TacpipeError
 from tacpipe.io.files import readable_errors, sync_folder, write_whole
-from tacpipe.recording import spool_blocks
-from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.spool_folders import FOLDER, refuse_link
 from tacpipe.sensors.framing import Chunks
+
+MARK = b"tacB"
+HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
+CHUNKS, NOTE = 0, 1  # kinds of blocks
+WHOLE = 255  # stream number of a note on the recording, whose stream is ""
+
+
+@dataclass(frozen=True)
+class Note:
+    """An event of a stream, such as a link that opened or was lost. ``what`` names it."""
+
+    t_ns: int
+    stream: str
+    what: str
+    detail: str = ""
+
+
+def pack_block(kind: int, stream: int, count: int, body: bytes) -> bytes:
+    """Return a block with ``body``, which has ``count`` chunks of the stream of this number."""
+    covered = HEAD.pack(MARK, 0, kind, stream, 0, count, len(body))[8:]
+    return MARK + struct.pack("<I", zlib.crc32(body, zlib.crc32(covered))) + covered + body
+
+
+def find_end(content: mmap.mmap, place: int) -> int | None:
+    """Return where the block at ``place`` ends, or None if no complete and undamaged block starts there."""
+    if place + HEAD.size > len(content) or content[place : place + 4] != MARK:
+        return None
+    _, check, _, _, _, _, size = HEAD.unpack_from(content, place)
+    stop = place + HEAD.size + int(size)
+    if stop > len(content):
+        return None
+    with memoryview(content) as view, view[place + 8 : stop] as covered:
+        return stop if zlib.crc32(covered) == check else None
+
+
+def find_next(handle: int, content: mmap.mmap, place: int) -> int:
+    """Return the next place after ``place`` where a block may begin. Holes of the file are skipped unread."""
+    try:
+        data = os.lseek(handle, place, os.SEEK_DATA)
+        if data > place:
+            return min(data, len(content))
+        stop = min(os.lseek(handle, place, os.SEEK_HOLE), len(content))
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # nothing follows but a hole
+            return len(content)
+        stop = len(content)  # the file system reports no holes
+    mark = content.find(MARK, place + 1, stop)
+    return stop if mark < 0 else mark
+
+
+def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
+    """Return the content of a block, or None where its check sum is right but another program wrote it."""
+    try:
+        if kind == NOTE:
+            entry = json.loads(body)
+            return Note(int(entry["t_ns"]), stream, str(entry["what"]), str(entry["detail"]))
+        stamps = np.frombuffer(body, "<i8", count)
+        sizes = np.frombuffer(body, "<u4", count, 8 * count).astype(np.int64)
+    except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
+        return None
+    if kind != CHUNKS or not count or int(sizes.sum()) != len(body) - 12 * count:
+        return None
+    return Chunks(stamps.astype(np.int64), sizes, body[12 * count :])
+
 
 ENDED = "ended"  # a note on the whole recording
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
@@ -77,18 +144,12 @@ class Spool:
         """Add bytes of a link. The next `write` hands them to the operating system."""
         if len(chunks.size):
             body = chunks.t_ns.astype("<i8").tobytes() + chunks.size.astype("<u4").tobytes() + chunks.data
-            self._waiting.append(
-                spool_blocks.pack_block(spool_blocks.CHUNKS, self.streams[stream], len(chunks.size), body)
-            )
+            self._waiting.append(pack_block(CHUNKS, self.streams[stream], len(chunks.size), body))
 
     def note(self, note: Note) -> None:
         """Add a note."""
         body = json.dumps({"t_ns": note.t_ns, "what": note.what, "detail": note.detail}).encode()
-        self._waiting.append(
-            spool_blocks.pack_block(
-                spool_blocks.NOTE, self.streams[note.stream] if note.stream else spool_blocks.WHOLE, 0, body
-            )
-        )
+        self._waiting.append(pack_block(NOTE, self.streams[note.stream] if note.stream else WHOLE, 0, body))
 
     def write(self) -> None:
         """Hand all added blocks to the operating system, so that they survive this process.

@@ -17,10 +17,9 @@ from typing import Any
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sync_folder
-from tacpipe.recording import spool_blocks, spool_folders
+from tacpipe.recording import spool, spool_folders
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED, RECOVERED
-from tacpipe.recording.spool import ENDED, TALLY
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import ENDED, TALLY, Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
@@ -94,23 +93,23 @@ class Spooled:
                 if place - passed >= PASSED_BYTES:  # spools are larger than memory, so release what was read
                     content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
                     passed += PASSED_BYTES
-                stop = spool_blocks.find_end(content, place)
+                stop = spool.find_end(content, place)
                 if stop is None:
-                    next_place = spool_blocks.find_next(file.fileno(), content, place)
+                    next_place = spool.find_next(file.fileno(), content, place)
                     self._add_damage(place, next_place - place)
                     place = next_place
                     continue
-                _, _, kind, number, _, count, size = spool_blocks.HEAD.unpack_from(content, place)
+                _, _, kind, number, _, count, size = spool.HEAD.unpack_from(content, place)
                 if (requested is None or number == requested) and number < len(self.streams):
-                    body = content[place + spool_blocks.HEAD.size : place + spool_blocks.HEAD.size + size]
-                    entry = spool_blocks.unpack_block(kind, self.streams[number], count, body)
+                    body = content[place + spool.HEAD.size : place + spool.HEAD.size + size]
+                    entry = spool.unpack_block(kind, self.streams[number], count, body)
                     if entry is None:
                         self._add_damage(place, stop - place)
                     else:
                         yield self.streams[number], entry
-                elif number == spool_blocks.WHOLE:
-                    entry = spool_blocks.unpack_block(
-                        kind, "", count, content[place + spool_blocks.HEAD.size : place + spool_blocks.HEAD.size + size]
+                elif number == spool.WHOLE:
+                    entry = spool.unpack_block(
+                        kind, "", count, content[place + spool.HEAD.size : place + spool.HEAD.size + size]
                     )
                     self._notes += [entry] if isinstance(entry, Note) else []
                 place = stop

@@ -11,18 +11,18 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import DeviceError, TacpipeError
-from tacpipe.links import dialogue, opening
-from tacpipe.links.dialogue import NoReplyError
+from tacpipe.links import opening
 from tacpipe.links.link import Link, LinkLostError, Opened
+from tacpipe.links.opening import NoReplyError
 from tacpipe.recording import clock
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
-    from tacpipe.links.recognition import Candidate
+    from tacpipe.links.probing import Candidate
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
@@ -124,7 +124,7 @@ class Station:
 
         def order(link: Link) -> None:
             try:
-                self._keep(dialogue.run_dialogue(link, sensor.taring(), name))
+                self._keep(opening.run_dialogue(link, sensor.taring(), name))
             except DeviceError as error:
                 failed.append(error)
             finished.set()
@@ -154,7 +154,7 @@ class Station:
         sensor = self.stream.sensor
         link = opening.open_link(self.stream.address, sensor, self.stream.name)
         try:
-            early = dialogue.run_dialogue(link, sensor.opening(link.local), self.stream.name)
+            early = opening.run_dialogue(link, sensor.opening(link.local), self.stream.name)
         except BaseException:
             link.close()
             raise
@@ -346,7 +346,7 @@ def explain_silence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, re
 
 def _explain_bytes(stream: Stream, heard: Chunks, *, reply: bool) -> str:
     """Return a sentence on the sensor that the bytes are of, empty if none is recognised."""
-    from tacpipe.links.recognition import Candidate, recognise
+    from tacpipe.links.probing import Candidate, recognise
 
     scheme, expected = stream.address.scheme, Candidate(stream.kind, stream.sensor)
     if reply and recognise(heard, scheme, [expected]):
@@ -367,7 +367,7 @@ def _explain_bytes(stream: Stream, heard: Chunks, *, reply: bool) -> str:
 
 def _nearer(expected: Candidate, recognised: Candidate) -> list[Candidate]:
     """Return variants of the rig file's sensor, each with one option of another sensor of the same kind."""
-    from tacpipe.links.recognition import Candidate
+    from tacpipe.links.probing import Candidate
 
     sensor: Any = expected.sensor
     variants = []

@@ -19,8 +19,7 @@ from tacpipe.recording.appending import NothingError
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import ENDED, Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import ENDED, Note, Spool
 from tacpipe.recording.spool_folders import users
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.watch import View

@@ -18,7 +18,7 @@ from tacpipe.io import progress, terminal
 from tacpipe.recording import clock
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 

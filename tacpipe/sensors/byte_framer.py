@@ -99,14 +99,14 @@ class ByteFramer:
             self._usual = size
         return place
 
-    def _chain(self, place: int, most: int | None = None) -> tuple[list[Span], int, bool]:
+    def _chain(self, place: int, limit: int | None = None) -> tuple[list[Span], int, bool]:
         """Return the good frames that follow one another from ``place``: spans of (start, size, count).
 
-        And where they end, and whether it is certain that no frame begins there. With ``most``, no more than so many.
+        Return also where they end, and whether it is certain that no frame begins there. ``limit`` is the largest count.
         """
         spans: list[Span] = []
         size_of_text = len(self._text.data)
-        limit = size_of_text if most is None else most
+        limit = size_of_text if limit is None else limit
         while limit > 0:
             size = self._size(place)
             if size is None or place + size > size_of_text:

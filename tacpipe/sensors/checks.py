@@ -40,7 +40,7 @@ def xor8(data: Bytes) -> Bytes:
 
 def crc8(data: Bytes, polynomial: int = 0x07) -> Bytes:
     """Return the CRC-8 of each frame (frame,): most significant bit first, from 0."""
-    return _crc(data, _left, polynomial, 8, b"").astype(np.uint8)
+    return _crc(data, _high_bit_first, polynomial, 8, b"").astype(np.uint8)
 
 
 def crc16_modbus(data: Bytes) -> Counts:
@@ -48,12 +48,12 @@ def crc16_modbus(data: Bytes) -> Counts:
 
     Source: MODBUS over Serial Line, V1.02, section 6.2.2.
     """
-    return _crc(data, _right, 0xA001, 16, b"\xff\xff").astype(np.uint16)
+    return _crc(data, _low_bit_first, 0xA001, 16, b"\xff\xff").astype(np.uint16)
 
 
 def crc16_ccitt(data: Bytes) -> Counts:
     """Return the CRC-16 of each frame (frame,): polynomial 0x1021, most significant bit first, from 0xFFFF."""
-    return _crc(data, _left, 0x1021, 16, b"\xff\xff").astype(np.uint16)
+    return _crc(data, _high_bit_first, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 
 
 def crc16_wts(data: Bytes) -> Counts:
@@ -63,7 +63,7 @@ def crc16_wts(data: Bytes) -> Counts:
 
 def crc32(data: Bytes) -> NDArray[np.uint32]:
     """Return the CRC-32 of each frame (frame,) as of Ethernet and zip: 0xEDB88320 reflected, from and with all bits."""
-    return ~_crc(data, _right, 0xEDB88320, 32, b"\xff\xff\xff\xff")
+    return ~_crc(data, _low_bit_first, 0xEDB88320, 32, b"\xff\xff\xff\xff")
 
 
 Kind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]  # polynomial and bits to a table (256,) and a step
@@ -76,7 +76,11 @@ def _crc(data: Bytes, kind: Kind, polynomial: int, bits: int, start: bytes) -> N
     """
     count = data.shape[1]
     unused = start[count:]  # bytes of the first value that are combined with no byte
-    remainder = int.from_bytes(unused.ljust(len(start), b"\x00")) if kind is _left else int.from_bytes(unused, "little")
+    remainder = (
+        int.from_bytes(unused.ljust(len(start), b"\x00"))
+        if kind is _high_bit_first
+        else int.from_bytes(unused, "little")
+    )
     crc = np.full(len(data), remainder, dtype=np.uint32)
     if not count:
         return crc
@@ -102,15 +106,15 @@ def _added(kind: Kind, polynomial: int, bits: int, count: int) -> NDArray[np.uin
     return np.stack(rows)
 
 
-def _right(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
+def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
     """Return table and step of a CRC that takes the least significant bit first."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(polynomial), table >> 1)
-    return table, _step_right
+    return table, _step_low_bit_first
 
 
-def _left(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
+def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
     """Return table and step of a CRC that takes the most significant bit first."""
     mask = np.uint32((1 << bits) - 1)
     table = np.arange(256, dtype=np.uint32) << np.uint32(bits - 8)
@@ -125,10 +129,10 @@ def _left(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
 
 
 def _mixed(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return the table of `_left` with the step of `_right`."""
-    return _left(polynomial, bits)[0], _step_right
+    """Return the table of `_high_bit_first` with the step of `_low_bit_first`."""
+    return _high_bit_first(polynomial, bits)[0], _step_low_bit_first
 
 
-def _step_right(crc: NDArray[np.uint32], table: NDArray[np.uint32]) -> NDArray[np.uint32]:
+def _step_low_bit_first(crc: NDArray[np.uint32], table: NDArray[np.uint32]) -> NDArray[np.uint32]:
     stepped: NDArray[np.uint32] = table[crc & 0xFF] ^ (crc >> 8)
     return stepped

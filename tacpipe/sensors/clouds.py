@@ -1,6 +1,6 @@
 """Clouds of points: what a depth camera sees, or the files that its program leaves in a folder, one cloud at a time.
 
-A chunk is one cloud: the content of a PLY or PCD file, or a `tacpipe.clouds.depth_frame.DepthFrame`. Each of its points is
+A chunk is one cloud: the content of a PLY or PCD file, or a `tacpipe.clouds.cloud.DepthFrame`. Each of its points is
 a row of the stream, all with the stamp of the cloud, in the columns of the stream ``scene`` that `tacpipe segment grasps`
 reads.
 """
@@ -17,8 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s
 from tacpipe.clouds import pcd, ply
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.depth_frame import MAGIC, DepthFrame
+from tacpipe.clouds.cloud import MAGIC, Cloud, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor

@@ -280,13 +280,13 @@ class Generic(DescribedSensor):
 def _names(number: Number) -> list[tuple[str, dict[str, str]]]:
     """Return name and metadata of each channel that a number is."""
     metadata = {"unit": number.unit, "quantity": number.quantity}
-    found = []
+    channels: list[tuple[str, dict[str, str]]] = []
     names = [number.name] if number.count == 1 else taxels.numbered(number.name, number.count)
     for place, name in enumerate(names, start=1):
         mine = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(place)}
         key = "axis" if number.quantity == "tactile" else "component"
-        found += [(f"{name}_{axis}", {**mine, key: axis}) for axis in number.axes] or [(name, mine)]
-    return found
+        channels += [(f"{name}_{axis}", {**mine, key: axis}) for axis in number.axes] or [(name, mine)]
+    return channels
 
 
 def _bytes(name: str, text: str) -> bytes:

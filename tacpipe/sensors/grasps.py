@@ -74,11 +74,11 @@ class Grasps(Sensor):
         """Return a sample for each grasp of each request; the wrist is NaN where it is not given."""
         requests = [parsed(frame) for frame in frames]
         rows = [len(request["grasps"]) for request in requests]
-        numbers = [[one["request"], place] for one in requests for place in range(len(one["grasps"]))]
+        numbers = [[request["request"], place] for request in requests for place in range(len(request["grasps"]))]
         places = [
             [*grasp["g1"], *grasp["g2"], *itertools.chain.from_iterable(grasp.get("wrist") or [[math.nan] * 3] * 3)]
-            for one in requests
-            for grasp in one["grasps"]
+            for request in requests
+            for grasp in request["grasps"]
         ]
         return Samples(
             (

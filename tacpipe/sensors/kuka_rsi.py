@@ -224,8 +224,8 @@ def _text(outputs: Sequence[str], values: Sequence[Sequence[float]], ipoc: int) 
     root = ElementTree.Element("Rob", Type="KUKA")
     for name, numbers in zip(outputs, values, strict=True):
         tag, _, attribute = name.partition(".")
-        found = root.find(tag)
-        element = ElementTree.SubElement(root, tag) if found is None else found
+        existing = root.find(tag)
+        element = ElementTree.SubElement(root, tag) if existing is None else existing
         write: Callable[[float], str] = "{:.4f}".format
         if name in ATTRIBUTES or attribute:
             for part, number in zip(ATTRIBUTES.get(name, (attribute,)), numbers, strict=True):

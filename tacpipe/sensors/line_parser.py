@@ -241,11 +241,11 @@ def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
     )
     bodies, declared = [], []
     for line in lines:
-        body, separator, written = line.rpartition(mark)
-        if not separator or not body.startswith(begin) or not digits.fullmatch(written.strip(b" \t")):
+        body, separator, digits_text = line.rpartition(mark)
+        if not separator or not body.startswith(begin) or not digits.fullmatch(digits_text.strip(b" \t")):
             return None
         bodies.append(body)
-        declared.append(int(written, 16 if total.digits == "hex" else 10))
+        declared.append(int(digits_text, 16 if total.digits == "hex" else 10))
     end = mark if total.mark_summed else b""
     summed = [body[len(begin) :] + end for body in bodies]
     return bodies if (sums(summed, total) == np.array(declared)).all() else None

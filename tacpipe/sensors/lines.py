@@ -216,7 +216,7 @@ class Lines(DescribedSensor):
         if self.clock is not None and samples.t_device_ns is not None:
             place, cell = self._places[self.clock.column]
             columns[place] = self._ticks(cell, samples.t_device_ns)
-        texts = [self._written(cell, column) for cell, column in zip(self._cells, columns, strict=True)]
+        texts = [self._format_column(cell, column) for cell, column in zip(self._cells, columns, strict=True)]
         between = self.separator
         lines = [f"{self.prefix}{between.join(row)}{self.suffix}".encode() for row in zip(*texts, strict=True)]
         return lines if self.sum is None else _summed(lines, self.sum)
@@ -229,7 +229,7 @@ class Lines(DescribedSensor):
         ticks = (t_device_ns + unit_ns // 2) // unit_ns
         return np.asarray(ticks % (self.device_wrap_ns // unit_ns) if self.device_wrap_ns else ticks)
 
-    def _written(self, cell: Cell, column: AnyArray) -> list[str]:
+    def _format_column(self, cell: Cell, column: AnyArray) -> list[str]:
         words = [str(value) for value in (column.astype(cell.kind) if cell.kind.kind == "f" else column)]
         if cell.kind.kind == "f":
             words = [word.replace(".", self.decimal) for word in words]

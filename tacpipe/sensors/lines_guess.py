@@ -50,11 +50,11 @@ def of(data: Chunks) -> list[Options]:
         return []
     options: Options = {}
     total, bodies = _sum(texts)
-    found = _cells(bodies)
-    if found is None:
+    cells_of_lines = _cells(bodies)
+    if cells_of_lines is None:
         return []
-    prefix, separator, suffix, decimal, cells, kept = found
-    t_ns = t_ns[kept]
+    prefix, separator, suffix, decimal, cells, cell_rows = cells_of_lines
+    t_ns = t_ns[cell_rows]
     labels, words = _labels(cells)
     if words is None or len(words) < FEWEST:
         return []
@@ -118,7 +118,7 @@ def _sum(lines: Sequence[str]) -> tuple[Options | None, list[str]]:
 
 def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Options | None:
     base = 16 if digits == "hex" else 10
-    words = [written.strip() for _, _, written in parted]
+    words = [options.strip() for _, _, options in parted]
     try:
         declared = np.array(
             [int(word, base) if not set(word) - set("0123456789abcdefABCDEF") else -1 for word in words]
@@ -137,10 +137,10 @@ def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Opt
                 end = mark if through else ""
                 texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in parted]
                 if (sums(texts, total) == declared).mean() >= STEADY:
-                    written: Options = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
-                    written["mark_summed"] = through
+                    options: Options = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
+                    options["mark_summed"] = through
                     usual = {"mark": "*", "digits": "hex", "begin": "", "mark_summed": False}
-                    return {name: value for name, value in written.items() if usual.get(name) != value}
+                    return {name: value for name, value in options.items() if usual.get(name) != value}
     return None
 
 

@@ -114,12 +114,12 @@ class Lsl(Sensor):
         """Return the samples of packets, several each: channels and corrections, and the stamps as they were sent."""
         opened = [(row, self._opened(frame)) for row, frame in enumerate(frames)]
         parts = [(row, packet) for row, packet in opened if packet is not None]
-        counts = [len(one[1]) for _, one in parts]
-        corrections = np.repeat([one[0] for _, one in parts], counts).astype(np.float64)[:, None]
+        counts = [len(block[1]) for _, block in parts]
+        corrections = np.repeat([block[0] for _, block in parts], counts).astype(np.float64)[:, None]
         kind = object if self._is_text else self._dtype.newbyteorder("=")
         empty = np.zeros((0, len(self.channels)), dtype=kind)
-        values = np.concatenate([empty, *(one[2] for _, one in parts)]).astype(kind)
-        stamps = np.concatenate([np.zeros(0), *(one[1] for _, one in parts)])
+        values = np.concatenate([empty, *(block[2] for _, block in parts)]).astype(kind)
+        stamps = np.concatenate([np.zeros(0), *(block[1] for _, block in parts)])
         blocks = (values, corrections) if self.channels else (corrections,)
         return Samples(
             (np.hstack(blocks),) if values.dtype == corrections.dtype else blocks,

@@ -52,18 +52,18 @@ class FreshFramer:
             losses.append(Loss(int(run.t_ns[-1]), STALE, 0, run.frames.size))
         return fresh, losses
 
-    def _parted(self, held: list[Run]) -> tuple[list[Run], list[Run]]:
+    def _parted(self, runs: list[Run]) -> tuple[list[Run], list[Run]]:
         """Return the runs before the last jump and those from it on."""
-        if not held:
+        if not runs:
             return [], []
-        counters = np.concatenate([self._counters(run.frames) for run in held])
-        t_ns = np.concatenate([run.t_ns for run in held])
+        counters = np.concatenate([self._counters(run.frames) for run in runs])
+        t_ns = np.concatenate([run.t_ns for run in runs])
         half = self._modulus // 2
         steps = (np.diff(counters[t_ns - t_ns[0] < SETTLE_NS]) + half) % self._modulus - half
         jumps = np.flatnonzero((steps < 0) | (steps > self._most))
         dropped = int(jumps[-1]) + 1 if len(jumps) else 0  # frames to drop
         stale, fresh = [], []
-        for run in held:
+        for run in runs:
             count = min(dropped, len(run.t_ns))
             dropped -= count
             if count:

@@ -82,19 +82,19 @@ class Tap(Sensor):
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return a sample for each record; of grasps, for each record that holds one."""
-        found = [(row, line, json.loads(line)) for row, frame in enumerate(frames) for line in _lines(frame)]
-        found = [one for one in found if not self.grasp or "grasp" in one[2]]
-        records = [record for _, _, record in found]
+        entries = [(row, line, json.loads(line)) for row, frame in enumerate(frames) for line in _lines(frame)]
+        entries = [entry for entry in entries if not self.grasp or "grasp" in entry[2]]
+        records = [record for _, _, record in entries]
         if self.grasp:
             values: tuple[AnyArray, ...] = (self._grasps(records),)
         else:
-            texts = [[str(record.get("event", "")), line.decode()] for _, line, record in found]
-            values = (np.array(texts, dtype=object).reshape(len(found), 2), self._numbers(records))
+            texts = [[str(record.get("event", "")), line.decode()] for _, line, record in entries]
+            values = (np.array(texts, dtype=object).reshape(len(entries), 2), self._numbers(records))
         return Samples(
             values,
             seq=np.array([record["seq"] for record in records], dtype=np.int64) if self.counted else None,
             t_device_ns=np.array([record["t_ns"] for record in records], dtype=np.int64) if self.timed else None,
-            rows=np.array([row for row, _, _ in found], dtype=np.int64),
+            rows=np.array([row for row, _, _ in entries], dtype=np.int64),
         )
 
     def encode(self, samples: Samples) -> list[bytes]:

@@ -111,9 +111,9 @@ class TfMini(Sensor):
 
     def encode(self, samples: Samples) -> Bytes:
         """Return the frames of these samples."""
-        words, *others = samples.values
+        words, *further_columns = samples.values
         marker = np.broadcast_to(np.frombuffer(MARKER, np.uint8), (len(words), 2))
-        body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *others])
+        body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *further_columns])
         return np.hstack([body, sum8(body)[:, None]])
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:

@@ -207,12 +207,12 @@ def _ask(kind: int, payload: bytes) -> Ask:
     def until(data: bytes) -> int | tuple[int, int]:
         place = 0
         while len(data) >= place + HEADER.size:
-            size, found = HEADER.unpack_from(data, place)
-            if found not in KINDS or size < HEADER.size:
+            size, package_kind = HEADER.unpack_from(data, place)
+            if package_kind not in KINDS or size < HEADER.size:
                 raise DeviceError(
                     f"Bytes {data[place : place + 8].hex(' ')} came, which are not RTDE. Is the port 30004?"
                 )
-            if found == kind:
+            if package_kind == kind:
                 return (place, place + size) if len(data) >= place + size else 0
             place += size
         return 0

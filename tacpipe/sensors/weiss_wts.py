@@ -180,17 +180,17 @@ class _Wts(Device):
         return replies
 
     def _done(self, number: int, payload: bytes) -> bytes:
-        done, unknown = b"\x00\x00", b"\x0e\x00"
+        accepted, unknown = b"\x00\x00", b"\x0e\x00"
         if number == MATRIX:
             sizes = (self.sensor.columns, self.sensor.rows, 340, 340, HIGHEST)  # cells are 3.4 mm wide, in 1/100 mm
-            return done + b"".join(size.to_bytes(2, "little") for size in sizes)
+            return accepted + b"".join(size.to_bytes(2, "little") for size in sizes)
         if number == START and len(payload) == 3:
             self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(payload[1:], "little"))
         elif number == STOP:
             self.streaming = False
         elif number != TARE:
             return unknown
-        return done
+        return accepted
 
 
 def message(number: int, payload: bytes = b"") -> bytes:

@@ -14,7 +14,10 @@ from tacpipe.arrays import Int64s, Times
 from tacpipe.signals.clocks import MOST_DRIFT, STEP_NS, Segment
 
 NEIGHBOURS = 3  # measurements on either side of a jump that must lie apart for a reset
-LINE_ROWS, LINE_NS = 3, 10_000_000_000  # what is shorter shows the errors of its measurements, not a drift
+LINE_ROWS, LINE_NS = (
+    3,
+    10_000_000_000,
+)  # least measurements and time of a line: a shorter one shows the errors of its measurements, no drift
 MOST_PAIRED = 512  # measurements whose pairs are looked at; of more, as many evenly spaced
 
 
@@ -44,15 +47,15 @@ def resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
     steps_ns = np.diff(device_ns)
     jumps_ns = np.diff(offset_ns)
     suspected = (steps_ns < 0) | (np.abs(jumps_ns) > STEP_NS + MOST_DRIFT * np.abs(steps_ns))
-    found: list[int] = []
+    rows: list[int] = []
     for row in (np.flatnonzero(suspected) + 1).tolist():
-        before = offset_ns[max(found[-1] if found else 0, row - NEIGHBOURS) : row]
+        before = offset_ns[max(rows[-1] if rows else 0, row - NEIGHBOURS) : row]
         after = offset_ns[row : row + NEIGHBOURS]
         apart_ns = abs(float(np.median(after)) - float(np.median(before)))
         stays = apart_ns > abs(float(jumps_ns[row - 1])) / 2 and len(after) > 1
         if stays or (steps_ns[row - 1] < 0 and apart_ns > STEP_NS):
-            found.append(row)
-    return found
+            rows.append(row)
+    return rows
 
 
 def host_times(segments: tuple[Segment, ...], starts: list[int], device_ns: Times) -> Times:
@@ -62,7 +65,8 @@ def host_times(segments: tuple[Segment, ...], starts: list[int], device_ns: Time
     """
     edges = [0, *starts[1:], len(device_ns)]
     mapped = [
-        one.host_times(device_ns[start:stop]) for one, start, stop in zip(segments, edges[:-1], edges[1:], strict=True)
+        segment.host_times(device_ns[start:stop])
+        for segment, start, stop in zip(segments, edges[:-1], edges[1:], strict=True)
     ]
     return np.concatenate(mapped)
 

@@ -23,15 +23,15 @@ from tacpipe.errors import TacpipeError
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 STEP_NS = 20_000_000  # smaller steps are latency: no device restarts within 20 ms
-STEP_WINDOW_NS = 2_000_000_000  # on both sides of a step the clock has to stay that long; stalls of a host are shorter
+STEP_WINDOW_NS = 2_000_000_000  # time that the clock must stay on both sides of a step; stalls of a host are shorter
 STEP_WINDOW_ROWS = (16, 4096)
 STEPS_LOOKED_AT = 64  # the largest jumps; a link that stalls more often than that hides restarts no smaller than these
 LOW = 0.1  # quantile that represents the fastest samples of a stretch: a few wrong stamps do not move it
 ROUGH_LOW, ROUGH_BLOCKS, ROUGH_ROWS = 0.05, 64, 8  # quantile, number and least length of the blocks of the first line
 EARLY_NS = 100_000.0  # least distance below the first line beyond which a sample is left out
-LINE_ROWS, LINE_NS = 32, 2_000_000_000  # what is shorter shows jitter, not drift
+LINE_ROWS, LINE_NS = 32, 2_000_000_000  # least rows and time of a line: a shorter one shows jitter, no drift
 HULL_BLOCKS = 512
-ENOUGH_ROWS = 1 << 14  # for a median and for the first line; the envelope itself looks at all rows
+ENOUGH_ROWS = 1 << 14  # rows for a median and for the first line; the envelope itself uses all rows
 MOST_DRIFT = 0.1  # an RC oscillator is off by a few percent; beyond, the stamps are not nanoseconds
 
 
@@ -41,7 +41,7 @@ class Segment:
 
     start: int
     stop: int
-    device_ns: int  # of the segment's first row
+    device_ns: int  # device time of the segment's first row
     host_ns: int  # the host's time at that reading
     drift: float  # host seconds a device second, less 1
 
@@ -54,19 +54,19 @@ class Segment:
 
 @dataclass(frozen=True)
 class ClockFit:
-    """What is known of a device's clock, and how late its samples came.
+    """The fitted clock of a device, and the delays of its samples.
 
     ``residual_ns`` are the quantiles `QUANTILES` of arrival less mapped time: latency beyond that of the fastest samples.
     """
 
     segments: tuple[Segment, ...]
     residual_ns: tuple[float, ...]
-    median_residual_ns: float  # of the absolute residuals
+    median_residual_ns: float  # median of the absolute residuals
 
     @property
     def longest(self) -> Segment:
         """The segment with the most rows, which speaks for the clock."""
-        return max(self.segments, key=lambda one: one.stop - one.start)
+        return max(self.segments, key=lambda segment: segment.stop - segment.start)
 
     @property
     def offset_ns(self) -> int:
@@ -108,8 +108,8 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
     edges = [0, *clock_steps(device_ns, arrival_ns), len(device_ns)]
     spans = list(pairwise(edges))
     drifts = [_drift(device_ns[start:stop], arrival_ns[start:stop]) for start, stop in spans]
-    known = [(stop - start, drift) for (start, stop), drift in zip(spans, drifts, strict=True) if drift is not None]
-    borrowed = max(known)[1] if known else 0.0
+    fitted = [(stop - start, drift) for (start, stop), drift in zip(spans, drifts, strict=True) if drift is not None]
+    borrowed = max(fitted)[1] if fitted else 0.0
     segments = tuple(
         _anchored(start, stop, device_ns, arrival_ns, borrowed if drift is None else drift)
         for (start, stop), drift in zip(spans, drifts, strict=True)
@@ -121,9 +121,9 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
 
 def _spread(fit: ClockFit, rows: Int64s, count: int) -> ClockFit:
     """Return a fit of some ``rows`` as one of all ``count``: a row that was left out belongs to the segment before it."""
-    edges = [0, *(int(rows[one.start]) for one in fit.segments[1:]), count]
+    edges = [0, *(int(rows[segment.start]) for segment in fit.segments[1:]), count]
     spans = zip(fit.segments, edges[:-1], edges[1:], strict=True)
-    return replace(fit, segments=tuple(replace(one, start=start, stop=stop) for one, start, stop in spans))
+    return replace(fit, segments=tuple(replace(segment, start=start, stop=stop) for segment, start, stop in spans))
 
 
 def host_times(fit: ClockFit, device_ns: Times, arrival_ns: Times) -> Times:
@@ -134,8 +134,8 @@ def host_times(fit: ClockFit, device_ns: Times, arrival_ns: Times) -> Times:
     """
     mapped = _mapped(fit.segments, device_ns)
     ahead = mapped - arrival_ns > STEP_NS
-    taken: Times = np.maximum.accumulate(np.where(ahead, arrival_ns, mapped))
-    return taken
+    host_ns: Times = np.maximum.accumulate(np.where(ahead, arrival_ns, mapped))
+    return host_ns
 
 
 def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
@@ -149,7 +149,7 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
     jumps = np.abs(np.diff(apart))
     if not len(jumps) or jumps.max() <= STEP_NS:
         return []
-    usual = float(np.median(_some(jumps)))  # of a difference of latencies; a step is far beyond
+    usual = float(np.median(_some(jumps)))  # median difference of latencies; a step is far beyond
     rows = np.flatnonzero(jumps > max(STEP_NS, 8 * usual)) + 1
     rows = rows[np.argsort(-jumps[rows - 1], kind="stable")][:STEPS_LOOKED_AT]
     period_ns = max(float(np.median(_some(np.diff(arrival_ns)))), 1.0)
@@ -228,14 +228,14 @@ def _envelope_slope(since_ns: Floats, level_ns: Floats) -> float:
     Only the lowest row of each of `HULL_BLOCKS` blocks is looked at: of nearly level values the hull has no others.
     """
     rows = max(1, len(since_ns) // HULL_BLOCKS)
-    whole = len(since_ns) // rows * rows
-    lowest = level_ns[:whole].reshape(-1, rows).argmin(axis=1) + np.arange(0, whole, rows)
-    lowest = np.append(lowest, np.arange(whole, len(since_ns)))
+    full_rows = len(since_ns) // rows * rows
+    lowest = level_ns[:full_rows].reshape(-1, rows).argmin(axis=1) + np.arange(0, full_rows, rows)
+    lowest = np.append(lowest, np.arange(full_rows, len(since_ns)))
     lowest = lowest[np.lexsort((level_ns[lowest], since_ns[lowest]))]
     hull: list[tuple[float, float]] = []
     for time, level in zip(since_ns[lowest].tolist(), level_ns[lowest].tolist(), strict=True):
         if hull and time == hull[-1][0]:
-            continue  # at the same time the first one is the lower
+            continue  # of two points at one time the first is the lower
         while len(hull) > 1 and _turns_up(hull[-2], hull[-1], (time, level)):
             hull.pop()
         hull.append((time, level))
@@ -261,4 +261,4 @@ def _anchored(start: int, stop: int, device_ns: Times, arrival_ns: Times, drift:
 
 
 def _mapped(segments: tuple[Segment, ...], device_ns: Times) -> Times:
-    return np.concatenate([one.host_times(device_ns[one.start : one.stop]) for one in segments])
+    return np.concatenate([segment.host_times(device_ns[segment.start : segment.stop]) for segment in segments])

@@ -1,4 +1,4 @@
-"""Smoothing of evenly spaced samples, with the whole of a signal or with what came so far."""
+"""Smooth evenly spaced samples, with the full signal or causally, and reduce a signal to its envelope."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Floats
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.errors import TacpipeError
 
 PAD_ROWS = 9  # scipy.signal.filtfilt's default for a filter of second order: three times its three coefficients
@@ -29,13 +29,13 @@ class Biquad:
         gain = (b0 + b1 + b2) / (1 + a1 + a2)
         second_state = (b2 - a2 * gain) * first
         first_state = (b1 - a1 * gain) * first + second_state
-        found = []
+        filtered = []
         for value in values.tolist():  # a recursion; plain numbers are faster than numpy's here
             smooth = b0 * value + first_state
             first_state = b1 * value - a1 * smooth + second_state
             second_state = b2 * value - a2 * smooth
-            found.append(smooth)
-        return np.array(found, dtype=np.float64)
+            filtered.append(smooth)
+        return np.array(filtered, dtype=np.float64)
 
     def both_ways(self, values: AnyArray) -> Floats:
         """Return ``values`` (time,) filtered forwards and backwards, which shifts nothing in time.
@@ -93,5 +93,27 @@ def _medians(values: AnyArray, before: int, after: int) -> Floats:
         return np.zeros(0)
     padded = np.pad(values.astype(np.float64), (before, after), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, before + after + 1)  # (time, rows)
-    found: Floats = np.median(windows, axis=1)
-    return found
+    medians: Floats = np.median(windows, axis=1)
+    return medians
+
+
+def envelope(t_ns: Times, values: AnyArray, points: int) -> tuple[Times, Floats]:
+    """Return a signal (time, channel) with at most ``points`` rows that looks the same as a line: times, values.
+
+    A longer one is cut into ``points // 2`` stretches of equal time. Of each that has rows, two remain: the least values,
+    at its first row, and the largest, at its middle one. NaN is left out where a stretch has anything else. Times ascend.
+
+    >>> t_ns, values = envelope(np.arange(6), np.array([[0], [9], [1], [5], [-7], [6]]), points=4)
+    >>> t_ns.tolist(), values.ravel().tolist()
+    ([0, 1, 3, 4], [0.0, 9.0, -7.0, 6.0])
+    """
+    floats = np.asarray(values, dtype=np.float64)
+    if len(t_ns) <= points:
+        return t_ns, floats
+    edges_ns = np.linspace(t_ns[0], t_ns[-1], points // 2 + 1)[:-1]
+    starts = np.unique(np.searchsorted(t_ns, edges_ns))
+    middles = (starts + np.append(starts[1:], len(t_ns))) // 2
+    extremes = np.empty((2 * len(starts), floats.shape[1]))
+    extremes[::2] = np.fmin.reduceat(floats, starts, axis=0)
+    extremes[1::2] = np.fmax.reduceat(floats, starts, axis=0)
+    return np.column_stack([t_ns[starts], t_ns[middles]]).ravel(), extremes

@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.signals.rotations import matrices_of
 
-BLOCK_ROWS = 1 << 14  # whose frames are computed at once
+BLOCK_ROWS = 1 << 14  # rows whose frames are computed at once
 TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
 TURN_SPREAD = 0.01  # the same of the entries of its rotation matrix
 
@@ -104,8 +104,8 @@ def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, ha
     ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).
     """
     velocity = np.empty((len(joint_rad), 6))
-    for some in _blocks(len(joint_rad)):
-        velocity[some] = velocity_in(joint_frames(chain, joint_rad[some]), joint_rad_s[some], hand_m[some])
+    for block in _blocks(len(joint_rad)):
+        velocity[block] = velocity_in(joint_frames(chain, joint_rad[block]), joint_rad_s[block], hand_m[block])
     return velocity
 
 
@@ -113,7 +113,7 @@ def velocity_in(frames: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) ->
     """Return the velocity (time, 6) that `hand_velocity` does, with the poses of the joints from `joint_frames`."""
     axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
     levers = np.cross(axes, hand_m[:, None] - places)
-    parts = [np.einsum("tja,tj->ta", one, joint_rad_s) for one in (levers, axes)]
+    parts = [np.einsum("tja,tj->ta", vectors, joint_rad_s) for vectors in (levers, axes)]
     return np.concatenate(parts, axis=1)
 
 

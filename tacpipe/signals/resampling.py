@@ -1,4 +1,4 @@
-"""Where a signal stands between its samples: grids, interpolation, distance and gaps.
+"""Resample signals: grids, interpolation, distance to samples, and gaps.
 
 Time is int64 nanoseconds throughout. Only differences of stamps become floats, so that stamps near 1.6e18 (UTC today)
 lose nothing: as float64 they would be rounded to 256 ns. Stamps must not run backwards; equal ones are allowed, and the
@@ -82,14 +82,14 @@ def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -
 
     ``values`` are (time, channel). Where no sample is that near, the value is that of `linear`.
     """
-    found = linear(t_ns, values, grid_ns)
+    medians = linear(t_ns, values, grid_ns)
     first = np.searchsorted(t_ns, grid_ns - half_ns, side="left")
     count = np.searchsorted(t_ns, grid_ns + half_ns, side="right") - first
     for samples in np.unique(count[count > 0]).tolist():  # few different ones: about as many come in each window
         points = np.flatnonzero(count == samples)
         windows = values[first[points, None] + np.arange(samples)]  # (point, sample, channel)
-        found[points] = np.median(windows, axis=1)
-    return found
+        medians[points] = np.median(windows, axis=1)
+    return medians
 
 
 def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
@@ -98,9 +98,9 @@ def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
     A stream of 1 kHz on a grid of 50 Hz is gathered from a tenth of its rows.
     """
     lower, upper, _ = _neighbours(t_ns, grid_ns)
-    wanted = np.zeros(len(t_ns), dtype=bool)
-    wanted[lower] = wanted[upper] = True
-    return np.flatnonzero(wanted)
+    bracketing = np.zeros(len(t_ns), dtype=bool)
+    bracketing[lower] = bracketing[upper] = True
+    return np.flatnonzero(bracketing)
 
 
 def nearest_rows(t_ns: Times, grid_ns: Times) -> Indices:
@@ -139,8 +139,8 @@ def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
 
     That is what `in_gap` can state of a gap before the sample that ends it has come.
     """
-    found: Bools = grid_ns - newest_ns > gap_ns
-    return found
+    overdue: Bools = grid_ns - newest_ns > gap_ns
+    return overdue
 
 
 def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -> Floats:
@@ -150,11 +150,11 @@ def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -
     sample that is not after it.
     """
     newest = newest_rows(t_ns, grid_ns)
-    found: Floats = values[newest].astype(np.float64)
+    medians: Floats = values[newest].astype(np.float64)
     first = np.searchsorted(t_ns, grid_ns - span_ns, side="left")
     for point in np.flatnonzero(newest > first):
-        found[point] = np.median(values[first[point] : newest[point] + 1].astype(np.float64), axis=0)
-    return found
+        medians[point] = np.median(values[first[point] : newest[point] + 1].astype(np.float64), axis=0)
+    return medians
 
 
 def default_gap_ns(t_ns: Times) -> int:
@@ -176,8 +176,8 @@ def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     """
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
-    found: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
-    return found
+    inside: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
+    return inside
 
 
 def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from tacpipe.arrays import Floats
 
-UPRIGHT = 1e-12  # by which the sine of a right angle may miss 1
+UPRIGHT = 1e-12  # largest distance of the sine of a right angle from 1
 
 
 def continuous(quaternions: Floats) -> Floats:
@@ -74,8 +74,8 @@ def vectors_of(quaternions: Floats) -> Floats:
     signed = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
     sine = np.linalg.norm(signed[:, :3], axis=1, keepdims=True)
     half = np.arctan2(sine, signed[:, 3:])
-    found: Floats = signed[:, :3] * 2 / np.sinc(half / np.pi)
-    return found
+    vectors: Floats = signed[:, :3] * 2 / np.sinc(half / np.pi)
+    return vectors
 
 
 def quaternions_of_angles(angles_rad: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Where a finger slides within a recording, which of its frames are kept, and whether it slid as it should."""
+"""Find the slide of a finger within a recording, choose its frames, and check it against the protocol."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CROPS = ("middle", "offset", "none")
 
 @dataclass(frozen=True)
 class Protocol:
-    """What each slide of an experiment should be like."""
+    """The protocol that each slide of an experiment should follow."""
 
     speed_m_s: float
     speed_tolerance: float  # fraction of it
@@ -37,9 +37,9 @@ def trigger_row(pressure: AnyArray, threshold: float) -> int:
     """
     reached = pressure >= threshold
     if not reached.any():
-        most = f"its most is {np.nanmax(pressure):g}" if np.isfinite(pressure).any() else "it has no reading"
+        largest = f"its most is {np.nanmax(pressure):g}" if np.isfinite(pressure).any() else "it has no reading"
         raise TacpipeError(
-            f"The pressure never reaches {threshold:g} counts, {most}; no slide began. Exclude the recording, or lower "
+            f"The pressure never reaches {threshold:g} counts, {largest}; no slide began. Exclude the recording, or lower "
             f"`--pressure-trigger`."
         )
     return int(reached.argmax())
@@ -55,10 +55,10 @@ def touched_rows(load: Floats, on: float, off: float, unit: str = "") -> Rows:
     """
     reached = load >= on
     if not reached.any():
-        most = f"{np.nanmax(load):.3g}" if np.isfinite(load).any() else "no reading"
+        largest = f"{np.nanmax(load):.3g}" if np.isfinite(load).any() else "no reading"
         raise TacpipeError(
-            f"The load never reaches {on:.3g} {unit}, its most is {most}; no slide began. Exclude the recording, or lower "
-            f"`--load-trigger`."
+            f"The load never reaches {on:.3g} {unit}, its most is {largest}; no slide began. Exclude the recording, or "
+            f"lower `--load-trigger`."
         )
     return int(reached.argmax()), int(np.flatnonzero(load >= off)[-1]) + 1
 
@@ -118,12 +118,12 @@ def measured(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, flo
     >>> measured(np.array([10, 20]), {"speed_m_s": np.array([0.02, 0.03]), "force_n": np.array([np.nan, 1.0])})
     {'pressure_mean_count': 15.0, 'speed_m_s': 0.025}
     """
-    found = {"pressure_mean_count": round(float(pressure.mean()), 3)}
+    figures = {"pressure_mean_count": round(float(pressure.mean()), 3)}
     kinds: tuple[tuple[str, Callable[..., Any], int], ...] = (("speed_m_s", np.median, 5), ("force_n", np.mean, 3))
     for name, average, digits in kinds:
         if name in profile and np.isfinite(profile[name]).all():
-            found[name] = round(float(average(profile[name])), digits)
-    return found
+            figures[name] = round(float(average(profile[name])), digits)
+    return figures
 
 
 def departures(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]) -> list[str]:
@@ -133,13 +133,13 @@ def departures(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]
     >>> departures(wanted, 8.0, {"pressure_mean_count": 1.0, "speed_m_s": 0.03})
     ['its speed is 30.0 mm/s and not 25.0', 'its mean pressure is 1.0 counts and not 2 to 150']
     """
-    found = []
+    reasons = []
     speed_m_s, pressure_count = measured.get("speed_m_s", protocol.speed_m_s), measured["pressure_mean_count"]
     if abs(speed_m_s - protocol.speed_m_s) > protocol.speed_tolerance * protocol.speed_m_s:
-        found.append(f"its speed is {1e3 * speed_m_s:.1f} mm/s and not {1e3 * protocol.speed_m_s:.1f}")
+        reasons.append(f"its speed is {1e3 * speed_m_s:.1f} mm/s and not {1e3 * protocol.speed_m_s:.1f}")
     if lasts_s < protocol.min_s:
-        found.append(f"it lasts {lasts_s:.2f} s and not {protocol.min_s:g} or more")
+        reasons.append(f"it lasts {lasts_s:.2f} s and not {protocol.min_s:g} or more")
     if not protocol.pressure_low <= pressure_count <= protocol.pressure_high:
         limits = f"{protocol.pressure_low:g} to {protocol.pressure_high:g}"
-        found.append(f"its mean pressure is {pressure_count:.1f} counts and not {limits}")
-    return found
+        reasons.append(f"its mean pressure is {pressure_count:.1f} counts and not {limits}")
+    return reasons

@@ -29,14 +29,14 @@ from tacpipe.signals.filters import butterworth, median, median_so_far
 from tacpipe.signals.runs import in_long_runs, lasting, latched, runs
 
 MEDIAN_ROWS = 5
-LEVEL_ROWS = 10  # before and after a slip, whose median is the level there
+LEVEL_ROWS = 10  # rows before and after a slip whose median is the level there
 CORNER_ROWS = 2  # how far back from the first row that has left its level the end of a slip may lie
 LEVEL_SIGMA = 3.0  # times the readings' own noise is at the level still
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as slip: rates in multiples of their noise, and for how many rows."""
+    """Limits of slip: rates in multiples of their noise, and least numbers of rows."""
 
     on_sigma: float = 5.0
     off_sigma: float = 2.0
@@ -64,12 +64,12 @@ def filled(readings: AnyArray) -> Floats:
     So no row is filled from its future but those before the first reading, where nothing can be determined anyway.
     """
     values = readings.astype(np.float64)
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return np.zeros(len(values))
-    rows = np.maximum.accumulate(np.where(known, np.arange(len(values)), int(known.argmax())))
-    found: Floats = values[rows]
-    return found
+    rows = np.maximum.accumulate(np.where(finite, np.arange(len(values)), int(finite.argmax())))
+    values_by_row: Floats = values[rows]
+    return values_by_row
 
 
 def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
@@ -77,8 +77,8 @@ def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     if len(readings) < 2:
         return np.zeros(len(readings))
     smooth = butterworth(cutoff_hz, rate_hz).both_ways(median(readings, MEDIAN_ROWS))
-    found: Floats = np.gradient(smooth) * rate_hz
-    return found
+    slope: Floats = np.gradient(smooth) * rate_hz
+    return slope
 
 
 def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
@@ -87,48 +87,50 @@ def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     return np.diff(smooth, prepend=smooth[:1]) * rate_hz
 
 
-def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Bools:
+def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: Limits) -> Bools:
     """Return where the object slips (time,), stated with the whole of ``readings`` (time,) since the grasp at hand.
 
-    In the first ``still`` rows it is taken to rest; their rate sets the threshold.
+    In the first ``rest_rows`` rows it is taken to rest; their rate sets the threshold.
     """
     speed = np.abs(rate(readings, rate_hz, cutoff_hz))
-    noise = _noise(speed[:still], limits)
+    noise = _noise(speed[:rest_rows], limits)
     on = in_long_runs(speed > limits.on_sigma * noise, limits.on_rows)
     off = in_long_runs(speed < limits.off_sigma * noise, limits.off_rows)
-    level = max(limits.level_count, LEVEL_SIGMA * float(np.std(readings[:still])) if len(readings[:still]) else 0.0)
+    level = max(
+        limits.level_count, LEVEL_SIGMA * float(np.std(readings[:rest_rows])) if len(readings[:rest_rows]) else 0.0
+    )
     smooth = median(readings, MEDIAN_ROWS)
     return _trimmed(latched(on, off) & ~_resting(smooth, limits.off_rows, level), smooth, level)
 
 
-def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Bools:
-    """Return where slip is known of (time,) from each row and those before it; never in the first ``still``."""
+def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: Limits) -> Bools:
+    """Return where slip is known of (time,) from each row and those before it; never in the first ``rest_rows``."""
     speed = np.abs(rate_so_far(readings, rate_hz, cutoff_hz))
-    noise = _noise(speed[:still], limits)
+    noise = _noise(speed[:rest_rows], limits)
     on = lasting(speed > limits.on_sigma * noise, limits.on_rows)
-    on[:still] = False
+    on[:rest_rows] = False
     return latched(on, lasting(speed < limits.off_sigma * noise, limits.off_rows))
 
 
-def dropped(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Bools:
+def dropped(readings: Floats, rest_rows: int, patch_count: float, saturated_count: float) -> Bools:
     """Return from where on (time,) the object is lost, stated with the whole of ``readings`` (time,) since the grasp.
 
-    That is after the first ``still`` rows, once the readings, smoothed by a median, are more than ``patch_count`` from the
-    median of those rows, or at ``saturated_count`` or below, where the sensor sees no more.
+    That is after the first ``rest_rows`` rows, once the readings, smoothed by a median, are more than ``patch_count`` from
+    the median of those rows, or at ``saturated_count`` or below, where the sensor sees no more.
     """
-    return _lost(median(readings, MEDIAN_ROWS), readings[:still], patch_count, saturated_count)
+    return _lost(median(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
 
 
-def dropped_online(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Bools:
+def dropped_online(readings: Floats, rest_rows: int, patch_count: float, saturated_count: float) -> Bools:
     """Return where the same is known of (time,) from each row and those before it."""
-    return _lost(median_so_far(readings, MEDIAN_ROWS), readings[:still], patch_count, saturated_count)
+    return _lost(median_so_far(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
 
 
-def _lost(smooth: Floats, rest: Floats, patch_count: float, saturated_count: float) -> Bools:
-    if not len(rest):
+def _lost(smooth: Floats, rest_readings: Floats, patch_count: float, saturated_count: float) -> Bools:
+    if not len(rest_readings):
         return np.zeros(len(smooth), dtype=bool)
-    lost = (np.abs(smooth - np.median(rest)) > patch_count) | (smooth <= saturated_count)
-    lost[: len(rest)] = False
+    lost = (np.abs(smooth - np.median(rest_readings)) > patch_count) | (smooth <= saturated_count)
+    lost[: len(rest_readings)] = False
     return np.logical_or.accumulate(lost)
 
 
@@ -141,13 +143,13 @@ def _resting(smooth: Floats, rows: int, level_count: float) -> Bools:
 
     Between two slips that follow at once the filtered rate does not come down; the readings state that there are two.
     """
-    found = np.zeros(len(smooth), dtype=bool)
+    resting = np.zeros(len(smooth), dtype=bool)
     if len(smooth) < rows:
-        return found
+        return resting
     windows = np.lib.stride_tricks.sliding_window_view(smooth, rows)  # (window, rows)
     starts = np.flatnonzero(windows.max(axis=1) - windows.min(axis=1) <= level_count)
-    found[starts[:, None] + np.arange(rows)] = True
-    return found
+    resting[starts[:, None] + np.arange(rows)] = True
+    return resting
 
 
 def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
@@ -155,7 +157,7 @@ def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
 
     A run that leaves its level nowhere goes: what has not moved has not slipped.
     """
-    found = np.zeros_like(slip)
+    trimmed = np.zeros_like(slip)
     starts, stops = runs(slip)
     free_from = np.append(0, stops)[: len(starts)]
     free_to = np.append(starts, len(slip))[1:]
@@ -166,8 +168,8 @@ def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
         run = sign * smooth[start:stop]
         first, last = _leaves(run - sign * before, level_count), _leaves((sign * after - run)[::-1], level_count)
         if first is not None and last is not None:
-            found[max(start + first, lowest) : min(stop - last, highest)] = True
-    return found
+            trimmed[max(start + first, lowest) : min(stop - last, highest)] = True
+    return trimmed
 
 
 def _leaves(moved: Floats, level_count: float) -> int | None:

@@ -1,4 +1,4 @@
-"""What `tacpipe demo` runs: the commands that a lab would type, on simulated recordings or on an emulated rig."""
+"""List the commands of `tacpipe demo`, as a lab would type them, on simulated recordings or on an emulated rig."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from tacpipe.plugins import registry
 if TYPE_CHECKING:
     from tacpipe.tasks.task import Demo
 
-LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
+LIVE_S, LIVE_TRIALS = 30, 6  # length and trials of the emulated rig
 EMULATED = "emulated"  # the folder of the emulated rig's own rig file
 
 
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
     demos = parts(output)
-    given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
-    return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
+    datasets = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
+    return [*(words for demo in demos for words in demo.commands), ["report", *datasets, "-o", str(page(output))]]
 
 
 def rig(output: Path) -> list[list[str]]:

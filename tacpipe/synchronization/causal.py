@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
+from tacpipe.signals.repairs import RANGE, turns
 from tacpipe.signals.resampling import is_overdue, median_before, newest_rows, uniform_offsets
-from tacpipe.signals.unwrap import RANGE, turns
 from tacpipe.synchronization.columns import PAST_NS
 
 ROOM = 256  # samples that a buffer holds at first
@@ -23,19 +23,19 @@ ROOM = 256  # samples that a buffer holds at first
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read of a stream: how many columns there are, and which of them are special."""
+    """The columns of a stream: their number, and those with a special treatment."""
 
     width: int  # columns of a sample
-    wraps: Sequence[int] = ()  # of counts of 16 bits whose wrap-around is undone
-    medians: Sequence[int] = ()  # that have the median of their last samples
-    compared: Sequence[int] = ()  # that are all equal to the sample before in one that is repeated
+    wraps: Sequence[int] = ()  # columns with counts of 16 bits whose wrap-around is undone
+    medians: Sequence[int] = ()  # columns that get the median of their last samples
+    compared: Sequence[int] = ()  # columns that are compared to detect a repeated sample
 
 
 class Rows(NamedTuple):
     """Some rows of a grid, in order; `newest_ns`, `gap` and `values` are by stream."""
 
     t_ns: Times  # (row,)
-    begun: Bools  # (row,), whether each stream has a sample; where not, the rest holds nothing
+    has_samples: Bools  # (row,), True where each stream has a sample; other rows are empty
     newest_ns: Mapping[str, Times]  # (row,), of the sample that is held
     gap: Mapping[str, Bools]  # (row,)
     values: Mapping[str, Floats]  # (row, column)
@@ -61,7 +61,7 @@ class Grid:
         self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}
         self._master, self._kind, self._rate_hz, self._gap_ns = master, kind, rate_hz, gap_ns
-        self._points = 0  # of a uniform grid that were made
+        self._points = 0  # points of the uniform grid so far
         self._until_ns: int | None = None  # up to which rows were made
         self.late = dict.fromkeys(streams, 0)  # samples that came after the rows that they would have changed
 
@@ -91,10 +91,10 @@ class Grid:
         source = self._sources[stream]
         if len(t_ns):
             least_ns = int(t_ns[0]) if source.newest_ns is None else source.newest_ns
-            kept = t_ns >= np.maximum.accumulate(np.maximum(t_ns, least_ns))
-            if not kept.all():
-                self.late[stream] += int(np.count_nonzero(~kept))
-                t_ns, values = t_ns[kept], values[kept]
+            in_order = t_ns >= np.maximum.accumulate(np.maximum(t_ns, least_ns))
+            if not in_order.all():
+                self.late[stream] += int(np.count_nonzero(~in_order))
+                t_ns, values = t_ns[in_order], values[in_order]
         if not len(t_ns):
             return
         if self._until_ns is not None and t_ns[0] <= self._until_ns:
@@ -106,18 +106,18 @@ class Grid:
         after_ns, self._until_ns = self._until_ns, max(until_ns, self._until_ns or until_ns)
         grid_ns = self._grid(after_ns, self._until_ns)
         firsts = [source.first_ns for source in self._sources.values()]
-        known = [first for first in firsts if first is not None]
-        begun = grid_ns >= max(known) if len(known) == len(firsts) else np.zeros(len(grid_ns), bool)
-        at_ns = grid_ns[begun]
+        first_stamps = [first for first in firsts if first is not None]
+        has_samples = grid_ns >= max(first_stamps) if len(first_stamps) == len(firsts) else np.zeros(len(grid_ns), bool)
+        at_ns = grid_ns[has_samples]
         newest_ns, gap, values = {}, {}, {}
         for name, source in self._sources.items():
             newest_ns[name], gap[name] = np.zeros(len(grid_ns), np.int64), np.zeros(len(grid_ns), bool)
             values[name] = np.full((len(grid_ns), source.reading.width), np.nan)
             if len(at_ns):
-                newest_ns[name][begun], values[name][begun] = source.at(at_ns)
-                gap[name][begun] = is_overdue(newest_ns[name][begun], at_ns, self._gap_ns[name])
+                newest_ns[name][has_samples], values[name][has_samples] = source.at(at_ns)
+                gap[name][has_samples] = is_overdue(newest_ns[name][has_samples], at_ns, self._gap_ns[name])
             source.forget(self._until_ns)
-        return Rows(grid_ns, begun, newest_ns, gap, values)
+        return Rows(grid_ns, has_samples, newest_ns, gap, values)
 
     def _grid(self, after_ns: int | None, until_ns: int) -> Times:
         """Return the grid points after ``after_ns`` up to ``until_ns`` (row,)."""
@@ -128,20 +128,20 @@ class Grid:
             origin_ns = master.first_ns if self._origin_ns is None else self._origin_ns
             if not self._points:  # those before the first sample are the grid's that is continued
                 self._points = max(0, int((master.first_ns - origin_ns) * self._rate_hz / 1e9) - 1)
-            most = int((until_ns - origin_ns) * self._rate_hz / 1e9) + 2
-            found = origin_ns + uniform_offsets(self._points, max(0, most - self._points), self._rate_hz)
-            found = found[found <= until_ns]
-            self._points += len(found)
-            found = found[found >= master.first_ns]
-            return found if after_ns is None else found[found > after_ns]
+            count = int((until_ns - origin_ns) * self._rate_hz / 1e9) + 2
+            points = origin_ns + uniform_offsets(self._points, max(0, count - self._points), self._rate_hz)
+            points = points[points <= until_ns]
+            self._points += len(points)
+            points = points[points >= master.first_ns]
+            return points if after_ns is None else points[points > after_ns]
         t_ns, repeated = master.stamps()
-        wanted = t_ns <= until_ns
+        selected = t_ns <= until_ns
         if after_ns is not None:
-            wanted &= t_ns > after_ns
+            selected &= t_ns > after_ns
         if self._kind == "fresh":
-            wanted &= ~repeated
-        wanted &= np.append(np.diff(t_ns) > 0, True)[: len(t_ns)]
-        return t_ns[wanted]
+            selected &= ~repeated
+        selected &= np.append(np.diff(t_ns) > 0, True)[: len(t_ns)]
+        return t_ns[selected]
 
 
 class _Source:
@@ -152,11 +152,11 @@ class _Source:
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
         self._wraps, self._compared, self._medians = (
-            np.array(some, np.intp) for some in (reading.wraps, reading.compared, reading.medians)
+            np.array(columns, np.intp) for columns in (reading.wraps, reading.compared, reading.medians)
         )
         self._t_ns, self._values = np.zeros(ROOM, np.int64), np.zeros((ROOM, reading.width))
         self._repeated = np.zeros(ROOM, bool)
-        self._start = self._stop = 0  # of what the buffers hold
+        self._start = self._stop = 0  # rows of the buffers in use
         self._before: AnyFloats | None = None  # (column,), the sample before, as it came
         self._turned: Int64s = np.zeros(len(self._wraps), np.int64)
         self.levels: AnyFloats | None = None  # (column,), that the first sample is nearest to; None: as it comes
@@ -164,19 +164,19 @@ class _Source:
     def push(self, t_ns: Times, values: AnyFloats) -> None:
         """Take samples whose stamps do not run backwards."""
         before = values[:1] if self._before is None else self._before[None]
-        both = np.concatenate([before, values]) if len(self._wraps) or len(self._compared) else values
+        extended = np.concatenate([before, values]) if len(self._wraps) or len(self._compared) else values
         self._reserve(len(t_ns))
-        some = slice(self._stop, self._stop + len(t_ns))
-        self._t_ns[some], self._values[some] = t_ns, values
+        added = slice(self._stop, self._stop + len(t_ns))
+        self._t_ns[added], self._values[added] = t_ns, values
         if self._before is None and self.levels is not None:
-            apart = (self.levels - values[0])[self._wraps]
-            self._turned = np.where(np.isfinite(apart), np.rint(apart / RANGE), 0).astype(np.int64)
+            distance = (self.levels - values[0])[self._wraps]
+            self._turned = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
         if len(self._wraps):
-            turned = self._turned + np.cumsum(turns(both[:, self._wraps]), axis=0)
-            self._values[some, self._wraps] += RANGE * turned
+            turned = self._turned + np.cumsum(turns(extended[:, self._wraps]), axis=0)
+            self._values[added, self._wraps] += RANGE * turned
             self._turned = turned[-1]
         if len(self._compared):
-            self._repeated[some] = (both[1:, self._compared] == both[:-1, self._compared]).all(axis=1)
+            self._repeated[added] = (extended[1:, self._compared] == extended[:-1, self._compared]).all(axis=1)
             if self._before is None:
                 self._repeated[self._stop] = False
         self._before = values[-1].copy()
@@ -186,18 +186,18 @@ class _Source:
 
     def stamps(self) -> tuple[Times, Bools]:
         """Return the stamps of the samples that are kept (time,), and which repeat the sample before."""
-        held = slice(self._start, self._stop)
-        return self._t_ns[held], self._repeated[held]
+        filled = slice(self._start, self._stop)
+        return self._t_ns[filled], self._repeated[filled]
 
     def at(self, grid_ns: Times) -> tuple[Times, Floats]:
         """Return stamp (grid,) and values (grid, column) of the newest sample at each grid point."""
-        held = slice(self._start, self._stop)
-        t_ns, values = self._t_ns[held], self._values[held]
+        filled = slice(self._start, self._stop)
+        t_ns, values = self._t_ns[filled], self._values[filled]
         rows = newest_rows(t_ns, grid_ns)
-        found: Floats = values[rows]
+        samples: Floats = values[rows]
         if len(self._medians):
-            found[:, self._medians] = median_before(t_ns, values[:, self._medians], grid_ns, PAST_NS)
-        return t_ns[rows], found
+            samples[:, self._medians] = median_before(t_ns, values[:, self._medians], grid_ns, PAST_NS)
+        return t_ns[rows], samples
 
     def forget(self, until_ns: int) -> None:
         """Let go of samples that no grid point after ``until_ns`` reads."""
@@ -210,12 +210,12 @@ class _Source:
         """Make room for some samples behind those that are kept."""
         if self._stop + count <= len(self._t_ns):
             return
-        kept = slice(self._start, self._stop)
+        filled = slice(self._start, self._stop)
         length = self._stop - self._start
         room = max(len(self._t_ns), 2 * (length + count))
         for name in ("_t_ns", "_values", "_repeated"):
             old = getattr(self, name)
-            made = np.zeros((room, *old.shape[1:]), old.dtype)
-            made[:length] = old[kept]
-            setattr(self, name, made)
+            larger = np.zeros((room, *old.shape[1:]), old.dtype)
+            larger[:length] = old[filled]
+            setattr(self, name, larger)
         self._start, self._stop = 0, length

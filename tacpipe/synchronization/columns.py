@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.synchronization import methods
+from tacpipe.synchronization import streams
 from tacpipe.synchronization.streams import Stream
 
 if TYPE_CHECKING:
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Bools, Floats, Int64s, Times
 
 MEDIAN_NS = (
-    10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
+    10_000_000  # half width of a median: eight readings of a proximity sensor at 400 Hz, which reduces its noise
 )
-PAST_NS = 2 * MEDIAN_NS  # before a causal grid point: as many readings, 10 ms late
+PAST_NS = 2 * MEDIAN_NS  # width of a causal median: as many readings, 10 ms late
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
 Keep = Callable[[Any], Any]  # puts values (grid,) aside and returns them
 BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
@@ -32,7 +32,7 @@ def channels(stream: Stream, grid_ns: Times, exact: Int64s | None, keep: Keep) -
         return [_at_rows(stream, name, pa.array(exact), "none", keep) for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
-        groups.setdefault(methods.method(stream.columns.schema, name), []).append(name)
+        groups.setdefault(streams.method(stream.columns.schema, name), []).append(name)
     grid_columns: dict[str, GridColumn] = {}
     if "nearest" in groups:
         rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
@@ -40,13 +40,15 @@ def channels(stream: Stream, grid_ns: Times, exact: Int64s | None, keep: Keep) -
             grid_columns[name] = _at_rows(stream, name, rows, "nearest", keep)
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
-        how = method.partition(" ")[0]
-        rows = slice(None) if how == "median" else used
-        for some in _blocks(stream, members, how, len(grid_ns)):
-            for name, column in zip(some, _between_samples(stream, some, how, grid_ns, rows).T, strict=True):
-                kind = methods.between_type(stream.columns.schema.field(name).type)
+        interpolation = method.partition(" ")[0]
+        rows = slice(None) if interpolation == "median" else used
+        for block in _blocks(stream, members, interpolation, len(grid_ns)):
+            for name, column in zip(
+                block, _between_samples(stream, block, interpolation, grid_ns, rows).T, strict=True
+            ):
+                kind = streams.between_type(stream.columns.schema.field(name).type)
                 grid_columns[name] = _as_stored(
-                    methods.grid_field(stream.name, stream.field(name), how, kind), column, keep
+                    streams.grid_field(stream.name, stream.field(name), interpolation, kind), column, keep
                 )
     return [grid_columns[name] for name in stream.channels]
 
@@ -64,9 +66,9 @@ def held_channels(stream: Stream, grid_ns: Times, keep: Keep) -> list[GridColumn
     rows = pa.array(newest_rows(stream.t_ns, grid_ns))
     grid_columns = []
     for name in stream.channels:
-        if methods.method(stream.columns.schema, name) == "median":
-            kind = methods.between_type(stream.columns.schema.field(name).type)
-            field = methods.grid_field(stream.name, stream.field(name), "median", kind)
+        if streams.method(stream.columns.schema, name) == "median":
+            kind = streams.between_type(stream.columns.schema.field(name).type)
+            field = streams.grid_field(stream.name, stream.field(name), "median", kind)
             values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, PAST_NS)
             grid_columns.append(_as_stored(field, values[:, 0], keep))
         else:
@@ -74,22 +76,22 @@ def held_channels(stream: Stream, grid_ns: Times, keep: Keep) -> list[GridColumn
     return grid_columns
 
 
-def _at_rows(stream: Stream, name: str, rows: pa.Array, how: str, keep: Keep) -> GridColumn:
-    """Return field and values of a channel at some rows, its type kept; ``how`` names what that is."""
-    return methods.grid_field(stream.name, stream.field(name), how), keep(stream.at(name, rows))
+def _at_rows(stream: Stream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
+    """Return field and values of a channel at some rows, its type kept; ``interpolation`` names the method."""
+    return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
 
 
-def _blocks(stream: Stream, members: list[str], how: str, points: int) -> list[list[str]]:
+def _blocks(stream: Stream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
     """Return the channels that are interpolated at once: the four of a quaternion, else as many as fit a block."""
-    if how == "slerp":
+    if interpolation == "slerp":
         parts = [stream.columns.schema.field(name) for name in members]
-        return [[members[i] for i in methods.quaternion_order(stream.name, parts)]]
-    rows = len(stream.t_ns) if how == "median" else points
+        return [[members[i] for i in streams.quaternion_order(stream.name, parts)]]
+    rows = len(stream.t_ns) if interpolation == "median" else points
     size = max(1, BLOCK_BYTES // (8 * max(1, rows)))
     return [members[first : first + size] for first in range(0, len(members), size)]
 
 
-def _between_samples(stream: Stream, names: list[str], how: str, grid_ns: Times, used: Any) -> Floats:
+def _between_samples(stream: Stream, names: list[str], interpolation: str, grid_ns: Times, used: Any) -> Floats:
     """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
     import numpy as np
 
@@ -97,9 +99,9 @@ def _between_samples(stream: Stream, names: list[str], how: str, grid_ns: Times,
 
     t_ns = stream.t_ns[used]
     values = np.stack([stream.values(name)[used] for name in names], axis=1)  # (time, channel)
-    if how == "slerp":
+    if interpolation == "slerp":
         return slerp(t_ns, values.astype(np.float64), grid_ns)
-    if how == "median":
+    if interpolation == "median":
         return median_around(t_ns, values, grid_ns, MEDIAN_NS)
     return linear(t_ns, values, grid_ns)
 
@@ -118,7 +120,7 @@ def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> 
 
     rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
     gap = in_gap(stream.t_ns, grid_ns, gap_ns)
-    return _masks(stream.name, stream.held[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
+    return _masks(stream.name, stream.repeated[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
 
 
 def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times:
@@ -126,7 +128,7 @@ def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
-    if exact is None and any(methods.method(stream.columns.schema, name) == "median" for name in stream.channels):
+    if exact is None and any(streams.method(stream.columns.schema, name) == "median" for name in stream.channels):
         rows = np.maximum(rows, np.searchsorted(stream.t_ns, grid_ns + MEDIAN_NS, side="right") - 1)
     arrived_ns = stream.arrival_ns[np.minimum(rows, len(stream.t_ns) - 1)]
     ahead_ns: Times = np.maximum(arrived_ns - grid_ns, 0)
@@ -139,15 +141,15 @@ def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
 
     rows = newest_rows(stream.t_ns, grid_ns)
     newest_ns = stream.t_ns[rows]
-    return _masks(stream.name, stream.held[rows], is_overdue(newest_ns, grid_ns, gap_ns), grid_ns - newest_ns)
+    return _masks(stream.name, stream.repeated[rows], is_overdue(newest_ns, grid_ns, gap_ns), grid_ns - newest_ns)
 
 
-def _masks(name: str, held: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:
+def _masks(name: str, repeated: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:
     import pyarrow as pa
 
     mask = {"unit": "1", "quantity": "mask", "stream": name}
     return [
-        (pa.field(f"{name}_held", pa.bool_(), metadata=mask), held),
+        (pa.field(f"{name}_held", pa.bool_(), metadata=mask), repeated),
         (pa.field(f"{name}_gap", pa.bool_(), metadata=mask), gap),
         (pa.field(f"{name}_dt_ns", pa.int64(), metadata={**mask, "unit": "ns"}), dt_ns),
     ]

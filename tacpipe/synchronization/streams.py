@@ -1,21 +1,94 @@
-"""One stream of a recording on the host's clock, as a grid reads it."""
+"""Put the streams of a recording on the host's clock, and choose the grid and how each channel is placed on it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import printable
+from tacpipe.channels import arm
+from tacpipe.channels.streams import absent, entry
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
-from tacpipe.synchronization import methods
-from tacpipe.synchronization.methods import DEVICE, TRUTH, UNCERTAIN
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import AnyArray, Bools, Int32s, Int64s, Times
     from tacpipe.io.columns import Columns
+
+
+TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # a device's own time and number of a sample; they stay as they are
+UNCERTAIN = "t_uncertain_ns"  # column of the recorder with the largest delay of each stamp, no channel
+AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
+
+
+def channel_names(schema: pa.Schema) -> list[str]:
+    """Return the names of a stream's channels: of all columns but the time and its uncertainty."""
+    return [name for name in schema.names if name not in ("t_ns", UNCERTAIN)]
+
+
+def method(schema: pa.Schema, name: str) -> str:
+    """Return how a channel is interpolated: nearest, linear, median, or slerp and the name of its quaternion."""
+    import pyarrow as pa
+
+    field = schema.field(name)
+    metadata = field.metadata or {}
+    quantity = metadata.get(b"quantity", b"").decode()
+    number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
+    if not number or quantity in AS_IT_STANDS or name in (DEVICE, SEQUENCE):
+        return "nearest"
+    if quantity == "proximity":
+        return "median"
+    if quantity == "orientation":
+        return f"slerp {arm.shared_name(field)}"
+    return "linear"
+
+
+def quaternion_order(stream: str, fields: Sequence[pa.Field]) -> list[int]:
+    """Return where x, y, z and w are among the columns of a quaternion. Raises `TacpipeError` for other components."""
+    parts = [arm.component(field) for field in fields]
+    if sorted(parts) != ["w", "x", "y", "z"]:
+        raise TacpipeError(
+            f"Stream {stream!r}: the orientation in {listed(field.name for field in fields)} has the components "
+            f"{listed(part or 'unknown' for part in parts)}; a quaternion needs x, y, z and w once each. Set component = "
+            f'"x" and so on in {entry(stream)} of the layout file, or another quantity for what is not a quaternion.'
+        )
+    return [parts.index(part) for part in "xyzw"]
+
+
+def between_type(kind: pa.DataType) -> pa.DataType:
+    """Return the type of interpolated values: floats as they are, integers of 16 bits or fewer float32, else float64."""
+    import pyarrow as pa
+
+    if pa.types.is_floating(kind):
+        return kind
+    return pa.float32() if kind.bit_width <= 16 else pa.float64()
+
+
+def grid_field(stream: str, channel: pa.Field, interpolation: str, kind: pa.DataType | None = None) -> pa.Field:
+    """Return the field of a channel on the grid: ``<stream>_<column>``, where it came from and how."""
+    import pyarrow as pa
+
+    metadata = {**(channel.metadata or {}), b"stream": stream.encode(), b"interpolation": interpolation.encode()}
+    return pa.field(grid_name(stream, channel.name), kind or channel.type, metadata=metadata)
+
+
+def grid_name(stream: str, channel: str) -> str:
+    """Return the name of a stream's channel on the grid.
+
+    >>> grid_name("xela1", "taxel01_x"), grid_name("truth", "gt_slip")
+    ('xela1_taxel01_x', 'gt_slip')
+    """
+    return channel if channel.startswith(TRUTH) else f"{stream}_{channel}"
+
+
+def listed(names: Iterable[Any]) -> str:
+    """Return names with commas between them."""
+    return ", ".join(map(str, names))
+
 
 # quantities of streams that are no signals: times alone, and what a live session records of itself
 OF_SESSIONS = ("time", "plan", "prediction", "latency", "alarm", "material")
@@ -28,38 +101,42 @@ class Stream:
     name: str
     columns: Columns
     t_ns: Times  # (time,)
-    held: Bools  # (time,)
+    repeated: Bools  # (time,), True where a sample repeats the one before
     arrival_ns: Times  # (time,), when the samples arrived, whatever the clock of `t_ns`
-    attributes: dict[str, Attribute] = field(default_factory=dict)  # what the fit of its clock gave
+    attributes: dict[str, Attribute] = field(default_factory=dict)  # attributes of the fit of its clock
     unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
 
     @property
     def channels(self) -> list[str]:
         """The names of its channels."""
-        return methods.channel_names(self.columns.schema)
+        return channel_names(self.columns.schema)
 
     def field(self, name: str) -> pa.Field:
         """The field of a channel: of one that was unwrapped as it is then."""
         import pyarrow as pa
 
-        found = self.columns.schema.field(name)
-        return found.with_type(pa.int32()) if name in self.unwrapped else found
+        channel = self.columns.schema.field(name)
+        return channel.with_type(pa.int32()) if name in self.unwrapped else channel
 
     def values(self, name: str) -> AnyArray:
         """A channel of numbers (time,)."""
-        found = self.unwrapped.get(name)
-        return self.columns.column(name).to_numpy() if found is None else found
+        unwrapped_values = self.unwrapped.get(name)
+        return self.columns.column(name).to_numpy() if unwrapped_values is None else unwrapped_values
 
     def at(self, name: str, rows: pa.Array) -> pa.Array:
         """A channel of any type at some rows."""
         import pyarrow as pa
 
-        found = self.unwrapped.get(name)
-        return self.columns.column(name).take(rows).combine_chunks() if found is None else pa.array(found).take(rows)
+        unwrapped_values = self.unwrapped.get(name)
+        return (
+            self.columns.column(name).take(rows).combine_chunks()
+            if unwrapped_values is None
+            else pa.array(unwrapped_values).take(rows)
+        )
 
     @property
     def truth(self) -> bool:
-        """Whether all of it is ground truth."""
+        """True where the whole stream is ground truth."""
         return all(name.startswith(TRUTH) for name in self.channels)
 
 
@@ -87,7 +164,7 @@ def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> St
     Raises `TacpipeError` for stamps that are absent, run backwards or give no clock.
     """
     arrival_ns = _stamps(recording, name, columns)
-    stream = Stream(name, columns, arrival_ns, _held(columns), arrival_ns)
+    stream = Stream(name, columns, arrival_ns, _repeated_rows(columns), arrival_ns)
     if clock == "arrival" or stream.truth:
         return stream
     if DEVICE not in columns.column_names:
@@ -129,8 +206,8 @@ def _certain(columns: Columns) -> Bools | None:
     """Return which rows have an arrival that was recorded in time, None where all have."""
     if UNCERTAIN not in columns.column_names:
         return None
-    found: Bools = columns.column(UNCERTAIN).to_numpy() == 0
-    return found
+    certain: Bools = columns.column(UNCERTAIN).to_numpy() == 0
+    return certain
 
 
 def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
@@ -160,28 +237,98 @@ def without_wraps(stream: Stream, keep: Callable[[Any], Any]) -> tuple[Stream, i
     """
     import pyarrow as pa
 
-    from tacpipe.signals.unwrap import unwrapped
+    from tacpipe.signals.repairs import unwrapped
 
     changed: dict[str, Int32s] = {}
     for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
         if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
             values = stream.columns.column(kind.name).to_numpy()
-            found = unwrapped(values)
-            if found is not values:
-                changed[kind.name] = keep(found)
+            unwrapped_values = unwrapped(values)
+            if unwrapped_values is not values:
+                changed[kind.name] = keep(unwrapped_values)
     return replace(stream, unwrapped=changed), len(changed)
 
 
-def _held(columns: Columns) -> Bools:
+def _repeated_rows(columns: Columns) -> Bools:
     """Return which rows repeat the one before in all channels but labels, which are meant to stay."""
     import numpy as np
 
-    from tacpipe.signals.holds import held_columns
+    from tacpipe.signals.repairs import held_columns
 
-    names = [
-        name for name in methods.channel_names(columns.schema) if methods.method(columns.schema, name) != "nearest"
-    ]
+    names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
     if not names:
         return np.zeros(columns.num_rows, dtype=bool)
     return held_columns(columns.column(name).to_numpy() for name in names)
+
+
+def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
+    """Return the name of the stream that sets the grid: the ``requested`` one, or the first with a tactile channel.
+
+    Raises `TacpipeError` where there is none.
+    """
+    if requested:
+        if requested not in schemas:
+            raise TacpipeError(
+                f"Recording {recording} has no stream {requested!r} to be master; it has {listed(schemas)}."
+            )
+        return requested
+    for name, schema in schemas.items():
+        if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in schema):
+            return name
+    reason = absent(recording, "tactile", schemas)
+    raise TacpipeError(f"{reason} Without a tactile stream, name the master among {listed(schemas)} with --master.")
+
+
+def grid(
+    recording: str,
+    kind: str,
+    rate_hz: float | None,
+    streams: Mapping[str, Stream],
+    master: Stream,
+    *,
+    hold_values: bool,
+) -> tuple[Int64s, Int64s]:
+    """Return the grid points that lie within every stream, and the row of each: of the master, or of the grid itself.
+
+    A uniform grid is on the phase of the master's first sample. With ``hold_values`` it ends where the last stream does,
+    because nobody knows yet which sample of a stream is its last, and it has one point where stamps are equal.
+    Raises `TacpipeError` where no point is left.
+    """
+    import numpy as np
+
+    from tacpipe.signals.resampling import uniform_grid
+
+    first = max(int(stream.t_ns[0]) for stream in streams.values())
+    last = (max if hold_values else min)(int(stream.t_ns[-1]) for stream in streams.values())
+    grid_ns = uniform_grid(int(master.t_ns[0]), last, rate_hz) if rate_hz is not None else master.t_ns
+    selected = (grid_ns >= first) & (grid_ns <= last)
+    if kind == "fresh":
+        selected &= ~master.repeated
+    if hold_values and rate_hz is None:
+        selected &= np.append(np.diff(grid_ns) > 0, True)
+    rows = np.flatnonzero(selected)
+    if not len(rows):
+        late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
+        early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
+        raise TacpipeError(
+            f"Recording {recording}: its streams have no time in common, or no row of {master.name} lies in it. "
+            f"Stream {late.name} starts last, at {printable.moment(int(late.t_ns[0]))}, and {early.name} ends first, at "
+            f"{printable.moment(int(early.t_ns[-1]))}. Leave one of them out with --without, or check their clocks."
+        )
+    return grid_ns[rows], rows
+
+
+def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s) -> Int64s | None:
+    """Return the rows whose stamps are the grid's, or None if the stream has no sample at some grid point.
+
+    ``grid_rows`` (grid,) are the rows that a stream has there which was stamped along with the grid's.
+    """
+    import numpy as np
+
+    rows: Int64s = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
+    if rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns):
+        return rows  # one clock for both, equal stamps in a row included
+    rows = np.searchsorted(t_ns, grid_ns).astype(np.int64)
+    is_equal = rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns)
+    return rows if is_equal else None

@@ -1,1 +1,1 @@
-"""What is drawn of a recording, as arrays: curves, maps of taxels, spans, paths and forecasts."""
+"""Turn recordings into arrays to draw: curves, maps of taxels, spans, paths and predictions."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Floats, Times
-from tacpipe.channels import components
+from tacpipe.channels import arm
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,16 +26,16 @@ class Curves:
     stream: str
     quantity: str
     unit: str
-    names: tuple[str, ...]  # of the channels
+    names: tuple[str, ...]  # channel names
     t_ns: Times  # (time,)
     values: Floats  # (time, channel)
 
     @property
     def title(self) -> str:
-        """What a plot of them is named: stream, quantity and unit."""
-        what = self.quantity.replace("_", " ") or ", ".join(self.names[:3])
-        named = what if what == self.stream.replace("_", " ") else f"{self.stream} {what}".strip()
-        return named if self.unit in _NO_UNIT else f"{named} ({self.unit})"
+        """The title of their plot: stream, quantity and unit."""
+        quantity = self.quantity.replace("_", " ") or ", ".join(self.names[:3])
+        name = quantity if quantity == self.stream.replace("_", " ") else f"{self.stream} {quantity}".strip()
+        return name if self.unit in _NO_UNIT else f"{name} ({self.unit})"
 
 
 def of_streams(streams: Mapping[str, pa.Table]) -> list[Curves]:
@@ -57,15 +57,15 @@ def of_table(stream: str, table: pa.Table) -> list[Curves]:
         if _drawn(field, about):
             finger = about.get("finger", "") if about.get("quantity") == "vibration" else ""
             groups.setdefault((about.get("quantity", ""), about.get("unit", ""), finger), []).append(field)
-    found = []
+    curves = []
     for (quantity, unit, finger), fields in groups.items():
         values = matrix(table, [field.name for field in fields])
         if quantity == "vibration" and len(fields) > 1:
             name = f"{finger} {len(fields)} readings a row".strip()
-            found.append(Curves(stream, quantity, unit, (name,), *unrolled(t_ns, values)))
+            curves.append(Curves(stream, quantity, unit, (name,), *unrolled(t_ns, values)))
         else:
-            found.append(Curves(stream, quantity, unit, short_names(fields), t_ns, values))
-    return found
+            curves.append(Curves(stream, quantity, unit, short_names(fields), t_ns, values))
+    return curves
 
 
 def described(field: pa.Field) -> dict[str, str]:
@@ -76,7 +76,7 @@ def described(field: pa.Field) -> dict[str, str]:
 def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
     """Return columns of a table side by side as float64 (time, channel); nulls are NaN."""
     columns = [table.column(name).to_numpy() for name in names]
-    return np.column_stack([np.asarray(one, dtype=np.float64) for one in columns])
+    return np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
 
 
 def unrolled(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
@@ -93,8 +93,8 @@ def unrolled(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
 
 def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
     """Return names for a legend: the components where they are those of one vector, else the columns' names."""
-    parts = [components.component(field) for field in fields]
-    one_vector = len({components.shared_name(field) for field in fields}) == 1
+    parts = [arm.component(field) for field in fields]
+    one_vector = len({arm.shared_name(field) for field in fields}) == 1
     if len(fields) > 1 and one_vector and all(parts) and len(set(parts)) == len(parts):
         return tuple(parts)
     return tuple(str(field.name) for field in fields)

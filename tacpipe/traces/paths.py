@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Floats, Times
-from tacpipe.channels import components
-from tacpipe.channels.pose import METRES, ORIENTATION, POSITION
+from tacpipe.channels import arm
+from tacpipe.channels.arm import METRES, ORIENTATION, POSITION
 from tacpipe.traces.curves import TIME, described, matrix
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Path:
-    """Where something was, in metres; rows whose position is not finite are left out."""
+    """A path in metres, without the rows whose position is not finite."""
 
     name: str
     t_ns: Times  # (time,)
@@ -41,20 +41,20 @@ def of_table(stream: str, table: pa.Table) -> list[Path]:
         return []
     positions = _vectors(table, POSITION, "xyz")
     turned = _vectors(table, ORIENTATION, "xyzw")
-    quaternion = matrix(table, [one.name for one in next(iter(turned.values()))]) if len(turned) == 1 else None
-    found = []
+    quaternion = matrix(table, [field.name for field in next(iter(turned.values()))]) if len(turned) == 1 else None
+    paths = []
     for shared, fields in positions.items():
-        scale = [METRES.get(described(one).get("unit", "m")) for one in fields]
+        scale = [METRES.get(described(field).get("unit", "m")) for field in fields]
         if None in scale:
             continue
-        place_m = matrix(table, [one.name for one in fields]) * np.array(scale, dtype=np.float64)
-        seen = np.isfinite(place_m).all(axis=1)
+        place_m = matrix(table, [field.name for field in fields]) * np.array(scale, dtype=np.float64)
+        valid = np.isfinite(place_m).all(axis=1)
         if quaternion is not None:
-            seen &= np.isfinite(quaternion).all(axis=1) & (np.abs(quaternion).sum(axis=1) > 0)
-        if seen.any():
+            valid &= np.isfinite(quaternion).all(axis=1) & (np.abs(quaternion).sum(axis=1) > 0)
+        if valid.any():
             part = f"{stream} {shared.split('_')[0]}".strip() if len(positions) > 1 else stream or "position"
-            found.append(Path(part, t_ns[seen], place_m[seen], None if quaternion is None else quaternion[seen]))
-    return found
+            paths.append(Path(part, t_ns[valid], place_m[valid], None if quaternion is None else quaternion[valid]))
+    return paths
 
 
 def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Field]]:
@@ -62,6 +62,10 @@ def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Fi
     by_name: dict[str, dict[str, pa.Field]] = {}
     for field in table.schema:
         if described(field).get("quantity") == quantity:
-            shared = components.of_name(field.name)[1]
-            by_name.setdefault(shared, {})[components.component(field)] = field
-    return {name: [one[part] for part in parts] for name, one in by_name.items() if set(one) == set(parts)}
+            shared = arm.of_name(field.name)[1]
+            by_name.setdefault(shared, {})[arm.component(field)] = field
+    return {
+        name: [fields_by_part[part] for part in parts]
+        for name, fields_by_part in by_name.items()
+        if set(fields_by_part) == set(parts)
+    }

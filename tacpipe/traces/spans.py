@@ -1,4 +1,4 @@
-"""What lasts from one moment to another: contacts, slides, slips and other labels of rows, gaps, and events."""
+"""Find the spans of a recording (contacts, slides, slips and other labels of rows, gaps) and its events."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
-from tacpipe.channels.masks import GAP
-from tacpipe.channels.streams import gaps_before
+from tacpipe.channels.streams import GAP, gaps_before
 from tacpipe.traces.curves import TIME, described
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ class Span(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What went wrong at one moment of a recording."""
+    """A fault at one moment of a recording."""
 
     t_ns: int
     stream: str
@@ -50,11 +49,11 @@ def of_labels(table: pa.Table) -> list[Span]:
     if TIME not in table.column_names or not table.num_rows:
         return []
     t_ns = table.column(TIME).to_numpy()
-    found = []
+    spans = []
     for field in table.schema:
         if described(field).get("quantity") == "label" and field.name != TIME:
-            found += _of_column(str(field.name), table.column(field.name), t_ns)
-    return found
+            spans += _of_column(str(field.name), table.column(field.name), t_ns)
+    return spans
 
 
 def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[Span]:
@@ -80,8 +79,8 @@ def _of_column(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:
     encoded = column.combine_chunks().dictionary_encode()
     codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)  # (time,)
     values = {code: _text(value) for code, value in enumerate(encoded.dictionary.to_pylist())} | {-1: ""}
-    numbered = not any(set(values.values()) - {""} <= known for known in _SWITCHES)
-    texts = {code: _shown(name, value, numbered=numbered) for code, value in values.items()}
+    numbered = not any(set(values.values()) - {""} <= switch for switch in _SWITCHES)
+    texts = {code: _label_text(name, value, numbered=numbered) for code, value in values.items()}
     return [
         Span(name, texts[int(codes[start])], int(t_ns[start]), stop_ns(t_ns, stop))
         for start, stop in _stretches(codes)
@@ -93,12 +92,12 @@ def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _shown(name: str, value: str, *, numbered: bool) -> str:
+def _label_text(name: str, value: str, *, numbered: bool) -> str:
     if name in _NAMED:
         return _NAMED[name].get(int(value), value) if value.lstrip("-").isdigit() else value
     if numbered:
-        nothing = set(_NOTHING) - {"0"}
-        return "" if value in nothing else f"{name} {value}" if value.lstrip("-").isdigit() else value
+        unset = set(_NOTHING) - {"0"}
+        return "" if value in unset else f"{name} {value}" if value.lstrip("-").isdigit() else value
     return "" if value in _NOTHING else name
 
 
@@ -129,53 +128,54 @@ def masked_gaps(table: pa.Table) -> list[Span]:
     if TIME not in table.column_names or not table.num_rows:
         return []
     t_ns = table.column(TIME).to_numpy()
-    found = []
+    spans = []
     for name in table.column_names:
         if name.endswith(GAP):
             values = table.column(name).to_numpy().astype(bool)
             lane = name.removesuffix(GAP)
-            found += [
+            spans += [
                 Span(lane, "gap", int(t_ns[start]), stop_ns(t_ns, stop))
                 for start, stop in _stretches(values)
                 if values[start]
             ]
-    return found
+    return spans
 
 
-def merged(found: Sequence[Span], lane: str = "gaps") -> list[Span]:
+def merged(spans: Sequence[Span], lane: str = "gaps") -> list[Span]:
     """Return spans of several lanes as one lane without overlaps; each names the lanes that it is of.
 
-    >>> [one[1:] for one in merged([Span("a", "gap", 0, 5), Span("b", "gap", 3, 9)])]
+    >>> [span[1:] for span in merged([Span("a", "gap", 0, 5), Span("b", "gap", 3, 9)])]
     [('a', 0, 3), ('a, b', 3, 5), ('b', 5, 9)]
     """
-    edges = sorted({edge for one in found for edge in (one.start_ns, one.stop_ns)})
+    edges = sorted({edge for span in spans for edge in (span.start_ns, span.stop_ns)})
     starts: dict[int, list[str]] = {}
     stops: dict[int, list[str]] = {}
-    for one in found:
-        starts.setdefault(one.start_ns, []).append(one.lane)
-        stops.setdefault(one.stop_ns, []).append(one.lane)
-    there: Counter[str] = Counter()
-    together = []
+    for span in spans:
+        starts.setdefault(span.start_ns, []).append(span.lane)
+        stops.setdefault(span.stop_ns, []).append(span.lane)
+    open_lanes: Counter[str] = Counter()
+    merged_spans = []
     for start_ns, stop_ns_ in pairwise(edges):
-        there.update(starts.get(start_ns, ()))
-        there.subtract(stops.get(start_ns, ()))
-        names = sorted(name for name, count in there.items() if count > 0)
+        open_lanes.update(starts.get(start_ns, ()))
+        open_lanes.subtract(stops.get(start_ns, ()))
+        names = sorted(name for name, count in open_lanes.items() if count > 0)
         if names:
-            together.append(Span(lane, ", ".join(names), start_ns, stop_ns_))
-    return together
+            merged_spans.append(Span(lane, ", ".join(names), start_ns, stop_ns_))
+    return merged_spans
 
 
 def events(table: pa.Table) -> list[Event]:
     """Return the rows of a stream of events, in the order of time."""
     rows = table.to_pylist()
-    found = [
-        Event(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event(row)) for row in rows
+    parsed = [
+        Event(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event_text(row))
+        for row in rows
     ]
-    return sorted(found)
+    return sorted(parsed)
 
 
-def _event(row: Mapping[str, object]) -> str:
-    what = [str(row.get("cause") or "event")]
-    what += [f"{row[name]} {name}" for name in ("frames", "bytes") if row.get(name)]
-    what += [str(row["detail"])] if row.get("detail") else []
-    return ", ".join(what)
+def _event_text(row: Mapping[str, object]) -> str:
+    parts = [str(row.get("cause") or "event")]
+    parts += [f"{row[name]} {name}" for name in ("frames", "bytes") if row.get(name)]
+    parts += [str(row["detail"])] if row.get("detail") else []
+    return ", ".join(parts)

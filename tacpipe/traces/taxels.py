@@ -1,4 +1,4 @@
-"""The taxels of a sensor over time: where they lie, and how far each is from its level without load."""
+"""Compute the taxels of a sensor over time: their places, their distance from rest, and an image of all."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import Floats, Times
-from tacpipe.channels import components, places
+from tacpipe.arrays import AnyArray, Floats, Times
+from tacpipe.channels import arm, places
 from tacpipe.signals.contact import rest_level
 from tacpipe.traces.curves import TIME, described, matrix
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-REST_S = 0.2  # at the start, whose median is the level without load where no segmentation gave it
+REST_S = 0.2  # time at the start whose median is the level without load, where no segmentation gave a level
 LARGEST = 0.995  # quantile that is the end of a scale: a single wrong reading would darken all others
-LEAST = 0.5  # of a unit, the smallest end of a scale
+LEAST = 0.5  # smallest end of a scale, in the unit of the values
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class Taxels:
     """One finger's taxels; readings that are a single row are kept as they are, since their rest is unknown."""
 
     stream: str
-    finger: str  # of several on one stream, else empty
+    finger: str  # name of the finger where the stream has several, else empty
     unit: str
-    names: tuple[str, ...]  # of the taxels
+    names: tuple[str, ...]  # taxel names
     channels: tuple[str, ...]  # the columns, taxel by taxel
     places: Floats  # (taxel, 2), to the right and up
     places_unit: str  # mm, or grid
     t_ns: Times  # (time,)
     change: Floats  # (time, taxel, axis) from rest; three axes x, y, z or one
-    rest: Floats  # (channel,), taken off
+    rest_levels: Floats  # (channel,), subtracted
 
     @property
     def name(self) -> str:
@@ -81,8 +81,8 @@ def _of_fields(stream: str, finger: str, table: pa.Table, fields: Sequence[pa.Fi
     t_ns, values = table.column(TIME).to_numpy(), matrix(table, columns)
     firsts = fields[::axes]
     place, unit = places.of_taxels(firsts)
-    rest = _rest(fields, values, t_ns)
-    names = tuple(one.name.rpartition("_")[0] if axes == 3 else one.name for one in firsts)
+    levels = _rest_levels(fields, values, t_ns)
+    names = tuple(field.name.rpartition("_")[0] if axes == 3 else field.name for field in firsts)
     if finger:
         names = tuple(name.removeprefix(f"{finger}_") for name in names)
     return Taxels(
@@ -94,15 +94,15 @@ def _of_fields(stream: str, finger: str, table: pa.Table, fields: Sequence[pa.Fi
         place,
         unit,
         t_ns,
-        (values - rest).reshape(len(t_ns), -1, axes),
-        rest,
+        (values - levels).reshape(len(t_ns), -1, axes),
+        levels,
     )
 
 
-def _rest(fields: Sequence[pa.Field], values: Floats, t_ns: Times) -> Floats:
-    known = [described(field).get("rest") for field in fields]
-    if all(one is not None for one in known):
-        return np.array([float(one or 0) for one in known])
+def _rest_levels(fields: Sequence[pa.Field], values: Floats, t_ns: Times) -> Floats:
+    stored = [described(field).get("rest") for field in fields]
+    if all(level is not None for level in stored):
+        return np.array([float(level or 0) for level in stored])
     return np.zeros(len(fields)) if len(t_ns) < 2 else rest_level(values, t_ns, REST_S)
 
 
@@ -112,10 +112,10 @@ def _by_taxel(fields: Sequence[pa.Field]) -> tuple[list[pa.Field], int]:
     for field in fields:
         about = described(field)
         axis = about.get("axis", "")
-        part, shared = (axis, field.name.removesuffix(axis)) if axis else components.of_name(field.name)
+        part, shared = (axis, field.name.removesuffix(axis)) if axis else arm.of_name(field.name)
         vectors.setdefault(shared, {})[part] = field
-    if vectors and all(set(one) == set("xyz") for one in vectors.values()):
-        return [one[axis] for one in vectors.values() for axis in "xyz"], 3
+    if vectors and all(set(vector) == set("xyz") for vector in vectors.values()):
+        return [vector[axis] for vector in vectors.values() for axis in "xyz"], 3
     return list(fields), 1
 
 
@@ -133,5 +133,34 @@ def scale(values: Floats) -> tuple[float, float]:
     low, high = float(finite.min()), float(finite.max())
     if low > 0.2 * high > 0:
         return low, high
-    most = max(float(np.quantile(np.abs(finite), LARGEST)), LEAST)
-    return (-most, most) if float(np.quantile(finite, 1 - LARGEST)) < -0.1 * most else (0.0, most)
+    reach = max(float(np.quantile(np.abs(finite), LARGEST)), LEAST)
+    return (-reach, reach) if float(np.quantile(finite, 1 - LARGEST)) < -0.1 * reach else (0.0, reach)
+
+
+def binned(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: int) -> Floats:
+    """Return what a signal (time, channel) has in each of ``bins`` equal times: the value farthest from 0, (bin, channel).
+
+    A bin without rows repeats the one before it. Before the first row, and where a stream has ended, it is NaN.
+
+    >>> binned(np.array([0, 1, 2, 9]), np.array([[1.0], [-3.0], [2.0], [5.0]]), 0, 10, 5).ravel().tolist()
+    [-3.0, 2.0, 2.0, 2.0, 5.0]
+    """
+    peaks = np.full((bins, values.shape[1]), np.nan)
+    if not len(t_ns):
+        return peaks
+    width_ns = max(stop_ns - start_ns, 1)
+    place = np.clip((t_ns - start_ns) * bins // width_ns, 0, bins - 1)
+    occupied, starts = np.unique(place, return_index=True)
+    high, low = np.fmax.reduceat(values, starts, axis=0), np.fmin.reduceat(values, starts, axis=0)
+    peaks[occupied] = np.where(np.abs(high) >= np.abs(low), high, low)
+    spacing = int(np.median(np.diff(occupied))) if len(occupied) > 1 else bins
+    ends = occupied[-1] + spacing
+    latest = np.maximum.accumulate(np.where(np.isin(np.arange(bins), occupied), np.arange(bins), -1))
+    covered = (latest >= 0) & (np.arange(bins) < ends)
+    filled: Floats = np.where(covered[:, None], peaks[np.maximum(latest, 0)], np.nan)
+    return filled
+
+
+def image(colours: AnyArray, rows: int) -> AnyArray:
+    """Return an image (row, bin, rgb) of colours (bin, channel, rgb), ``rows`` high for each channel."""
+    return np.repeat(colours.transpose(1, 0, 2), rows, axis=0)

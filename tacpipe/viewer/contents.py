@@ -15,12 +15,13 @@ from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
+from tacpipe.printable import plain
 from tacpipe.signals import contact
-from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
+from tacpipe.traces import curves, paths, spans, taxels
+from tacpipe.traces import predictions as forecasts
 from tacpipe.traces.curves import TIME, Curves, described
-from tacpipe.traces.forecasts import Forecast
-from tacpipe.traces.named import Named
 from tacpipe.traces.paths import Path
+from tacpipe.traces.predictions import Classification, Forecast
 from tacpipe.traces.spans import Event, Span
 from tacpipe.traces.taxels import Taxels
 
@@ -60,13 +61,13 @@ class Frames:
 
 @dataclass(frozen=True)
 class Contents:
-    """What is drawn of a recording."""
+    """The contents of a recording that are drawn."""
 
     name: str
     attributes: Mapping[str, Attribute]
     rates: Mapping[str, tuple[int, float | None]]  # rows and rate in Hz, by stream
     curves: list[Curves] = field(default_factory=list)
-    truth: list[Curves] = field(default_factory=list)  # what a simulation knows
+    truth: list[Curves] = field(default_factory=list)  # ground truth of a simulation
     taxels: list[Taxels] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
     gaps: list[Span] = field(default_factory=list)
@@ -76,21 +77,20 @@ class Contents:
     frames: list[Frames] = field(default_factory=list)
     forecasts: list[Forecast] = field(default_factory=list)
     predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
-    named: Named | None = None  # what it named the whole recording
+    classification: Classification | None = None  # class that it predicted for the whole recording
 
     @cached_property
     def ends_ns(self) -> tuple[int, int]:
         """When the first and the last sample of any stream were taken; twice 0 where nothing has a time."""
-        stamps: list[Times] = [one.t_ns for one in (*self.curves, *self.truth)]
-        stamps += [one.t_ns for one in self.taxels] + [one.t_ns for one in self.paths]
-        stamps += [one.t_ns for one in self.frames]
-        stamps += [np.array([one.t_ns]) for one in self.clouds if one.t_ns is not None]
-        stamps = [one for one in stamps if len(one)]
-        return (min(int(one[0]) for one in stamps), max(int(one[-1]) for one in stamps)) if stamps else (0, 0)
+        timed: list[Curves | Taxels | Path | Frames]
+        timed = [*self.curves, *self.truth, *self.taxels, *self.paths, *self.frames]
+        stamps = [member.t_ns for member in timed if len(member.t_ns)]
+        stamps += [np.array([points.t_ns]) for points in self.clouds if points.t_ns is not None]
+        return (min(int(t_ns[0]) for t_ns in stamps), max(int(t_ns[-1]) for t_ns in stamps)) if stamps else (0, 0)
 
     @property
     def empty(self) -> bool:
-        """Whether there is nothing to draw."""
+        """True without anything to draw."""
         return not (self.curves or self.taxels or self.paths or self.clouds or self.frames)
 
     @property
@@ -103,10 +103,10 @@ class Contents:
         """The streams with curves, those first whose quantities a reader looks for first."""
 
         def rank(name: str) -> int:
-            here = [one.quantity for one in self.curves if one.stream == name]
-            return min((FIRST.index(one) for one in here if one in FIRST), default=len(FIRST))
+            quantities = [member.quantity for member in self.curves if member.stream == name]
+            return min((FIRST.index(quantity) for quantity in quantities if quantity in FIRST), default=len(FIRST))
 
-        return sorted(dict.fromkeys(one.stream for one in self.curves), key=rank)
+        return sorted(dict.fromkeys(member.stream for member in self.curves), key=rank)
 
     @property
     def duration_s(self) -> float:
@@ -214,7 +214,7 @@ def _of_tables(
 ) -> Contents:
     predicted = {} if row is None else _values(row)
     only_table = tables[""] if set(tables) == {""} else None
-    if only_table is not None and TIME not in only_table.column_names:  # of a split, or one row a recording
+    if only_table is not None and TIME not in only_table.column_names:  # a split, or one row per recording
         return Contents(name, attributes, {"": (only_table.num_rows, None)})
     streams = split_tables(tables)
     truth = _truth(tables)
@@ -244,17 +244,17 @@ def _of_tables(
         happened,
         paths.of_streams(plotted),
         [points for stream, table in clouds.items() for points in _points(stream, table)],
-        [found for stream, table in streams.items() for found in _frames(stream, table)],
+        [frames for stream, table in streams.items() for frames in _frames(stream, table)],
         ahead,
         predicted,
-        None if row is None else named.of_row(row, attributes),
+        None if row is None else forecasts.of_row(row, attributes),
     )
 
 
 def _values(row: pa.Table) -> dict[str, Any]:
     """Return what a row of predictions holds for a reader: neither the recording's name nor latents."""
-    kept = [field.name for field in row.schema if described(field).get("quantity") != "latent"]
-    return {name: row.column(name)[0].as_py() for name in kept if name != "recording"}
+    names = [field.name for field in row.schema if described(field).get("quantity") != "latent"]
+    return {name: row.column(name)[0].as_py() for name in names if name != "recording"}
 
 
 def _truth(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
@@ -289,12 +289,47 @@ def _points(stream: str, table: pa.Table) -> list[Points]:
 def _frames(stream: str, table: pa.Table) -> list[Frames]:
     if TIME not in table.column_names:
         return []
-    found = []
+    frames = []
     for column in table.schema:
         if not str(column.type).endswith("binary"):
             continue
-        content = [bytes(one or b"") for one in table.column(column.name).to_pylist()]
+        content = [bytes(picture or b"") for picture in table.column(column.name).to_pylist()]
         kind = next(filter(None, map(picture_encoding, content)), "")
         if kind:
-            found.append(Frames(stream, table.column(TIME).to_numpy(), content, f"image/{kind}"))
-    return found
+            frames.append(Frames(stream, table.column(TIME).to_numpy(), content, f"image/{kind}"))
+    return frames
+
+
+MOST = 40  # labels
+
+
+def to_markdown(contents: Contents) -> str:
+    """Return the labels, streams and events of a recording as Markdown."""
+    lines = [f"# {plain(contents.name)}", "", f"{contents.duration_s:.3g} s", ""]
+    labels = contents.labels
+    if labels:
+        lines += ["| label | value |", "| --- | --- |"]
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(labels.items())[:MOST]]
+        lines += [f"| … | {len(labels) - MOST} more |"] if len(labels) > MOST else []
+    lines += ["", "| stream | rows | Hz |", "| --- | --- | --- |"]
+    lines += [
+        f"| {_cell(name or '-')} | {rows} | {rate_hz or ''} |" for name, (rows, rate_hz) in contents.rates.items()
+    ]
+    if contents.classification:
+        lines += ["", "| predictor | " + _cell(contents.classification.key) + " |", "| --- | --- |"]
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in contents.classification.predicted.items()]
+        lines += [f"| the label | {_cell(contents.classification.label)} |"] if contents.classification.label else []
+    elif contents.predicted:
+        lines += ["", "| predicted | value |", "| --- | --- |"]
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(contents.predicted.items())[:MOST]]
+    lines += [
+        "",
+        "**Maps of taxels**: colour is the distance from rest, an arrow the shear along x and y.",
+    ]
+    lines += ["**Touch**: the mean of these distances over the taxels of a finger."]
+    return "\n".join(lines)
+
+
+def _cell(value: object) -> str:
+    cell = f"{value:g}" if isinstance(value, float) else str(value)
+    return plain(cell).replace("|", "\\|")

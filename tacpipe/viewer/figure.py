@@ -14,16 +14,16 @@ from tacpipe.errors import UsageError
 from tacpipe.io.files import readable_errors, write_whole
 from tacpipe.plugins import extras
 from tacpipe.printable import plain
-from tacpipe.signals.envelope import envelope
-from tacpipe.traces import carpet, palette, taxels
+from tacpipe.signals.filters import envelope
+from tacpipe.traces import drawing, taxels
 from tacpipe.traces.spans import CONTACT, PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer.contents import Contents
 
 ENDINGS = (".png", ".svg", ".pdf")
 WIDTH_IN, DPI = 11.0, 110
-POINTS = 2400  # of a line: two a pixel
-BINS = 1200  # of the image of all taxels
+POINTS = 2400  # points of a line: two per pixel
+BINS = 1200  # bins of the image of all taxels
 PANELS, NAMED = 9, 8  # sets of curves that are drawn, and lines that a legend names
 MAPS_A_ROW = 4
 LINE = 1.0
@@ -42,15 +42,15 @@ class Panel(NamedTuple):
 def panels(contents: Contents) -> list[Panel]:
     """Return what is plotted over time, the touch of all fingers of one unit first, then the streams, at most ten."""
     found = []
-    touched = [one for one in contents.taxels if len(one.t_ns) > 1]
-    for unit in dict.fromkeys(one.unit for one in touched):
+    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+    for unit in dict.fromkeys(finger.unit for finger in touched):
         title = f"touch: mean distance of the taxels from rest ({unit})".replace(" ()", "")
-        some = [one for one in touched if one.unit == unit]
+        some = [finger for finger in touched if finger.unit == unit]
         t_ns = some[0].t_ns
-        loads = [one.load if one.t_ns is t_ns else np.interp(t_ns, one.t_ns, one.load) for one in some]
-        found.append(Panel(title, t_ns, np.column_stack(loads), tuple(one.name for one in some)))
-    curves = [one for name in contents.by_interest for one in contents.curves if one.stream == name]
-    return found + [Panel(one.title, one.t_ns, one.values, one.names) for one in curves[:PANELS]]
+        loads = [finger.load if finger.t_ns is t_ns else np.interp(t_ns, finger.t_ns, finger.load) for finger in some]
+        found.append(Panel(title, t_ns, np.column_stack(loads), tuple(finger.name for finger in some)))
+    curves = [curve for name in contents.by_interest for curve in contents.curves if curve.stream == name]
+    return found + [Panel(curve.title, curve.t_ns, curve.values, curve.names) for curve in curves[:PANELS]]
 
 
 def draw(contents: Contents, path: Path) -> None:
@@ -80,50 +80,50 @@ def _over_time(contents: Contents, lines: Sequence[Panel]) -> Any:
 
     start_ns, stop_ns = contents.ends_ns
     lanes = _lanes(contents)
-    touched = [one for one in contents.taxels if len(one.t_ns) > 1]
+    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     heights = [1.9, *[0.28 * len(lanes) + 0.1] * bool(lanes), *[1.1] * len(touched), *[1.15] * (len(lines) - 1)]
     figure = Figure(figsize=(WIDTH_IN, sum(heights) + 0.42 * len(heights) + 0.5), dpi=DPI, layout="constrained")
     figure.suptitle(_title(contents), x=0.01, ha="left", fontsize=11)
     axes: list[Any] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     )
-    first, rest = lines[0], lines[1:]
+    first, further_panels = lines[0], lines[1:]
     main = axes.pop(0)
     _plot(main, first, start_ns)
     for span in contents.spans:
         if span.lane == CONTACT:
-            look = _look(span, palette.DISTINCT[0])
+            look = _look(span, drawing.DISTINCT[0])
             main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **look)
     if lanes:
         _diagram(axes.pop(0), lanes, start_ns)
-    for one in touched:
-        _image(axes.pop(0), one, start_ns, stop_ns)
-    for panel in rest:
+    for finger in touched:
+        _image(axes.pop(0), finger, start_ns, stop_ns)
+    for panel in further_panels:
         _plot(axes.pop(0), panel, start_ns)
     bottom = figure.axes[-1]
     bottom.set_xlabel("time since the start of the recording (s)")
     bottom.set_xlim(0, max(_s(stop_ns, start_ns), 1e-3))
-    for each in figure.axes:
+    for axis_of_figure in figure.axes:
         for event in contents.events:
-            each.axvline(_s(event.t_ns, start_ns), color=palette.FAULT, linewidth=0.8, alpha=0.8)
+            axis_of_figure.axvline(_s(event.t_ns, start_ns), color=drawing.FAULT, linewidth=0.8, alpha=0.8)
     return figure
 
 
 def _title(contents: Contents) -> str:
-    labels = [f"{name}: {value}" for name, value in contents.labels.items() if _named(name, value)]
-    return " · ".join([plain(contents.name), *(plain(one) for one in labels[:5])])
+    labels = [f"{name}: {value}" for name, value in contents.labels.items() if _is_label(name, value)]
+    return " · ".join([plain(contents.name), *(plain(label) for label in labels[:5])])
 
 
-def _named(name: str, value: object) -> bool:
+def _is_label(name: str, value: object) -> bool:
     """Return whether a label is one that the title names: of the recording, not of how it was synchronized."""
     return isinstance(value, str | bool) and not name.startswith("grid") and name not in ("trial", "simulated")
 
 
 def _lanes(contents: Contents) -> dict[str, list[Span]]:
-    found: dict[str, list[Span]] = {}
+    lanes: dict[str, list[Span]] = {}
     for span in (*contents.spans, *merged(contents.gaps)):
-        found.setdefault(span.lane, []).append(span)
-    return found
+        lanes.setdefault(span.lane, []).append(span)
+    return lanes
 
 
 def _plot(axes: Any, panel: Panel, start_ns: int) -> None:
@@ -131,7 +131,7 @@ def _plot(axes: Any, panel: Panel, start_ns: int) -> None:
     seconds = _s(t_ns, start_ns)
     vector = set(panel.names) <= set("xyzw")
     for place, name in enumerate(panel.names):
-        colour = palette.numbered(place, palette.AXES if vector else palette.PRINTED)
+        colour = drawing.numbered(place, drawing.AXES if vector else drawing.PRINTED)
         axes.plot(seconds, values[:, place], color=colour, linewidth=LINE, label=name if place < NAMED else None)
     axes.set_title(panel.title, loc="left")
     axes.grid(alpha=0.25)
@@ -139,9 +139,14 @@ def _plot(axes: Any, panel: Panel, start_ns: int) -> None:
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     if len(panel.names) > 1:
-        more = f"and {len(panel.names) - NAMED} more" if len(panel.names) > NAMED else None
+        legend_title = f"and {len(panel.names) - NAMED} more" if len(panel.names) > NAMED else None
         axes.legend(
-            loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7, title=more, title_fontsize=7
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            frameon=False,
+            fontsize=7,
+            title=legend_title,
+            title_fontsize=7,
         )
 
 
@@ -149,8 +154,10 @@ def _diagram(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
     """Draw the spans of each lane as bars, with their texts where there is room."""
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
     for place, (lane, spans) in enumerate(lanes.items()):
-        colour = palette.FAULT if lane == "gaps" else palette.numbered(place)
-        bars: dict[tuple[tuple[str, str], ...], list[tuple[float, float]]] = {}  # by look, which are drawn at once
+        colour = drawing.FAULT if lane == "gaps" else drawing.numbered(place)
+        bars: dict[
+            tuple[tuple[str, str], ...], list[tuple[float, float]]
+        ] = {}  # bars by look: those of one look are drawn at once
         for span in spans:
             left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
             bars.setdefault(tuple(_look(span, colour).items()), []).append((left, width))
@@ -175,16 +182,16 @@ def _look(span: Span, colour: str) -> dict[str, str]:
     return {"facecolor": colour}
 
 
-def _image(axes: Any, one: Taxels, start_ns: int, stop_ns: int) -> None:
+def _image(axes: Any, finger: Taxels, start_ns: int, stop_ns: int) -> None:
     """Draw all taxels over time, a row each, with the ends of the colour scale in the title."""
-    low, high = taxels.scale(one.magnitude)
-    colours = palette.coloured(carpet.binned(one.t_ns, one.magnitude, start_ns, stop_ns, BINS), low, high)
-    extent = (0, _s(stop_ns, start_ns), len(one.names) + 0.5, 0.5)
-    axes.imshow(carpet.image(colours, 1), aspect="auto", extent=extent, interpolation="nearest")
-    unit = f" {one.unit}" if one.unit else ""
+    low, high = taxels.scale(finger.magnitude)
+    colours = drawing.coloured(taxels.binned(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS), low, high)
+    extent = (0, _s(stop_ns, start_ns), len(finger.names) + 0.5, 0.5)
+    axes.imshow(taxels.image(colours, 1), aspect="auto", extent=extent, interpolation="nearest")
+    unit = f" {finger.unit}" if finger.unit else ""
     dark, bright = ("blue", "orange") if low < 0 else ("dark", "bright")
     ends = f"{low:,.4g} ({dark}) to {high:,.4g}{unit} ({bright})"
-    axes.set_title(f"{one.name}: distance of each taxel from rest, {ends}", loc="left")
+    axes.set_title(f"{finger.name}: distance of each taxel from rest, {ends}", loc="left")
     axes.set_ylabel("taxel")
 
 
@@ -192,24 +199,24 @@ def _at_once(contents: Contents) -> Any:
     """Draw maps of taxels of which there is one reading."""
     from matplotlib.figure import Figure
 
-    shown = contents.taxels
-    columns = min(len(shown), MAPS_A_ROW)
-    rows = -(-len(shown) // columns)
+    fingers = contents.taxels
+    columns = min(len(fingers), MAPS_A_ROW)
+    rows = -(-len(fingers) // columns)
     figure = Figure(figsize=(3.4 * columns, 3.6 * rows + 0.4), dpi=DPI, layout="constrained")
     figure.suptitle(_title(contents), x=0.01, ha="left", fontsize=11)
-    low, high = taxels.scale(np.concatenate([one.magnitude.ravel() for one in shown]))
-    for place, one in enumerate(shown):
+    low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
+    for place, finger in enumerate(fingers):
         axes: Any = figure.add_subplot(rows, columns, place + 1)
-        colours = palette.coloured(one.magnitude[-1], low, high) / 255
-        axes.scatter(*one.places.T, c=colours, s=260, edgecolors="#6e7781", linewidths=0.5)
-        for (x, y), value in zip(one.places, one.magnitude[-1], strict=True):
+        colours = drawing.coloured(finger.magnitude[-1], low, high) / 255
+        axes.scatter(*finger.places.T, c=colours, s=260, edgecolors="#6e7781", linewidths=0.5)
+        for (x, y), value in zip(finger.places, finger.magnitude[-1], strict=True):
             axes.annotate(
                 f"{value:.0f}", (x, y), (0, -12), textcoords="offset points", ha="center", va="center", fontsize=6
             )
-        axes.set_title(f"{one.name} ({one.unit})", loc="left")
+        axes.set_title(f"{finger.name} ({finger.unit})", loc="left")
         axes.set_aspect("equal")
         axes.margins(0.15)
-        axes.set_xlabel("mm" if one.places_unit == "mm" else "column")
+        axes.set_xlabel("mm" if finger.places_unit == "mm" else "column")
     return figure
 
 

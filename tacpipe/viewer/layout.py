@@ -1,4 +1,4 @@
-"""Which views the viewer opens with, and where they lie: few large ones, the others in tabs.
+"""Choose the views with which the viewer opens, and their places: few large ones, the others in tabs.
 
 On the left the time axes, one below the other and moved together: touch, spans, streams. On the right the taxels at the
 cursor, all taxels over the whole recording, and space. Rerun is imported inside the functions.
@@ -22,17 +22,19 @@ SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of
 def signature(contents: Contents) -> tuple[Any, ...]:
     """Return what the layout depends on; recordings with the same one share it."""
     titles = (
-        sorted(f"{one.stream} {one.title}" for one in contents.curves),
-        sorted(one.name for one in contents.taxels),
+        sorted(f"{curve.stream} {curve.title}" for curve in contents.curves),
+        sorted(finger.name for finger in contents.taxels),
     )
-    steps = sorted({(one.measured.name, one.step) for one in contents.forecasts})
-    space = (sorted(one.name for one in contents.paths), sorted({one.stream for one in contents.clouds}))
-    cameras = sorted(one.stream for one in contents.frames)
-    named = (contents.named.key, len(contents.named.leading())) if contents.named else ()
-    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), named)
+    steps = sorted({(forecast.measured.name, forecast.step) for forecast in contents.forecasts})
+    space = (sorted(path.name for path in contents.paths), sorted({cloud.stream for cloud in contents.clouds}))
+    cameras = sorted(camera.stream for camera in contents.frames)
+    prediction = (
+        (contents.classification.key, len(contents.classification.leading())) if contents.classification else ()
+    )
+    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), prediction)
 
 
-def blueprint(contents: Contents, *, several: bool = False) -> Any:
+def blueprint(contents: Contents, *, with_list: bool = False) -> Any:
     """Return the layout of a recording's views as Rerun's blueprint."""
     import rerun.blueprint as rrb
 
@@ -47,7 +49,7 @@ def blueprint(contents: Contents, *, several: bool = False) -> Any:
         root,
         _playing(contents),
         rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="expanded" if several else "collapsed"),  # which has the list of recordings
+        rrb.BlueprintPanel(state="expanded" if with_list else "collapsed"),  # this panel has the list of recordings
     )
 
 
@@ -71,11 +73,11 @@ def _playing(contents: Contents) -> Any:
 
 def loop_s(contents: Contents) -> tuple[float, float] | None:
     """Return the part of a recording of more than 20 s that plays at first, seconds from its start; None for all."""
-    touched = [one for one in contents.taxels if len(one.t_ns) > 1]
+    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     if contents.duration_s <= SHORT_S or not touched:
         return None
-    most = max(touched, key=lambda one: float(np.nanmax(one.load, initial=0.0)))
-    peak_s = (int(most.t_ns[int(np.nanargmax(most.load))]) - contents.ends_ns[0]) / 1e9
+    strongest = max(touched, key=lambda finger: float(np.nanmax(finger.load, initial=0.0)))
+    peak_s = (int(strongest.t_ns[int(np.nanargmax(strongest.load))]) - contents.ends_ns[0]) / 1e9
     start_s = min(max(peak_s - LOOP_S / 2, 0.0), contents.duration_s - LOOP_S)
     return start_s, start_s + LOOP_S
 
@@ -91,65 +93,71 @@ def _times(contents: Contents) -> list[tuple[Any, float]]:
     """Return the views with a time axis, with their heights."""
     import rerun.blueprint as rrb
 
-    found: list[tuple[Any, float]] = []
+    views: list[tuple[Any, float]] = []
     unit = f" ({_unit(contents)})".replace(" ()", "")
-    ahead = [one for one in contents.forecasts if one.step]
+    ahead = [forecast for forecast in contents.forecasts if forecast.step]
     if ahead:
-        for name in dict.fromkeys(one.measured.name for one in ahead):
+        for name in dict.fromkeys(forecast.measured.name for forecast in ahead):
             title = f"{name}: load measured and predicted{unit}"
-            found.append((_plot(_origin(stream.FORECAST, name), title), 2.0))
-        found.append((_plot(stream.ERROR, f"Mean absolute error of the forecasts{unit}"), 1.3))
-    elif any(len(one.t_ns) > 1 for one in contents.taxels):
-        found.append((_plot(stream.TOUCH, f"Touch: mean distance of the taxels from rest{unit}"), 3.0))
-    lanes = {one.lane for one in contents.spans} | ({"gaps"} if contents.gaps else set())
-    lanes |= {f"events {one.stream}" for one in contents.events}
+            views.append((_plot(_origin(stream.FORECAST, name), title), 2.0))
+        views.append((_plot(stream.ERROR, f"Mean absolute error of the forecasts{unit}"), 1.3))
+    elif any(len(finger.t_ns) > 1 for finger in contents.taxels):
+        views.append((_plot(stream.TOUCH, f"Touch: mean distance of the taxels from rest{unit}"), 3.0))
+    lanes = {span.lane for span in contents.spans} | ({"gaps"} if contents.gaps else set())
+    lanes |= {f"events {event.stream}" for event in contents.events}
     if lanes:
         view = rrb.StateTimelineView(origin=stream.SPANS, name="Contacts, labels, gaps", time_view=_linked())
-        found.append((view, min(max(LEAST, LANE * (len(lanes) + 1)), MOST)))
+        views.append((view, min(max(LEAST, LANE * (len(lanes) + 1)), MOST)))
     tabs = _tabs(contents)
     if tabs:
-        found.append((rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0], 3.2))
-    return found
+        views.append((rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0], 3.2))
+    return views
 
 
 def _tabs(contents: Contents) -> list[Any]:
     """Return a tab a stream, one of each finger's taxels, and that of the ground truth."""
     import rerun.blueprint as rrb
 
-    found = []
+    tabs = []
     for name in contents.by_interest:
         views = [
-            _plot(_origin(stream.SERIES, name, one.title), one.title) for one in contents.curves if one.stream == name
+            _plot(_origin(stream.SERIES, name, curve.title), curve.title)
+            for curve in contents.curves
+            if curve.stream == name
         ]
-        found.append(rrb.Vertical(*views, name=name or "rows") if len(views) > 1 else views[0])
-    for one in contents.taxels:
-        if len(one.t_ns) > 1:
-            titles = [stream.channels_title(one, axis) for axis in (stream.AXES if one.change.shape[2] == 3 else ("",))]
-            views = [_plot(_origin(stream.CHANNELS, one.name, title), title) for title in titles]
-            found.append(rrb.Vertical(*views, name=f"{one.name} taxels"))
+        tabs.append(rrb.Vertical(*views, name=name or "rows") if len(views) > 1 else views[0])
+    for finger in contents.taxels:
+        if len(finger.t_ns) > 1:
+            titles = [
+                stream.channels_title(finger, axis) for axis in (stream.AXES if finger.change.shape[2] == 3 else ("",))
+            ]
+            views = [_plot(_origin(stream.CHANNELS, finger.name, title), title) for title in titles]
+            tabs.append(rrb.Vertical(*views, name=f"{finger.name} taxels"))
     if contents.truth:
-        views = [_plot(_origin(stream.TRUTH, one.title), one.title) for one in contents.truth]
-        found.append(rrb.Grid(*views, name="ground truth"))
+        views = [_plot(_origin(stream.TRUTH, curve.title), curve.title) for curve in contents.truth]
+        tabs.append(rrb.Grid(*views, name="ground truth"))
     if contents.events:
-        found.append(rrb.TextLogView(origin=stream.EVENTS, name="events"))
-    return found
+        tabs.append(rrb.TextLogView(origin=stream.EVENTS, name="events"))
+    return tabs
 
 
 def _space(contents: Contents) -> Any:
     """Return the view of paths and clouds, seen from a side from which all of them are in sight."""
     import rerun.blueprint as rrb
 
-    places = [one.position_m for one in contents.paths] + [one.points_m for one in contents.clouds]
+    places = [path.position_m for path in contents.paths] + [cloud.points_m for cloud in contents.clouds]
     if contents.clouds:  # the camera that saw the cloud looks along z
-        middle = np.median(np.concatenate([one.points_m for one in contents.clouds]), axis=0)
-        behind, up = np.array([0.0, 0.0, -1.0]), (0, -1, 0)
-        extent = np.concatenate([one.points_m for one in contents.clouds])
+        middle = np.median(np.concatenate([cloud.points_m for cloud in contents.clouds]), axis=0)
+        eye_direction, up = np.array([0.0, 0.0, -1.0]), (0, -1, 0)
+        extent = np.concatenate([cloud.points_m for cloud in contents.clouds])
     else:
         extent = np.concatenate(places)
-        middle, behind, up = (extent.min(axis=0) + extent.max(axis=0)) / 2, np.array([0.8, -1.0, 0.6]), (0, 0, 1)
+        middle, eye_direction, up = (extent.min(axis=0) + extent.max(axis=0)) / 2, np.array([0.8, -1.0, 0.6]), (0, 0, 1)
     low, high = np.quantile(extent, [0.02, 0.98], axis=0)
     reach_m = max(float(np.linalg.norm(high - low)), 0.05)
-    eye = rrb.EyeControls3D(position=middle + behind / np.linalg.norm(behind) * reach_m, look_target=middle, eye_up=up)
+    eye = rrb.EyeControls3D(
+        position=middle + eye_direction / np.linalg.norm(eye_direction) * reach_m, look_target=middle, eye_up=up
+    )
     return rrb.Spatial3DView(origin=stream.SPACE, name="Space (m)", eye_controls=eye)
 
 
@@ -165,64 +173,67 @@ def _moments(contents: Contents) -> list[tuple[Any, float]]:
     """Return the views of the moment at the cursor, with their heights."""
     import rerun.blueprint as rrb
 
-    found: list[tuple[Any, float]] = []
+    views: list[tuple[Any, float]] = []
     maps = [_map(name, one, contents) for name, one in _maps(contents)]
     if maps:
         grid = rrb.Grid(*maps, grid_columns=min(len(maps), MAPS_A_ROW)) if len(maps) > 1 else maps[0]
-        found.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
-    if any(len(one.t_ns) > 1 for one in contents.taxels):
-        found.append((_carpet(contents), 1.3))
-    if contents.named is not None:
-        rows = len(contents.named.leading())
+        views.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
+    if any(len(finger.t_ns) > 1 for finger in contents.taxels):
+        views.append((_carpet(contents), 1.3))
+    if contents.classification is not None:
+        rows = len(contents.classification.leading())
         bounds = rrb.VisualBounds2D(x_range=(-stream.NAMES_WIDTH, stream.BARS_WIDTH + 0.5), y_range=(-1.9, rows - 0.4))
-        title = f"Predicted {contents.named.key}, and the largest scores"
-        found.append((rrb.Spatial2DView(origin=stream.NAMED, name=title, visual_bounds=bounds), 1.8))
-    return found
+        title = f"Predicted {contents.classification.key}, and the largest scores"
+        views.append((rrb.Spatial2DView(origin=stream.NAMED, name=title, visual_bounds=bounds), 1.8))
+    return views
 
 
 def _places(contents: Contents) -> tuple[Any, float]:
     """Return the tabs with what lies in space, cameras, and the recording's labels, with their height."""
     import rerun.blueprint as rrb
 
-    rest: list[Any] = [_space(contents)] if contents.paths or contents.clouds else []
-    rest += [rrb.Spatial2DView(origin=_origin(stream.CAMERAS, one.stream), name=one.stream) for one in contents.frames]
-    rest.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
-    return (rrb.Tabs(*rest, active_tab=0) if len(rest) > 1 else rest[0]), 2.4
+    views: list[Any] = [_space(contents)] if contents.paths or contents.clouds else []
+    views += [
+        rrb.Spatial2DView(origin=_origin(stream.CAMERAS, camera.stream), name=camera.stream)
+        for camera in contents.frames
+    ]
+    views.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
+    return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
 
 
-def _map(name: str, one: Taxels, contents: Contents) -> Any:
+def _map(name: str, finger: Taxels, contents: Contents) -> Any:
     import rerun.blueprint as rrb
 
-    x, y = stream.map_bounds(one)
+    x, y = stream.map_bounds(finger)
     bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
     return rrb.Spatial2DView(
-        origin=_origin(stream.MAPS, name), name=_map_title(name, one, contents), visual_bounds=bounds
+        origin=_origin(stream.MAPS, name), name=_map_title(name, finger, contents), visual_bounds=bounds
     )
 
 
 def _maps(contents: Contents) -> list[tuple[str, Taxels]]:
     """Return the maps by name, of measured taxels and of what was predicted of them."""
     names = []
-    for one in contents.taxels:
-        names.append((one.name, one))
-        steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == one.name]
-        names += [(stream.map_name(one.name, what, max(steps)), one) for what in stream.COMPARED if steps]
+    for finger in contents.taxels:
+        names.append((finger.name, finger))
+        steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
+        names += [(stream.map_name(finger.name, compared, max(steps)), finger) for compared in stream.COMPARED if steps]
     return names
 
 
 def _unit(contents: Contents) -> str:
     """Return the unit of the taxels, empty where they have several."""
-    units = {one.unit for one in contents.taxels}
+    units = {finger.unit for finger in contents.taxels}
     return units.pop() if len(units) == 1 else ""
 
 
-def _map_title(name: str, one: Taxels, contents: Contents) -> str:
+def _map_title(name: str, finger: Taxels, contents: Contents) -> str:
     """Return the title of a map, short enough for three of them in a row."""
-    steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == one.name]
-    if not steps or name == one.name:
-        return name if contents.forecasts else f"{name} ({one.unit})".replace(" ()", "")
+    steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
+    if not steps or name == finger.name:
+        return name if contents.forecasts else f"{name} ({finger.unit})".replace(" ()", "")
     ahead = f"t+{max(steps)}" if max(steps) else "predicted"
-    return ahead if name == stream.map_name(one.name, stream.COMPARED[0], max(steps)) else f"error {ahead}"
+    return ahead if name == stream.map_name(finger.name, stream.COMPARED[0], max(steps)) else f"error {ahead}"
 
 
 def _plot(origin: str, name: str) -> Any:

@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Indices, Times
-from tacpipe.signals.envelope import envelope
-from tacpipe.traces import carpet, palette, taxels
+from tacpipe.signals.filters import envelope
+from tacpipe.traces import drawing, taxels
 from tacpipe.traces.curves import Curves
-from tacpipe.traces.forecasts import Forecast
-from tacpipe.traces.named import Named
 from tacpipe.traces.paths import Path
+from tacpipe.traces.predictions import Classification, Forecast
 from tacpipe.traces.spans import PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
-from tacpipe.viewer import about
-from tacpipe.viewer.contents import Contents, Frames, Points
+from tacpipe.viewer.contents import Contents, Frames, Points, to_markdown
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -31,31 +29,31 @@ MAPS, SPANS, SPACE, CAMERAS, CARPET, ABOUT, EVENTS = "taxels", "spans", "space",
 NAMED = "named"
 AXES = "xyz"
 COMPARED = ("predicted", "residual")
-FRAMES_HZ = 60.0  # of maps and paths, at most: what a display shows
+FRAMES_HZ = 60.0  # largest rate of maps and paths: that of a display
 MOST_ROWS = (
-    30_000  # of a plot's lines; of longer ones the envelope: 13 million points a frame are too many for a viewer
+    30_000  # points of a plot's line; a viewer cannot draw millions, so longer lines are drawn as their envelope
 )
-POINTS = 4000  # of a path drawn as a line
-BINS, HEIGHT = 1200, 330  # of the carpet, pixels
-BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # of the chart of scores, in rows of it
+POINTS = 4000  # points of a path drawn as a line
+BINS, HEIGHT = 1200, 330  # bins and height of the carpet, in pixels
+BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in its rows
 BAR = "#5a6572"
-EVENT_WIDTH = 1 / 200  # of the recording, for which an event is drawn
+EVENT_WIDTH = 1 / 200  # drawn length of an event, as a fraction of the recording
 RAMP = 24  # steps of a colour scale
 
 
 class Stream:
-    """What writes one recording's contents to a stream of Rerun's; times count from ``start_ns``."""
+    """Writes one recording's contents to a stream of Rerun's; times count from ``start_ns``."""
 
     def __init__(self, recording: rr.RecordingStream, start_ns: int, *, all_rows: bool = False) -> None:
         self._recording, self._start_ns, self._all_rows = recording, start_ns, all_rows
 
     def send(self, contents: Contents) -> None:
         """Write everything that is drawn of a recording."""
-        for place, one in enumerate(contents.taxels):
-            self._touch(one, place)
-            self._channels(one)
-        for name, some in groups(contents.taxels).items():
-            self._maps(name, some)
+        for place, finger in enumerate(contents.taxels):
+            self._touch(finger, place)
+            self._channels(finger)
+        for name, members in groups(contents.taxels).items():
+            self._maps(name, members)
         self._forecasts(contents.forecasts)
         self._carpet(contents)
         for curves in contents.curves:
@@ -68,72 +66,79 @@ class Stream:
         self._clouds(contents.clouds)
         for frames in contents.frames:
             self._frames(frames)
-        if contents.named is not None:
-            self._named(contents.named)
-        self._static((ABOUT,), _rerun().TextDocument(about.text(contents), media_type="text/markdown"))
+        if contents.classification is not None:
+            self._scores(contents.classification)
+        self._static((ABOUT,), _rerun().TextDocument(to_markdown(contents), media_type="text/markdown"))
 
     def _at(self, t_ns: AnyArray) -> Any:
         since = (np.asarray(t_ns, np.int64) - self._start_ns).astype("timedelta64[ns]")
         return _rerun().TimeColumn(TIMELINE, duration=since)
 
-    def _static(self, parts: Sequence[str], *what: Any) -> None:
-        self._recording.log(list(parts), *what, static=True)
+    def _static(self, parts: Sequence[str], *components: Any) -> None:
+        self._recording.log(list(parts), *components, static=True)
 
     def _columns(self, parts: Sequence[str], t_ns: AnyArray, columns: Any) -> None:
         path = _rerun().new_entity_path(list(parts))
         self._recording.send_columns(path, [self._at(t_ns)], columns)
 
-    def _lines(self, parts: Sequence[str], t_ns: Times, values: Floats, named: Sequence[tuple[str, str]]) -> None:
+    def _lines(
+        self, parts: Sequence[str], t_ns: Times, values: Floats, names_and_colours: Sequence[tuple[str, str]]
+    ) -> None:
         """Write values (time, channel) as the lines of one plot, each with a name and a colour."""
         rr = _rerun()
-        names, colours = [name for name, _ in named], [palette.rgb(colour) for _, colour in named]
+        names, colours = (
+            [name for name, _ in names_and_colours],
+            [drawing.rgb(colour) for _, colour in names_and_colours],
+        )
         if not self._all_rows:
             t_ns, values = envelope(t_ns, values, MOST_ROWS)
-        self._static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(named)))
+        self._static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(names_and_colours)))
         self._columns(parts, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
 
     def _curves(self, parts: Sequence[str], curves: Curves) -> None:
-        few = curves.names in (tuple("xyz"), tuple("xyzw"), tuple("xy"))
-        colours = palette.AXES if few else palette.DISTINCT
-        named = [(name, palette.numbered(place, colours)) for place, name in enumerate(curves.names)]
-        self._lines(parts, curves.t_ns, curves.values, named)
+        are_axes = curves.names in (tuple("xyz"), tuple("xyzw"), tuple("xy"))
+        colours = drawing.AXES if are_axes else drawing.DISTINCT
+        names_and_colours = [(name, drawing.numbered(place, colours)) for place, name in enumerate(curves.names)]
+        self._lines(parts, curves.t_ns, curves.values, names_and_colours)
 
-    def _touch(self, one: Taxels, place: int) -> None:
-        if len(one.t_ns) > 1:
-            self._lines((TOUCH, one.name), one.t_ns, one.load[:, None], [(one.name, palette.numbered(place))])
+    def _touch(self, finger: Taxels, place: int) -> None:
+        if len(finger.t_ns) > 1:
+            self._lines(
+                (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.numbered(place))]
+            )
 
-    def _channels(self, one: Taxels) -> None:
+    def _channels(self, finger: Taxels) -> None:
         """Write the change of each taxel, an axis at a time."""
-        if len(one.t_ns) < 2:
+        if len(finger.t_ns) < 2:
             return
-        named = [(name, palette.numbered(place)) for place, name in enumerate(one.names)]
-        for axis, name in enumerate(AXES if one.change.shape[2] == 3 else ("",)):
-            parts = (CHANNELS, one.name, channels_title(one, name))
-            self._lines(parts, one.t_ns, one.change[:, :, axis], named)
+        names_and_colours = [(name, drawing.numbered(place)) for place, name in enumerate(finger.names)]
+        for axis, name in enumerate(AXES if finger.change.shape[2] == 3 else ("",)):
+            parts = (CHANNELS, finger.name, channels_title(finger, name))
+            self._lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
 
-    def _maps(self, group: str, some: Sequence[Taxels]) -> None:
+    def _maps(self, group: str, fingers: Sequence[Taxels]) -> None:
         """Write the maps of fingers that share a scale of colours and of arrows."""
-        low, high = taxels.scale(np.concatenate([one.magnitude.ravel() for one in some]))
-        shear = np.concatenate([np.linalg.norm(one.change[:, :, :2], axis=2).ravel() for one in some])
+        low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
+        shear = np.concatenate([np.linalg.norm(finger.change[:, :, :2], axis=2).ravel() for finger in fingers])
         longest = max(float(np.nanquantile(shear, taxels.LARGEST)), taxels.LEAST) if group == "3" else 1.0
-        for one in some:
-            self._map((MAPS, one.name), one, low, high, longest)
+        for finger in fingers:
+            self._map((MAPS, finger.name), finger, low, high, longest)
 
-    def _map(self, parts: tuple[str, ...], one: Taxels, low: float, high: float, longest: float) -> None:
+    def _map(self, parts: tuple[str, ...], finger: Taxels, low: float, high: float, longest: float) -> None:
         """Write a map of taxels: a disc each, its colour the change from rest, an arrow its shear along x and y."""
         rr = _rerun()
-        pitch = spacing(one.places)
-        place = one.places * (1, -1)  # pixels go down
-        self._static((*parts, "discs"), rr.Points2D(place, radii=0.42 * pitch, labels=one.names, show_labels=False))
-        self._scale((*parts, "scale"), place, pitch, low, high, one.unit)
-        rows = _thinned(one.t_ns)
-        t_ns, change, magnitude = one.t_ns[rows], one.change[rows], one.magnitude[rows]
+        pitch = spacing(finger.places)
+        place = finger.places * (1, -1)  # pixels go down
+        self._static((*parts, "discs"), rr.Points2D(place, radii=0.42 * pitch, labels=finger.names, show_labels=False))
+        self._scale((*parts, "scale"), place, pitch, low, high, finger.unit)
+        rows = _thinned(finger.t_ns)
+        t_ns, change, magnitude = finger.t_ns[rows], finger.change[rows], finger.magnitude[rows]
         if len(rows) > 1 and t_ns[0] > self._start_ns:  # nothing is known before the first row
             t_ns = np.concatenate([[self._start_ns], t_ns])
             change, magnitude = (np.concatenate([np.zeros_like(values[:1]), values]) for values in (change, magnitude))
-        colours = _packed(palette.coloured(magnitude, low, high))  # (time, taxel)
+        colours = _packed(drawing.coloured(magnitude, low, high))  # (time, taxel)
         count = [colours.shape[1]] * len(colours)
-        vectors = one.change.shape[2] == 3
+        vectors = finger.change.shape[2] == 3
         arrows = change[:, :, :2] * (1, -1) * (0.9 * pitch / longest) if vectors else None
         style = {"origins": place, "colors": [(255, 255, 255)], "radii": 0.05 * pitch, "draw_order": 50.0}
         if len(colours) == 1:  # the only reading holds for the whole recording
@@ -155,7 +160,7 @@ class Stream:
         boxes = rr.Boxes2D(
             centers=np.column_stack([x, np.full(RAMP, bottom)]),
             half_sizes=[(max(right - left, pitch) / RAMP / 1.8, 0.12 * pitch)] * RAMP,
-            colors=palette.coloured(np.linspace(low, high, RAMP), low, high),
+            colors=drawing.coloured(np.linspace(low, high, RAMP), low, high),
             radii=0.1 * pitch,
         )
         ends = [f"{low:,.4g}", f"{high:,.4g} {unit}".strip()]
@@ -163,46 +168,48 @@ class Stream:
         self._static((*parts, "ramp"), boxes)
         self._static((*parts, "ends"), text)
 
-    def _forecasts(self, found: Sequence[Forecast]) -> None:
+    def _forecasts(self, forecasts: Sequence[Forecast]) -> None:
         """Write measured and predicted load of each finger, the errors, and the maps of the farthest step."""
-        for name in dict.fromkeys(one.measured.name for one in found):
-            steps = [one for one in found if one.measured.name == name]
+        for name in dict.fromkeys(member.measured.name for member in forecasts):
+            steps = [member for member in forecasts if member.measured.name == name]
             last = steps[-1]
             if last.step:
                 self._errors(name, steps)
-            both = np.concatenate([last.predicted.magnitude.ravel(), last.measured.magnitude.ravel()])
-            low, high = taxels.scale(both)
+            magnitudes = np.concatenate([last.predicted.magnitude.ravel(), last.measured.magnitude.ravel()])
+            low, high = taxels.scale(magnitudes)
             shear = np.linalg.norm(last.measured.change[:, :, :2], axis=2)
             longest = max(float(np.nanquantile(shear, taxels.LARGEST)), taxels.LEAST)
-            predicted, residual = (map_name(name, what, last.step) for what in COMPARED)
+            predicted, residual = (map_name(name, compared, last.step) for compared in COMPARED)
             self._map((MAPS, predicted), last.predicted, low, high, longest)
             low, high = taxels.scale(last.residual.magnitude)  # one of its own, or small errors are not seen
             self._map((MAPS, residual), last.residual, low, high, max(high, taxels.LEAST))
 
     def _errors(self, name: str, steps: Sequence[Forecast]) -> None:
         """Write the load of a finger as measured and as predicted at each step, and the errors."""
-        came, last = [("measured", palette.MEASURED)], steps[-1].measured
-        self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], came)
-        for place, one in enumerate(steps):
-            named = [(f"t+{one.step}", palette.numbered(place))]
-            parts = (name, named[0][0])
-            self._lines((FORECAST, *parts), one.predicted.t_ns, one.predicted.load[:, None], named)
-            self._lines((ERROR, *parts), one.predicted.t_ns, one.error[:, None], named)
+        measured_line, last = [("measured", drawing.MEASURED)], steps[-1].measured
+        self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
+        for place, forecast in enumerate(steps):
+            names_and_colours = [(f"t+{forecast.step}", drawing.numbered(place))]
+            parts = (name, names_and_colours[0][0])
+            self._lines(
+                (FORECAST, *parts), forecast.predicted.t_ns, forecast.predicted.load[:, None], names_and_colours
+            )
+            self._lines((ERROR, *parts), forecast.predicted.t_ns, forecast.error[:, None], names_and_colours)
 
     def _carpet(self, contents: Contents) -> None:
         """Write all taxels over the whole recording as one image, and a line in it at the cursor."""
         rr = _rerun()
-        shown = [one for one in contents.taxels if len(one.t_ns) > 1]
-        if not shown:
+        fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+        if not fingers:
             return
         start_ns, stop_ns = contents.ends_ns
         parts, labels, top = [], [], 0
-        rows = carpet_size(contents)[1] // (sum(len(one.names) for one in shown) + len(shown) - 1)
-        for one in shown:
-            low, high = taxels.scale(one.magnitude)
-            values = carpet.binned(one.t_ns, one.magnitude, start_ns, stop_ns, BINS)
-            parts.append(carpet.image(palette.coloured(values, low, high), rows))
-            labels.append((one.name, top + parts[-1].shape[0] / 2))
+        rows = carpet_size(contents)[1] // (sum(len(finger.names) for finger in fingers) + len(fingers) - 1)
+        for finger in fingers:
+            low, high = taxels.scale(finger.magnitude)
+            values = taxels.binned(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS)
+            parts.append(taxels.image(drawing.coloured(values, low, high), rows))
+            labels.append((finger.name, top + parts[-1].shape[0] / 2))
             top += parts[-1].shape[0] + rows
             parts.append(np.zeros((rows, BINS, 3), np.uint8))
         picture = np.concatenate(parts[:-1])
@@ -220,34 +227,35 @@ class Stream:
         start_ns, stop_ns = contents.ends_ns
         width_ns = int((stop_ns - start_ns) * EVENT_WIDTH)
         happened = [
-            Span(f"events {one.stream}".strip(), one.cause, one.t_ns, one.t_ns + width_ns) for one in contents.events
+            Span(f"events {event.stream}".strip(), event.cause, event.t_ns, event.t_ns + width_ns)
+            for event in contents.events
         ]
         lanes: dict[str, list[Span]] = {}
         for span in (*contents.spans, *merged(contents.gaps), *happened):
             lanes.setdefault(span.lane, []).append(span)
         for place, (lane, spans) in enumerate(lanes.items()):
             fault = lane == "gaps" or lane.startswith("events")
-            self._lane(lane, spans, palette.FAULT if fault else palette.numbered(place))
+            self._lane(lane, spans, drawing.FAULT if fault else drawing.numbered(place))
         if contents.events:
             rr = _rerun()
-            at_ns = np.array([one.t_ns for one in contents.events])
-            texts = [f"{one.stream}: {one.text}" for one in contents.events]
+            at_ns = np.array([event.t_ns for event in contents.events])
+            texts = [f"{event.stream}: {event.text}" for event in contents.events]
             self._columns((EVENTS,), at_ns, rr.TextLog.columns(text=texts, level=["WARN"] * len(texts)))
 
     def _lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
         rr = _rerun()
         t_ns, states = changes(spans)
         labels = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
-        colours = [palette.rgb(colour)] * len(labels) if len(labels) < 2 else _shades(colour, len(labels))
+        colours = [drawing.rgb(colour)] * len(labels) if len(labels) < 2 else _shades(colour, len(labels))
         values = [*labels, PADDING] if PADDING in states else labels
-        colours += [palette.rgb(palette.MEASURED)] * (len(values) - len(labels))
+        colours += [drawing.rgb(drawing.MEASURED)] * (len(values) - len(labels))
         self._static((SPANS, lane), rr.StateConfiguration(values=values, labels=values, colors=colours))
         self._columns((SPANS, lane), t_ns, rr.StateChange.columns(state=states))
 
     def _path(self, path: Path) -> None:
         rr = _rerun()
         parts = (SPACE, path.name)
-        colour = palette.rgb(palette.named(path.name))
+        colour = drawing.rgb(drawing.colour_for(path.name))
         if len(path.t_ns) == 1:
             style = {"radii": rr.Radius.ui_points(7), "colors": [colour], "labels": [path.name]}
             self._static(parts, rr.Points3D(path.position_m, **style))
@@ -266,13 +274,13 @@ class Stream:
 
     def _clouds(self, clouds: Sequence[Points]) -> None:
         rr = _rerun()
-        for one in clouds:
-            drawn = rr.Points3D(one.points_m, colors=one.colours, radii=rr.Radius.ui_points(2))
-            if one.t_ns is None:
-                self._static((SPACE, one.stream), drawn)
+        for points in clouds:
+            drawn = rr.Points3D(points.points_m, colors=points.colours, radii=rr.Radius.ui_points(2))
+            if points.t_ns is None:
+                self._static((SPACE, points.stream), drawn)
             else:
-                self._recording.set_time(TIMELINE, duration=np.timedelta64(one.t_ns - self._start_ns, "ns"))
-                self._recording.log([SPACE, one.stream], drawn)
+                self._recording.set_time(TIMELINE, duration=np.timedelta64(points.t_ns - self._start_ns, "ns"))
+                self._recording.log([SPACE, points.stream], drawn)
 
     def _frames(self, frames: Frames) -> None:
         rr = _rerun()
@@ -280,22 +288,22 @@ class Stream:
         self._static(parts, rr.EncodedImage.from_fields(media_type=frames.media_type))
         self._columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
 
-    def _named(self, named: Named) -> None:
+    def _scores(self, prediction: Classification) -> None:
         """Write a bar a name, as long as its score: that of the model's name is bright, that of the label has a mark."""
         rr = _rerun()
-        chosen = named.leading()
+        chosen = prediction.leading()
         scores = np.array(list(chosen.values()))
         row = np.arange(len(chosen), dtype=np.float64)
         ends = np.column_stack([bars(scores), row])
-        colours = [palette.rgb(palette.DISTINCT[0] if name == named.of_model else BAR) for name in chosen]
+        colours = [drawing.rgb(drawing.DISTINCT[0] if name == prediction.of_model else BAR) for name in chosen]
         strips = [[(0.0, place), tuple(end)] for place, end in zip(row, ends, strict=True)]
         self._static((NAMED, "bars"), rr.LineStrips2D(strips, radii=0.3, colors=colours))
-        marked = (f"{name} (label)" if name == named.label else name for name in chosen)
+        marked = (f"{name} (label)" if name == prediction.label else name for name in chosen)
         texts = [f"{name}   {score:.3g}" for name, score in zip(marked, scores, strict=True)]
         above = NAMES_RISE  # a text is drawn below its place
         self._static((NAMED, "names"), _labels([(-NAMES_WIDTH / 2, at - above) for at in row], texts))
         middle = (BARS_WIDTH - NAMES_WIDTH) / 2
-        self._static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [named.sentence]))
+        self._static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [prediction.sentence]))
 
 
 def bars(scores: Floats) -> Floats:
@@ -304,49 +312,49 @@ def bars(scores: Floats) -> Floats:
     >>> bars(np.array([0.0, 1.0, 4.0])).tolist(), bars(np.array([-2.0, 0.0])).tolist()
     ([0.0, 2.0, 8.0], [0.0, 8.0])
     """
-    least = min(float(scores.min()), 0.0)
-    reach = float(scores.max()) - least
-    return np.asarray(BARS_WIDTH * (scores - least) / (reach if reach > 0 else 1.0))
+    lowest = min(float(scores.min()), 0.0)
+    reach = float(scores.max()) - lowest
+    return np.asarray(BARS_WIDTH * (scores - lowest) / (reach if reach > 0 else 1.0))
 
 
-def map_bounds(one: Taxels) -> tuple[tuple[float, float], tuple[float, float]]:
+def map_bounds(finger: Taxels) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return what a map's view shows of x and of y, with room for the colour scale."""
-    pitch = spacing(one.places)
-    (left, low), (right, high) = one.places.min(axis=0), one.places.max(axis=0)
+    pitch = spacing(finger.places)
+    (left, low), (right, high) = finger.places.min(axis=0), finger.places.max(axis=0)
     return (left - 0.8 * pitch, right + 0.8 * pitch), (-high - 0.8 * pitch, -low + 2.8 * pitch)
 
 
-def map_name(name: str, what: str, step: int) -> str:
+def map_name(name: str, compared: str, step: int) -> str:
     """Return how the map of a finger's forecast or residual is named; step 0 is a value of the whole recording.
 
     >>> map_name("xela1", "predicted", 10), map_name("reading th", "residual", 0)
     ('xela1 predicted t+10', 'reading th residual')
     """
-    return f"{name} {what} t+{step}" if step else f"{name} {what}"
+    return f"{name} {compared} t+{step}" if step else f"{name} {compared}"
 
 
 def carpet_size(contents: Contents) -> tuple[int, int]:
     """Return width and height of the carpet in pixels: wide, whatever the number of taxels."""
-    shown = [one for one in contents.taxels if len(one.t_ns) > 1]
-    rows = sum(len(one.names) for one in shown) + max(len(shown) - 1, 0)  # one row between two fingers
+    fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+    rows = sum(len(finger.names) for finger in fingers) + max(len(fingers) - 1, 0)  # one row between two fingers
     return BINS, max(HEIGHT // max(rows, 1), 1) * rows
 
 
-def groups(found: Sequence[Taxels]) -> dict[str, list[Taxels]]:
+def groups(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
     """Return fingers that share a scale: those of one unit and as many axes, under the number of axes (and the unit)."""
     shared: dict[tuple[int, str], list[Taxels]] = {}
-    for one in found:
-        shared.setdefault((one.change.shape[2], one.unit), []).append(one)
+    for member in fingers:
+        shared.setdefault((member.change.shape[2], member.unit), []).append(member)
     names: dict[str, list[Taxels]] = {}
-    for (axes, _), some in shared.items():
-        names[str(axes) if str(axes) not in names else f"{axes} {some[0].unit}"] = some
+    for (axes, _), members in shared.items():
+        names[str(axes) if str(axes) not in names else f"{axes} {members[0].unit}"] = members
     return names
 
 
-def channels_title(one: Taxels, axis: str) -> str:
+def channels_title(finger: Taxels, axis: str) -> str:
     """Return what a plot of the taxels' change along one axis is named."""
-    unit = f" ({one.unit})" if one.unit else ""
-    return f"{one.name} {axis}{' ' if axis else ''}change of each taxel{unit}"
+    unit = f" ({finger.unit})" if finger.unit else ""
+    return f"{finger.name} {axis}{' ' if axis else ''}change of each taxel{unit}"
 
 
 def changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
@@ -359,7 +367,7 @@ def changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
     ([0, 5, 7], ['x', 'y', ''])
     """
     at: dict[int, str] = {}
-    for span in sorted(spans, key=lambda one: one.start_ns):
+    for span in sorted(spans, key=lambda member: member.start_ns):
         at[span.start_ns] = span.text
         for later in [t_ns for t_ns in at if span.start_ns < t_ns < span.stop_ns]:
             del at[later]
@@ -372,9 +380,9 @@ def spacing(places: Floats) -> float:
     """Return the median distance of the places (taxel, 2) to their nearest neighbour; 1 of a single one."""
     if len(places) < 2:
         return 1.0
-    apart = np.linalg.norm(places[:, None] - places, axis=2)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(axis=1))) or 1.0
+    distances = np.linalg.norm(places[:, None] - places, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    return float(np.median(distances.min(axis=1))) or 1.0
 
 
 def _thinned(t_ns: Times) -> Indices:
@@ -385,8 +393,8 @@ def _thinned(t_ns: Times) -> Indices:
     return _spread(len(t_ns), max(int(seconds * FRAMES_HZ), 2))
 
 
-def _spread(rows: int, most: int) -> Indices:
-    return np.arange(rows) if rows <= most else np.unique(np.linspace(0, rows - 1, most).round().astype(np.intp))
+def _spread(rows: int, limit: int) -> Indices:
+    return np.arange(rows) if rows <= limit else np.unique(np.linspace(0, rows - 1, limit).round().astype(np.intp))
 
 
 def _packed(colours: AnyArray) -> AnyArray:
@@ -397,14 +405,14 @@ def _packed(colours: AnyArray) -> AnyArray:
 
 def _shades(colour: str, count: int) -> list[tuple[int, int, int]]:
     """Return a colour for each of ``count`` values of one lane, by turns lighter and darker."""
-    bright = palette.rgb(colour)
+    bright = drawing.rgb(colour)
     dark = (int(bright[0] * 0.7), int(bright[1] * 0.7), int(bright[2] * 0.7))
     return [dark if place % 2 else bright for place in range(count)]
 
 
 def _labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:
     """Return texts at places of a two-dimensional view."""
-    return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[palette.rgb(palette.MEASURED)])
+    return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[drawing.rgb(drawing.MEASURED)])
 
 
 def _rerun() -> Any:

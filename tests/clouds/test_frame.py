@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tacpipe.clouds import frame
+from tacpipe.clouds import grasp as frame
 from tacpipe.clouds.grasp import Grasp
 from tests.clouds.test_grasp import grasp
 

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.frame import axes
-from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.grasp import Grasp, axes
 from tests.clouds.shapes import PLACE_M, box
 
 SIDES_M = (0.06, 0.16, 0.04)

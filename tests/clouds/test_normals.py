@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.normals import normals
+from tacpipe.clouds.cloud import Cloud, normals
 from tests.clouds import shapes
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tacpipe.signals.scrambling import scramble
+from tacpipe.signals.array_order import scramble
 
 ARM = {
     "cp": "posx,posy,posz,ox,oy,oz, ow",

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.link import LinkLostError
 from tests.links.peers import Quiet, made

@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 
 from tacpipe.errors import DeviceError
-from tacpipe.links import dialogue as dialogue_of
-from tacpipe.links.dialogue import run_dialogue
+from tacpipe.links import opening as dialogue_of
 from tacpipe.links.link import Arrived, Link
+from tacpipe.links.opening import run_dialogue
 from tacpipe.recording import rig
 from tacpipe.sensors.sensor import Ask, Dialogue
 from tests.links import peers

@@ -21,10 +21,10 @@ from tacpipe.channels import lsl as descriptions
 from tacpipe.errors import DeviceError, TacpipeError, UsageError
 from tacpipe.links.link import Link, LinkLostError, parse
 from tacpipe.links.opening import open_link
-from tacpipe.links.recognition import recognise
+from tacpipe.links.probing import recognise
 from tacpipe.recording import recorder, rig
 from tacpipe.recording.reading import Reading
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import Station
 from tacpipe.sensors import lsl
 from tacpipe.sensors.framing import Chunks

@@ -19,7 +19,7 @@ import pytest
 
 from tacpipe.links import probing
 from tacpipe.links.link import parse
-from tacpipe.links.recognition import candidates
+from tacpipe.links.probing import candidates
 from tacpipe.recording import rig
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.links.recognition import CERTAIN, recognise
+from tacpipe.links.probing import CERTAIN, recognise
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.sensors.framing import Chunks

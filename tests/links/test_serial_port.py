@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import DeviceError
-from tacpipe.links import ports, serial_port
+from tacpipe.links import ports
 from tacpipe.sensors.sensor import Line, Sensor
 from tests.links.peers import Quiet, made
 
@@ -76,7 +76,7 @@ def test_what_comes_while_a_device_boots_is_thrown_away(
         slept.append(seconds)
         os.write(terminal[0], b"Hello from the bootloader\r\n")
 
-    monkeypatch.setattr("tacpipe.links.serial_port.time.sleep", boot)
+    monkeypatch.setattr("tacpipe.links.ports.time.sleep", boot)
     link = made(f"serial:{terminal[1]}", Booting())
     os.write(terminal[0], b"frame")
 
@@ -102,7 +102,7 @@ def test_a_port_that_another_program_holds_is_busy_and_the_program_is_named(term
 def test_a_port_that_another_program_reads_without_locking_it_is_busy_too(
     terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serial_port, "PSEUDO", "/nowhere")  # as if it were a cable
+    monkeypatch.setattr(ports, "PSEUDO", "/nowhere")  # as if it were a cable
     with subprocess.Popen([sys.executable, "-c", HOLDER.replace("exclusive=True", ""), terminal[1]],
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:  # fmt: skip
         assert holder.stdout is not None and holder.stdin is not None

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import udp
-from tacpipe.links.arrival import OLDEST_NS, Arrivals
-from tacpipe.links.link import LinkLostError
+from tacpipe.links.link import OLDEST_NS, Arrivals, LinkLostError
 from tests.links import peers
 from tests.links.peers import Listened, Quiet, made
 
@@ -126,7 +125,7 @@ def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch
     arrivals = Arrivals()
     clocks = {"monotonic_ns": 1_000_000_000_000, "time_ns": 5_000_000_000_000}
     for name in clocks:
-        monkeypatch.setattr(f"tacpipe.links.arrival.time.{name}", lambda name=name: clocks[name])
+        monkeypatch.setattr(f"tacpipe.links.link.time.{name}", lambda name=name: clocks[name])
 
     arrivals.look()
     assert arrivals.to_monotonic(clocks["time_ns"] - 3_000) == 999_999_997_000
@@ -145,7 +144,7 @@ class Clocks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, passing: Iterator[int]) -> None:
         self.now_ns, self.passing = 1_000_000_000, passing
-        monkeypatch.setattr("tacpipe.links.arrival.time", self)
+        monkeypatch.setattr("tacpipe.links.link.time", self)
 
     def monotonic_ns(self) -> int:
         """Return the time since the computer started."""

@@ -7,7 +7,7 @@ import pytest
 
 from tacpipe.live.decoding import Decoder
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tests.sensors import made

@@ -10,7 +10,7 @@ import pytest
 
 from tacpipe.live import wire
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN, LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor

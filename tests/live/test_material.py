@@ -17,7 +17,7 @@ from tacpipe.live.settings import Settings
 from tacpipe.metrics import calibration
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live

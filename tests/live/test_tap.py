@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.live import wire
 from tacpipe.live.wire import Tap
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.sensors.framing import Chunks
 
 Pair = tuple[socket.socket, socket.socket]

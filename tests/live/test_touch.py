@@ -18,7 +18,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import wire
 from tacpipe.live.messages import packets
 from tacpipe.recording import rig as rigs_of
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request

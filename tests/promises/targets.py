@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 
 from tacpipe.clouds import files as cloud_files
 from tacpipe.clouds import pcd, ply
-from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.codecs import codec
 from tacpipe.codecs.measures import Moments
 from tacpipe.codecs.pca import fit
@@ -37,7 +37,7 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import hid
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
-from tacpipe.recording import rig, spool, spool_blocks, spool_folders, spooled
+from tacpipe.recording import rig, spool, spool_folders, spooled
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
@@ -170,7 +170,7 @@ def _spools() -> list[bytes]:
     written_spool = spool.Spool(_folder(), HEADER, ["a", "b"])
     for number in range(5):
         written_spool.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
-        written_spool.note(spool_blocks.Note(number, "a", "lost", "unplugged"))
+        written_spool.note(spool.Note(number, "a", "lost", "unplugged"))
     written_spool.write()
     content = (written_spool.folder / "bytes").read_bytes()
     written_spool.close()

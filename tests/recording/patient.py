@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import pytest
 
-from tacpipe.links import dialogue
+from tacpipe.links import opening
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors.sensor import Ask
@@ -36,8 +36,8 @@ def relax(patch: pytest.MonkeyPatch) -> None:
         for limit in limits:
             patch.setattr(module, limit, getattr(module, limit) * TIMES)
     patch.setattr("tacpipe.recording.trials.clock", Samples(patch))
-    reply = dialogue._reply
-    patch.setattr(dialogue, "_reply", lambda link, ask, *more: reply(link, longer(ask), *more))
+    reply = opening._reply
+    patch.setattr(opening, "_reply", lambda link, ask, *more: reply(link, longer(ask), *more))
 
 
 class Samples:

@@ -8,7 +8,7 @@ import pytest
 
 from tacpipe.recording import clock, recorder
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import Tally
 from tacpipe.sensors.framing import Chunks
 

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from tacpipe.recording import appending
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.spooled import Spooled
 from tests.conftest import Lab
 from tests.recording import force_rig, live

@@ -16,8 +16,7 @@ from tacpipe.links.link import LinkLostError
 from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce

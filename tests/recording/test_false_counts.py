@@ -9,8 +9,7 @@ import pytest
 
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing, station
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import Station
 from tests.conftest import Lab

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
 from tacpipe.recording import spool_folders, spooled
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 

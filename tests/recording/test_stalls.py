@@ -18,8 +18,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import READ_S, Station
 from tests.conftest import Lab

@@ -12,8 +12,7 @@ import pytest
 from tacpipe.channels import schema
 from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.frame import estimated_wrist
-from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.grasp import Grasp, estimated_wrist
 from tacpipe.plugins.registry import load
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors.clouds import Clouds

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.clouds import files, ply
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.clouds.cloud import Cloud, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors.clouds import Clouds

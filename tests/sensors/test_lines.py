@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from tacpipe.cli import sensors
 from tacpipe.errors import UsageError
-from tacpipe.links.probing import Report
-from tacpipe.links.recognition import recognise
+from tacpipe.links.probing import Report, recognise
 from tacpipe.recording import rig
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors import lines_guess

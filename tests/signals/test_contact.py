@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.contact import axis_mean_level, contact_intervals, load, noise_thresholds, rest_level
-from tacpipe.signals.holds import held
+from tacpipe.signals.repairs import held
 
 MS = 1_000_000
 loads = hnp.arrays(np.float64, st.integers(1, 80), elements=st.floats(0, 10))

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.signals.envelope import envelope
+from tacpipe.signals.filters import envelope
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4000), st.integers(2, 300))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tacpipe.signals.holds import fresh_rate_hz, held, mean_rate_hz
+from tacpipe.signals.repairs import fresh_rate_hz, held, mean_rate_hz
 
 
 def test_a_frame_is_held_only_if_every_channel_repeats() -> None:

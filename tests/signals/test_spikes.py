@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tacpipe.signals.spikes import hampel
+from tacpipe.signals.repairs import hampel
 
 
 def spike(values: list[int], row: int, deviations: float, floor: float) -> bool:

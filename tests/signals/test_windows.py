@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.windows import window_starts
+from tacpipe.signals.runs import window_starts
 
 
 def test_windows_do_not_cross_recordings_or_unusable_rows() -> None:

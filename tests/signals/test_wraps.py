@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tacpipe.signals.unwrap import unwrapped
+from tacpipe.signals.repairs import unwrapped
 
 steps = hnp.arrays(np.int32, st.integers(1, 60), elements=st.integers(-32_767, 32_767))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tacpipe.signals.holds import held
+from tacpipe.signals.repairs import held
 from tacpipe.simulation.faults import Clock, arrivals, device_stamps, hold, samples
 
 

@@ -12,7 +12,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
 from tacpipe.signals.contact import rest_level
-from tacpipe.signals.holds import held
+from tacpipe.signals.repairs import held
 from tacpipe.simulation import taxels
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
 from tacpipe.simulation.pick_and_move import MASSES_KG, Rig, Scene, perform, simulate_trial, touch

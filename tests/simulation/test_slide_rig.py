@@ -16,8 +16,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.registry import load
-from tacpipe.signals.axes import is_time, lag_one
-from tacpipe.signals.scrambling import scramble, unscramble
+from tacpipe.signals.array_order import is_time, lag_one, scramble, unscramble
 from tacpipe.simulation import fingertip, forearm
 from tacpipe.simulation.slide import SENSORS, Rig, material, nuisance, place, simulate_trial
 from tests.fake_recordings import column

@@ -53,7 +53,7 @@ def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int],
             grid.push(name, t_ns[here], np.column_stack(columns).astype(np.float64))
         parts.append(grid.rows(until_ns))
         before = until_ns
-    begun = [part.begun for part in parts]
+    begun = [part.has_samples for part in parts]
     t_ns = np.concatenate([part.t_ns[some] for part, some in zip(parts, begun, strict=True)])
     assert t_ns.tolist() == wanted["t_ns"].to_pylist() and len(t_ns) > 20
     for name, columns in (("xela1", ["taxel01_x", "taxel01_y", "taxel01_z"]), ("near", ["near_m"])):
@@ -81,4 +81,4 @@ def test_before_a_stream_has_begun_rows_say_so_and_name_who_is_waited_for() -> N
     grid.push("a", T0 + np.arange(0, 100, 10) * MS, np.zeros((10, 1)))
     assert grid.waiting == ("b",)
     rows = grid.rows(T0 + 90 * MS)
-    assert rows.t_ns.tolist() == [T0 + ms * MS for ms in (0, 20, 40, 60, 80)] and not rows.begun.any()
+    assert rows.t_ns.tolist() == [T0 + ms * MS for ms in (0, 20, 40, 60, 80)] and not rows.has_samples.any()

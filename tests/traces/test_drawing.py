@@ -8,24 +8,24 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.traces import carpet, curves, palette, sparkline, taxels
+from tacpipe.traces import curves, drawing, taxels
 from tests.viewer import hand
 
 
 def test_colours_rise_in_brightness_with_the_value_and_are_cut_at_the_ends() -> None:
-    found = palette.coloured(np.linspace(-1, 12, 200), 0.0, 10.0).astype(int)
+    found = drawing.coloured(np.linspace(-1, 12, 200), 0.0, 10.0).astype(int)
     brightness = found @ [0.299, 0.587, 0.114]
 
     assert (np.diff(brightness) > -1).all() and brightness[-1] > 4 * brightness[0]  # numbers are rounded
-    np.testing.assert_array_equal(found[0], palette.coloured(np.array(0.0), 0.0, 10.0))
-    np.testing.assert_array_equal(found[-1], palette.coloured(np.array(10.0), 0.0, 10.0))
+    np.testing.assert_array_equal(found[0], drawing.coloured(np.array(0.0), 0.0, 10.0))
+    np.testing.assert_array_equal(found[-1], drawing.coloured(np.array(10.0), 0.0, 10.0))
 
 
 def test_both_signs_differ_and_their_middle_is_the_ground() -> None:
-    low, middle, high = palette.coloured(np.array([-5.0, 0.0, 5.0]), -5.0, 5.0).astype(int)
+    low, middle, high = drawing.coloured(np.array([-5.0, 0.0, 5.0]), -5.0, 5.0).astype(int)
 
     assert low[2] > low[0] and high[0] > high[2]  # blue below, orange above
-    np.testing.assert_array_equal(middle, palette.coloured(np.array(0.0), 0.0, 5.0))
+    np.testing.assert_array_equal(middle, drawing.coloured(np.array(0.0), 0.0, 5.0))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 500), st.integers(1, 60))
@@ -34,7 +34,7 @@ def test_each_bin_of_the_carpet_has_the_value_farthest_from_rest(seed: int, rows
     t_ns = np.sort(rng.integers(0, 1000, rows))
     values = rng.normal(size=(rows, 2))
 
-    found = carpet.binned(t_ns, values, 0, 1000, bins)
+    found = taxels.binned(t_ns, values, 0, 1000, bins)
 
     latest = np.full(2, np.nan)
     there = np.unique(t_ns * bins // 1000)
@@ -51,16 +51,16 @@ def test_each_bin_of_the_carpet_has_the_value_farthest_from_rest(seed: int, rows
 def test_the_picture_of_a_notebook_is_svg_of_bounded_size_whatever_the_length() -> None:
     skin = taxels.of_table("xela1", hand.finger(hand.pressed()))
     arm = curves.of_table("<arm>", hand.arm())
-    found = sparkline.svg(sparkline.rows(arm * 10, skin))
+    found = drawing.svg(drawing.rows(arm * 10, skin))
 
     root = ET.fromstring(found)
     lines = [one for one in root.iter() if one.tag.endswith("polyline")]
-    assert len(found) < 120_000 and len(lines) <= sparkline.ROWS * sparkline.LINES
-    assert all(len(one.attrib["points"].split()) <= sparkline.POINTS for one in lines)
+    assert len(found) < 120_000 and len(lines) <= drawing.ROWS * drawing.LINES
+    assert all(len(one.attrib["points"].split()) <= drawing.POINTS for one in lines)
     texts = [one.text or "" for one in root.iter() if one.tag.endswith("text")]
     assert "xela1 touch (count)" in texts and any("<arm>" in one for one in texts)
     assert any("13 more" in one and "3.999 s" in one for one in texts)
 
 
 def test_there_is_no_picture_of_nothing() -> None:
-    assert sparkline.svg([]) == ""
+    assert drawing.svg([]) == ""

@@ -6,7 +6,8 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels import biotac_sp, schema
-from tacpipe.traces import forecasts, taxels
+from tacpipe.traces import predictions as forecasts
+from tacpipe.traces import taxels
 from tests.viewer import hand
 
 

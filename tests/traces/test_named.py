@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from tacpipe.traces.named import of_row
+from tacpipe.traces.predictions import of_row
 
 
 def row(**columns: tuple[Any, str]) -> pa.Table:

@@ -64,7 +64,7 @@ def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: p
     assert brief.spans == every_row.spans and brief.gaps == every_row.gaps and brief.ends_ns == every_row.ends_ns
     for thin, full in zip(brief.taxels, every_row.taxels, strict=True):
         assert len(thin.t_ns) < len(full.t_ns) / 2
-        assert thin.load.max() == full.load.max() and thin.rest.tolist() == full.rest.tolist()
+        assert thin.load.max() == full.load.max() and thin.rest_levels.tolist() == full.rest_levels.tolist()
     assert np.ptp(brief.curves[0].values) == np.ptp(every_row.curves[0].values)
 
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe.traces import palette, taxels
+from tacpipe.traces import drawing, taxels
 from tacpipe.viewer import contents, layout, session
 from tests.conftest import Lab
 from tests.traces.test_forecasts import predictions
@@ -96,7 +96,7 @@ def test_maps_have_a_disc_a_taxel_in_the_colour_of_its_change_and_an_arrow_of_it
     low, high = taxels.scale(np.concatenate([each.magnitude.ravel() for each in drawn.taxels]))
     last = np.array(colours[-1], np.uint32)
     rgb = np.stack([last >> 24, (last >> 16) & 255, (last >> 8) & 255], axis=-1)
-    np.testing.assert_array_equal(rgb, palette.coloured(one.magnitude[-1], low, high))
+    np.testing.assert_array_equal(rgb, drawing.coloured(one.magnitude[-1], low, high))
     _, vectors = timed(found["/taxels/xela1/shear"], "Arrows2D:vectors")
     assert np.array(vectors[0]).any() == np.False_
     right, up = np.array(vectors[-1]).T
@@ -208,10 +208,10 @@ def test_view_saves_the_recordings_that_are_chosen_as_one_file(lab: Lab, own_hom
 
 
 def test_the_page_of_the_web_viewer_forbids_connections_to_other_computers(tmp_path: Path) -> None:
-    from tacpipe.viewer import web
+    from tacpipe.viewer import session
 
     files = session.write([contents.of(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
-    with web.served(files, None) as address, urllib.request.urlopen(address, timeout=60) as answer:
+    with session.served(files, None) as address, urllib.request.urlopen(address, timeout=60) as answer:
         policy = answer.headers["Content-Security-Policy"]
         assert b"Rerun" in answer.read()
     sources = {word for part in policy.split(";") for word in part.split()[1:] if "://" in word}

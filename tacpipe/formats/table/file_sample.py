@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.channels import vocabulary
+from tacpipe.channels import schema
 from tacpipe.formats.table import binary, column_names, label_table, stamps, text
 from tacpipe.formats.table.binary import ArrayMember
 from tacpipe.formats.table.columns import TYPES
@@ -174,7 +174,7 @@ class FileSample:
         """Return the unit that the header or the row below it states for a column, '' where neither does."""
         match = column_names.UNIT_IN_NAME.fullmatch(column.strip())
         text = self.units.get(column, "") or (match["unit"] if match and match["base"] else "")
-        return vocabulary.unit_from_text(text.strip().strip("[]()"))
+        return schema.unit_from_text(text.strip().strip("[]()"))
 
     def only(self, arrays: Sequence[str]) -> FileSample:
         """Return the sample of some of the file's arrays."""
@@ -387,7 +387,7 @@ def time_entry(sample: FileSample, column: str | None, file: str = "") -> str:
         if 1e8 <= first < limit:
             return f'{{ {source}, unit = "{unit}" }}'
     suffix = re.search(r"(?:^|[_ ])(ms|us|ns|s|sec|seconds)$", column_names.without_unit(column), re.IGNORECASE)
-    unit_text = sample.stated_unit(column) or vocabulary.unit_from_text(suffix[1] if suffix else "")
+    unit_text = sample.stated_unit(column) or schema.unit_from_text(suffix[1] if suffix else "")
     steps = np.diff([value for value in values if isinstance(value, float)])
     if not unit_text and len(steps) and 0 < float(np.median(steps)) < 0.5:
         unit_text = "s"  # steps this small in ms would be thousands of rows per second

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from tacpipe.channels import vocabulary
+from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.formats.containers.container import KINDS, Time, describe_kind, has_ending
 from tacpipe.formats.table import pattern, stamps
@@ -267,10 +267,10 @@ def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], pla
             for kind, fault, word in (
                 (
                     "quantities",
-                    vocabulary.describe_unknown_quantity(column.quantity, local.quantities),
+                    schema.describe_unknown_quantity(column.quantity, local.quantities),
                     column.quantity,
                 ),
-                ("units", vocabulary.describe_unknown_unit(column.unit, local.units), column.unit),
+                ("units", schema.describe_unknown_unit(column.unit, local.units), column.unit),
             ):
                 if fault:
                     raise UsageError(

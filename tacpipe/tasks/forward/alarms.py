@@ -32,7 +32,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Indices, Int64s
 from tacpipe.errors import TacpipeError
-from tacpipe.signals import holds
+from tacpipe.signals import repairs
 from tacpipe.signals.runs import latched, runs
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.params import AlarmLevels
@@ -359,7 +359,7 @@ class Loads:
                 sd=sd,
                 theta=theta,
                 rate_hz=self.rate_hz,
-                repeated=holds.held(truth),
+                repeated=repairs.held(truth),
             )
             scores[name] = {key: _number(value) for key, value in asdict(result).items()}
         return scores

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Times
-from tacpipe.channels.pose import NAMED, Pose
+from tacpipe.channels.arm import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files

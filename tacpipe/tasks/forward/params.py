@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict, cast
 
-from tacpipe.channels import pose
+from tacpipe.channels import arm
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
 from tacpipe.plugins.requirements import Channels, Label, Requirements
@@ -266,13 +266,13 @@ REQUIREMENTS = Requirements(
             "column state where it lies, and then the model reads taxel by taxel",
         ),
         Channels(
-            pose.POSITION,
-            tuple(pose.METRES),
+            arm.POSITION,
+            tuple(arm.METRES),
             "x, y and z of the hand, in one stream (--arm names it where several have a position)",
             "train with --actions none",
         ),
         Channels(
-            pose.ORIENTATION,
+            arm.ORIENTATION,
             ("1",),
             "the quaternion x, y, z, w of the hand, in the stream of the position",
             "the hand is taken to keep its orientation",
@@ -283,7 +283,7 @@ REQUIREMENTS = Requirements(
             "7 angles in the stream of the position, with as many of joint_velocity [rad/s]",
             "velocities are differences of the pose, as with any arm but a Franka",
         ),
-        Channels(pose.WIDTH, tuple(pose.METRES), "the width between the fingers, 1 column", "it counts as constant"),
+        Channels(arm.WIDTH, tuple(arm.METRES), "the width between the fingers, 1 column", "it counts as constant"),
     ),
     labels=(Label("object", "what is held, any value", "known and novel objects are not reported apart"),),
 )

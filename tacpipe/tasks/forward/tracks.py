@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
-from tacpipe.channels import masks
-from tacpipe.channels import pose as poses
-from tacpipe.channels.absent import absent
-from tacpipe.channels.pose import Pose
+from tacpipe.channels import arm as poses
+from tacpipe.channels import streams
+from tacpipe.channels.arm import Pose
+from tacpipe.channels.streams import absent
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
 from tacpipe.codecs.codec import breaks
@@ -20,7 +20,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
-from tacpipe.signals.windows import window_starts
+from tacpipe.signals.runs import window_starts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -200,7 +200,7 @@ def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -
 
     ``beginning`` are its first words, such as ``The training recordings hold``.
     """
-    gaps = masks.describe_gaps(*(recording.columns() for recording in recordings.recordings.values()))
+    gaps = streams.describe_gaps(*(recording.columns() for recording in recordings.recordings.values()))
     advice = gaps or ["Give more or longer recordings, or shorten context and horizon."]
     return TacpipeError(f"{beginning} no window of {context} and {horizon} rows without a gap. {' '.join(advice)}")
 
@@ -252,7 +252,7 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     """Return the columns of the arm whose motion a model reads; of no arm where it needs none and there is none.
 
     ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is
-    no arm to plan with, and what `tacpipe.channels.pose.pose` raises.
+    no arm to plan with, and what `tacpipe.channels.arm.pose` raises.
     """
     schema = shard.columns().schema
     try:
@@ -303,7 +303,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         shard.name,
         t_ns,
         contact,
-        np.cumsum(breaks(t_ns, masks.apart(shard.attributes))),
+        np.cumsum(breaks(t_ns, streams.apart(shard.attributes))),
         finite & np.isfinite(finger) & ~gaps,
         latent,
         arm,

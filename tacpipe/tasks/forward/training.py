@@ -16,8 +16,8 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Int64s
-from tacpipe.channels import masks
-from tacpipe.channels.pose import NAMED, Pose
+from tacpipe.channels import streams
+from tacpipe.channels.arm import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
@@ -205,11 +205,11 @@ def _look_ahead(training: Dataset) -> LookAhead | None:
     """Return how far the rows of the training recordings look ahead; None where no recording states it."""
     look_ahead = [
         (
-            float(recording.attributes[masks.LOOK_AHEAD_MEAN] or 0),
-            float(recording.attributes[masks.LOOK_AHEAD_MAX] or 0),
+            float(recording.attributes[streams.LOOK_AHEAD_MEAN] or 0),
+            float(recording.attributes[streams.LOOK_AHEAD_MAX] or 0),
         )
         for recording in training.recordings.values()
-        if masks.LOOK_AHEAD_MAX in recording.attributes
+        if streams.LOOK_AHEAD_MAX in recording.attributes
     ]
     if not look_ahead:
         return None
@@ -222,8 +222,8 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
     values: dict[str, list[float]] = {}
     for recording in training.recordings.values():
         for name, value in recording.attributes.items():
-            if name.endswith(masks.GAP_MS) and value is not None:
-                values.setdefault(name.removesuffix(masks.GAP_MS), []).append(float(value))
+            if name.endswith(streams.GAP_MS) and value is not None:
+                values.setdefault(name.removesuffix(streams.GAP_MS), []).append(float(value))
     return {stream: float(np.median(gaps_ms)) for stream, gaps_ms in sorted(values.items())}
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
-from tacpipe.channels.absent import absent
+from tacpipe.channels.streams import absent
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from tacpipe.arrays import Float32s, Floats, Indices
-from tacpipe.clouds import frame, geometry
+from tacpipe.clouds import geometry
+from tacpipe.clouds import grasp as frame
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.frame import local_points
-from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.grasp import Grasp, local_points
 from tacpipe.clouds.normalisation import (
     NORMALISATIONS,
     Extent,

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links import dialogue
+from tacpipe.links import opening
 from tacpipe.links.link import Link, LinkLostError
 from tacpipe.links.opening import open_link
 from tacpipe.recording import rig
@@ -44,7 +44,7 @@ class Reader:
         self.framer = self.sensor.framer()
         self.runs: list[Any] = []
         self.losses: list[Any] = []
-        self.take(dialogue.run_dialogue(self.link, self.sensor.opening(self.link.local), name))
+        self.take(opening.run_dialogue(self.link, self.sensor.opening(self.link.local), name))
 
     def take(self, chunks: list[tuple[int, bytes]]) -> None:
         for _, chunk in chunks:

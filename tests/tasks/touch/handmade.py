@@ -12,8 +12,7 @@ import pyarrow as pa
 
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.frame import axes
-from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.grasp import Grasp, axes
 from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.touch import evaluation as touch_evaluation

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from tacpipe.clouds import frame, normalisation
+from tacpipe.clouds import grasp as frame
+from tacpipe.clouds import normalisation
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.normalisation import Extent
 from tacpipe.errors import TacpipeError

@@ -305,7 +305,7 @@ class Chain:
             return forecasts
         with one_thread():
             for index, at_ns in enumerate(rows.t_ns.tolist()):
-                if not rows.begun[index]:
+                if not rows.has_samples[index]:
                     forecasts.append(Forecast(at_ns, 0, None, None, Cause.START))
                     continue
                 row = self._row(rows, index, at_ns)

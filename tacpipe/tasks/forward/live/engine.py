@@ -16,7 +16,7 @@ import numpy as np
 from tacpipe.live import messages
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.plan import NAME as PLAN

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
-from tacpipe.channels import pose as poses
+from tacpipe.channels import arm as poses
 from tacpipe.channels.schema import time_field
 from tacpipe.channels.streams import EVENTS, axes_of
 from tacpipe.codecs import tactile
@@ -18,7 +18,7 @@ from tacpipe.live.decoding import Columns
 from tacpipe.printable import listed
 from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tared
-from tacpipe.synchronization import grids, methods
+from tacpipe.synchronization import streams
 from tacpipe.synchronization.causal import Reading
 from tacpipe.synchronization.streams import holds_signal
 from tacpipe.tasks.forward import headline, tracks
@@ -94,18 +94,18 @@ class Layout:
 
         signals = {name: layouts[name] for name in sorted(layouts) if name != EVENTS and holds_signal(layouts[name])}
         origin = {
-            methods.grid_name(stream, name): (stream, name)
+            streams.grid_name(stream, name): (stream, name)
             for stream, schema in signals.items()
-            for name in methods.channel_names(schema)
+            for name in streams.channel_names(schema)
         }
         grid = pa.schema(
             [
-                methods.grid_field(stream, signals[stream].field(name), "hold").with_name(grid_column)
+                streams.grid_field(stream, signals[stream].field(name), "hold").with_name(grid_column)
                 for grid_column, (stream, name) in origin.items()
             ]
         )
         _check(forecaster, signals, grid)
-        leader = grids.master("of this rig", synchronize.master or master, signals)
+        leader = streams.master("of this rig", synchronize.master or master, signals)
         columns: dict[str, list[str]] = {leader: []}
 
         def placed(names: Sequence[str]) -> Place | None:
@@ -232,7 +232,7 @@ def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master
 
     compared: list[int] = []
     if is_master and synchronize.grid == "fresh":
-        compared_names = [name for name in methods.channel_names(schema) if methods.method(schema, name) != "nearest"]
+        compared_names = [name for name in streams.channel_names(schema) if streams.method(schema, name) != "nearest"]
         names += [name for name in compared_names if name not in names]
         compared = [names.index(name) for name in compared_names]
     wraps = [
@@ -243,7 +243,7 @@ def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master
         and pa.types.is_integer(schema.field(name).type)
         and schema.field(name).type.bit_width == 16
     ]
-    medians = [index for index, name in enumerate(names) if methods.method(schema, name) == "median"]
+    medians = [index for index, name in enumerate(names) if streams.method(schema, name) == "median"]
     return Reading(len(names), wraps, medians, compared)
 
 

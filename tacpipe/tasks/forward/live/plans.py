@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Float32s, Floats
-from tacpipe.channels.pose import metres
+from tacpipe.channels.arm import metres
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.errors import UsageError
 from tacpipe.links import network

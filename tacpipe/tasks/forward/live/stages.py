@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from tacpipe.channels.masks import GRID, apart
+from tacpipe.channels.streams import GRID, apart
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.live.decoding import Decoder, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
 from tacpipe.live.messages import Message
-from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -238,7 +238,7 @@ class MaterialEngine(Engine):
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:
     """Return the stream with tactile channels. Raises `TacpipeError` where there is none, or more than one."""
-    from tacpipe.channels.finger import finger
+    from tacpipe.channels.streams import finger
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
     tables: Mapping[str, Any] = {name: schema.empty_table() for name, schema in schemas.items()}

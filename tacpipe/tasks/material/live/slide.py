@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Float32s
-from tacpipe.channels.finger import finger
-from tacpipe.channels.streams import EVENTS
+from tacpipe.channels.streams import EVENTS, finger
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params, streams_as_recorded
 from tacpipe.plugins import registry
