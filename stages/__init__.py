@@ -1,6 +1,6 @@
 """The built-in stages: the first plug-in, found through entry points like any other."""
 
-COMMANDS = {  # in the order of `tacpipe --help`; the line of a group, "" for a stage, whose docstring has its own
+COMMANDS = {  # help lines of groups, in the order of `tacpipe --help`; "" for a stage, whose docstring has its own
     "ingest": "Read recordings of files into a dataset.",
     "simulate": "Simulate recordings of a rig, with ground truth.",
     "synchronize": "",

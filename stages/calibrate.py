@@ -31,9 +31,9 @@ class Params:
     """How a model is to state its uncertainty."""
 
     quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50, of forward and touch
-    # of forward and touch: widen bands until they hold in a new recording with at least their level; else they do on average
+    # forward and touch: widen bands until they hold in a new recording with at least their level; else they do on average
     promise: bool = False
-    # of material: fraction of slides of known materials that may be answered unknown
+    # material: fraction of slides of known materials that may be answered unknown
     false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05
     seed: Seed = 0  # random seed of what is fitted
 

@@ -39,7 +39,7 @@ class Params:
 
 @dataclass(frozen=True)
 class AutoencoderParams:
-    """What the network reads, how wide it is, and how it is trained."""
+    """Inputs, widths and training of the network."""
 
     frames: Literal[1, 2, 3] = 1  # consecutive rows that it reads: the paper's classes C1, C2 and C3
     components: PositiveInt = 8  # latents; the paper chose 8
@@ -50,8 +50,8 @@ class AutoencoderParams:
     search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget, the best is kept; 0: none
     epochs: PositiveInt = 100  # maximum number of passes over the training rows
     batch: PositiveInt = 256  # rows per step of the optimiser
-    learning_rate: PositiveFloat = 1e-3  # of Adam
-    weight_decay: NonNegativeFloat = 1e-5  # of Adam
+    learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
+    weight_decay: NonNegativeFloat = 1e-5  # weight decay of Adam
     patience: PositiveInt = 10  # epochs without a lower error on held-out training recordings after which training ends
     seed: Seed = 0  # random seed of initial weights and of the order of rows
     PANELS: ClassVar[Panels] = {
@@ -75,8 +75,10 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.plugins.stage import Result
 
     rows = training_rows.stored(train.recordings, params.representation)
-    kept, notes = _kept(params.components, len(rows.channels))
-    codec = pca.fit_and_measure(rows, components=kept, variance=params.variance, representation=params.representation)
+    latents, notes = _latent_count(params.components, len(rows.channels))
+    codec = pca.fit_and_measure(
+        rows, components=latents, variance=params.variance, representation=params.representation
+    )
     return Result(files=codec.to_files(), notes=[] if params.variance else notes)
 
 
@@ -99,8 +101,10 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
         seed=params.seed,
     )
     rows = training_rows.read(train.recordings, params.representation, params.frames)
-    kept, notes = _kept(params.components, len(rows.channels))
-    codec = autoencoder_fit.fit(rows, tried, schedule, workspace, components=kept, representation=params.representation)
+    latents, notes = _latent_count(params.components, len(rows.channels))
+    codec = autoencoder_fit.fit(
+        rows, tried, schedule, workspace, components=latents, representation=params.representation
+    )
     return Result(files=codec.to_files(), notes=notes)
 
 
@@ -133,7 +137,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     return tactile.added(recording, codec)
 
 
-def _kept(components: int, channels: int) -> tuple[int, list[str]]:
+def _latent_count(components: int, channels: int) -> tuple[int, list[str]]:
     """Return how many latents are kept, and a note where there are fewer channels than were asked for."""
     if components <= channels:
         return components, []

@@ -41,15 +41,15 @@ class Params(StreamSelection):
     merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # largest gap between two contacts that are merged
     min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # shortest contact that is kept
     pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that belongs to it
-    # as on_count, of streams in other units, in theirs; None: from noise at rest
+    # on_count for streams in other units, in their unit; None: from noise at rest
     on_level: PositiveFloat | None = added(None)
     # level below which it ends there; None: two thirds of where it starts
     off_level: NonNegativeFloat | None = added(None)
-    # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
+    # level that `rest` names: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
     tare: Literal["median", "first", "axis_mean"] = "median"
-    # of streams in counts: unit, on_count and off_count; noise, from their noise at rest as those in other units
+    # thresholds of streams in counts: unit, on_count and off_count; noise, from their noise at rest as in other units
     thresholds: Literal["unit", "noise"] = added("unit")
-    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    # rest_s to use: start of the recording; lowest: those in which the channels are lowest together
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
@@ -99,7 +99,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     columns.forget()
     loads: list[Floats] = []
     limits: list[Thresholds] = []
-    rest: dict[str, dict[str, str]] = {}
+    rest_metadata: dict[str, dict[str, str]] = {}
     schema = columns.schema
     sensors = _sensors(recording.name, schema)
     units = {stream: unit_of(schema, names) for stream, names in sensors.items()}
@@ -118,9 +118,9 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         if stream in fixed:
             limits.append(Thresholds(params.on_count, params.off_count))
         else:
-            limits.append(_given(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
+            limits.append(_with_given_levels(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
         zero = tared(params.tare, next(blocks()), level, axes)
-        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
+        rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
     stacked = np.array(loads)  # (sensor, time)
     loads.clear()
     if params.begins == "grasped":
@@ -137,7 +137,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
     def mark(table: pa.Table, first: int) -> pa.Table:
         contact = pa.array(numbers[first : first + table.num_rows])
-        return with_metadata(table.append_column(field, contact), rest)
+        return with_metadata(table.append_column(field, contact), rest_metadata)
 
     return RecordingOutput(change(columns, mark), _threshold_attributes(units, limits, fixed), notes)
 
@@ -159,12 +159,12 @@ def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Co
         )
 
 
-def _given(params: Params, found: Thresholds) -> Thresholds:
-    """Return the thresholds of a stream in another unit than counts: those given, else those ``found``."""
+def _with_given_levels(params: Params, thresholds: Thresholds) -> Thresholds:
+    """Return the thresholds of a stream in another unit than counts: those of the params, else ``thresholds``."""
     from tacpipe.signals.contact import ENDS
 
-    on = found.on if params.on_level is None else params.on_level
-    return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
+    on = thresholds.on if params.on_level is None else params.on_level
+    return thresholds._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
 
 
 def _threshold_attributes(
@@ -187,18 +187,18 @@ def _no_contact(
     fixed: Collection[str],
 ) -> str:
     """Return the note on a recording without a contact: thresholds, largest load, and what to do."""
-    found = [
+    descriptions = [
         f"{stream or 'the sensor'} starts contact at a load of {_number(on)} {unit}".rstrip()
-        + f" and reaches {_number(most)} {unit}".rstrip()
+        + f" and reaches {_number(largest_load)} {unit}".rstrip()
         if math.isfinite(on)
         else f"{stream or 'the sensor'} never leaves its level at rest"
-        for (stream, unit), (on, _), most in zip(units.items(), limits, largest, strict=True)
+        for (stream, unit), (on, _), largest_load in zip(units.items(), limits, largest, strict=True)
     ]
     names = ["--on-count"] * bool(fixed) + ["--on-level"] * (set(fixed) != set(units))
-    other = ", or give --thresholds noise" if fixed else ""
+    alternative = ", or give --thresholds noise" if fixed else ""
     return (
-        f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(found)}. If something was "
-        f"touched, lower {' and '.join(names)}{other}."
+        f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(descriptions)}. If something was "
+        f"touched, lower {' and '.join(names)}{alternative}."
     )
 
 
@@ -209,11 +209,11 @@ def _number(value: float) -> str:
 
 def _sensors(name: str, schema: pa.Schema) -> dict[str, list[str]]:
     """Return the tactile columns of each stream, taxel by taxel."""
-    found: dict[str, list[str]] = {}
+    columns_by_stream: dict[str, list[str]] = {}
     for field in schema:
         metadata = field.metadata or {}
         if metadata.get(b"quantity") == b"tactile":
-            found.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
-    if not found:
+            columns_by_stream.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
+    if not columns_by_stream:
         raise absent(name, "tactile", schema)
-    return found
+    return columns_by_stream

@@ -65,10 +65,12 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.clouds.grasp import Grasp
     from tacpipe.clouds.segmentation import Limits, object_rows
 
-    given = {name: recording.table(name) for name in recording.streams}
-    if set(FINISHED) <= set(given) and "biotac_sp" not in given:
-        return RecordingOutput(given)
-    missing = [name for name in ("scene", "grasp") if name not in given and not (name == "scene" and "cloud" in given)]
+    streams = {name: recording.table(name) for name in recording.streams}
+    if set(FINISHED) <= set(streams) and "biotac_sp" not in streams:
+        return RecordingOutput(streams)
+    missing = [
+        name for name in ("scene", "grasp") if name not in streams and not (name == "scene" and "cloud" in streams)
+    ]
     if missing:
         raise TacpipeError(
             f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams scene and grasp, and "
@@ -88,17 +90,17 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
     reading: dict[str, pa.Table] = {}
     attributes: dict[str, int] = {}
     try:
-        if "scene" in given:
-            scene = Cloud.of(given.pop("scene"))
-            rows = object_rows(scene, Grasp.of(given["grasp"]), limits, params.seed)
+        if "scene" in streams:
+            scene = Cloud.of(streams.pop("scene"))
+            rows = object_rows(scene, Grasp.of(streams["grasp"]), limits, params.seed)
             colours = None if scene.colours is None else scene.colours[rows]
-            given["cloud"] = Cloud(scene.points_m[rows], colours).table()
-        if "biotac_sp" in given:
-            reading["reading"], attributes["contact_ns"] = _reading(params, given.pop("biotac_sp"))
+            streams["cloud"] = Cloud(scene.points_m[rows], colours).table()
+        if "biotac_sp" in streams:
+            reading["reading"], attributes["contact_ns"] = _reading(params, streams.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
-    kept = {name: table for name, table in given.items() if table.num_rows == 1 or name == "cloud"}
-    return RecordingOutput({**kept, **reading}, attributes)
+    output_streams = {name: table for name, table in streams.items() if table.num_rows == 1 or name == "cloud"}
+    return RecordingOutput({**output_streams, **reading}, attributes)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:

@@ -28,16 +28,16 @@ STEPS = CommaList(PositiveInt, min_items=1)
 
 @dataclass(frozen=True)
 class Params:
-    """What is predicted."""
+    """Contents of the predictions."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
     # read no sample that had not arrived yet, as a live session; give recordings as they were recorded
     causal: bool = added(False)
-    # with --causal: accept a model that was trained on rows that look ahead
+    # accept, with --causal, a model that was trained on rows that look ahead
     allow_look_ahead: bool = added(False)
     # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
     quantiles: Annotated[str, CommaList(PositiveInt)] = added("")
-    # of material: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
+    # material: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
     probabilities: bool = added(False)
 
 
@@ -66,7 +66,7 @@ def _refuse_unstated(task: Task, request: PredictionRequest) -> None:
     from tacpipe.errors import UsageError
 
     requested = {"quantiles": bool(request.quantiles), "probabilities": request.probabilities}
-    for name in [name for name, wanted in requested.items() if wanted]:
+    for name in [name for name, is_requested in requested.items() if is_requested]:
         if task.calibration is None or task.calibration.states != name:
             raise UsageError(f"Models of the task {task.name} have no {name}; leave out --{name}.")
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """What the page shows."""
+    """Contents of the page."""
 
     title: str = ""  # heading of the page; without one, what its tasks predict
     traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn

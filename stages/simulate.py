@@ -26,7 +26,7 @@ Families = Annotated[
 
 @dataclass(frozen=True)
 class Params:
-    """What the simulated pick-and-move rig does, and the noise and latency of its streams."""
+    """Motions of the simulated pick-and-move rig, and the noise and latency of its streams."""
 
     trials: PositiveInt = 24  # recordings
     seed: Seed = 0  # random seed
@@ -76,7 +76,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class MaterialParams:
-    """What the simulated rig of two unlike sensors slides over, and the noise of the sensors."""
+    """Surfaces that the simulated rig of two unlike sensors slides over, and the noise of the sensors."""
 
     # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
     trials: PositiveInt = 200
@@ -94,7 +94,7 @@ class MaterialParams:
     speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the arm that draws the BioTac
     # mean speed of what slides over RoboSkin; it varies by 30 %
     roboskin_speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.05
-    pac: bool = True  # whether the BioTac's vibration channels are simulated; they are zero otherwise
+    pac: bool = True  # simulate the BioTac's vibration channels; they are zero otherwise
     # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
     arm_every: NonNegativeInt = 20
     jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.1  # mean and standard deviation of a reading's latency
@@ -118,13 +118,13 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class TouchParams:
-    """What lies on the simulated table, how it is grasped, and the noise of camera and fingertips."""
+    """Objects on the simulated table, their grasps, and the noise of camera and fingertips."""
 
     trials: PositiveInt = 360  # recordings, each a grasp; the objects take turns
     seed: Seed = 0  # random seed
     families: Families = "all"  # families of objects, or all
     objects: PositiveInt = 5  # named objects of each family
-    # of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
+    # stiffness of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
     stiffness: Literal["mixed", "rigid", "elastic", "foam"] = "mixed"
     spheres: bool = False  # spheres that differ in size alone, seen from as much nearer, grasped through the centre
     one_pose: bool = False  # each object always lies the same way, and is only shifted and turned about the vertical

@@ -47,7 +47,7 @@ class Params(StreamSelection):
     # fraction of speed_m_s above which the arm slides; only where the arm was recorded
     moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
-    # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
+    # frames to keep: middle ones; offset: those from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
     frames: PositiveInt = 400  # rows that are kept; recordings without static pressure are kept whole
     # rows between trigger and kept frames with crop offset; the authors' files have 101
@@ -66,13 +66,13 @@ class Params(StreamSelection):
     pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
     # largest mean pressure within the protocol; above, the finger was pressed too hard
     pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
-    # what the slide begins and ends by: pressure, the static one; load, the taxels' mean change from rest, of any sensor
+    # signal that starts and ends the slide: static pressure; load: the taxels' mean change from rest, of any sensor
     trigger: Literal["pressure", "load"] = added("pressure")
     # load at which the slide begins, in the unit of the taxels; None: from their noise at rest
     load_trigger: PositiveFloat | None = added(None)
     # time whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)
-    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    # rest_s to use: start of the recording; lowest: those in which the channels are lowest together
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
@@ -110,7 +110,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.channels import arm
     from tacpipe.channels.streams import finger, without_spikes
     from tacpipe.datasets.streams import streams_of
-    from tacpipe.signals import slides as found
+    from tacpipe.signals import slides as slide_signals
 
     streams = streams_of(recording)
     table = finger(recording.name, streams)
@@ -127,25 +127,27 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     pressure = table.column(pressures[0]).to_numpy()
     profile = arm.profile(streams, t_ns)
     try:
-        trigger = found.trigger_row(pressure, params.pressure_trigger)
+        trigger = slide_signals.trigger_row(pressure, params.pressure_trigger)
         slide = (trigger, len(t_ns))
         if profile:
             least_m_s = params.moving_fraction * params.speed_m_s
-            slide = found.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
-        first, stop = found.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
+            slide = slide_signals.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
+        first, stop = slide_signals.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
-    protocol = found.Protocol(
+    protocol = slide_signals.Protocol(
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    described = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
-    why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
+    described = slide_signals.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    departures = slide_signals.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
     attributes = {**described, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
-    attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
+    attributes |= {"outside_protocol": bool(departures)} | (
+        {"outside_protocol_why": "; ".join(departures)} if departures else {}
+    )
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:
-        tables["profile"] = arm.profile_table(t_ns, pressure, profile, found.phases(len(t_ns), slide))
+        tables["profile"] = arm.profile_table(t_ns, pressure, profile, slide_signals.phases(len(t_ns), slide))
     return RecordingOutput(tables, attributes)
 
 
@@ -155,11 +157,11 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
 
     from tacpipe.channels import arm
     from tacpipe.channels.streams import without_spikes
-    from tacpipe.signals import slides as found
+    from tacpipe.signals import slides as slide_signals
     from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load_in_blocks, noise_thresholds
 
     t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
-    values = np.column_stack([table.column(one).to_numpy() for one in names])  # (time, channel)
+    values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
     axes = axes_of(table, names)
     level, rows = at_rest(params.rest, lambda: [values], t_ns, params.rest_s)
     loaded, repeated = load_in_blocks(lambda: [values], level, axes)
@@ -170,27 +172,27 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
     unit = unit_of(table, names)
     profile = arm.profile(streams, t_ns, by_place=True)
     try:
-        touched = found.touched_rows(loaded, limits.on, limits.off, unit)
+        touched = slide_signals.touched_rows(loaded, limits.on, limits.off, unit)
         slide = touched
         if profile:
             usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
-            moving = found.sliding_rows(
+            moving = slide_signals.sliding_rows(
                 profile["speed_m_s"][: touched[1]], touched[0], params.moving_fraction * usual_m_s, params.steady_frames
             )
             slide = moving or touched
-        first, stop = found.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
+        first, stop = slide_signals.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {name}: {error}") from error
-    kept = slice(first, stop)
+    kept_rows = slice(first, stop)
     height = params.spike_count if unit == COUNT else limits.on
     table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, height)
     attributes: dict[str, Attribute] = {
-        "load_mean": float(f"{loaded[kept].mean():.4g}"),
+        "load_mean": float(f"{loaded[kept_rows].mean():.4g}"),
         "load_trigger": float(f"{limits.on:.4g}"),
         "slide_frames": stop - first,
-        "spikes": int(spikes[kept].sum()),
+        "spikes": int(spikes[kept_rows].sum()),
         "outside_protocol": False,
     }
-    if profile and np.isfinite(profile["speed_m_s"][kept]).all():
-        attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept])), 5)
+    if profile and np.isfinite(profile["speed_m_s"][kept_rows]).all():
+        attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept_rows])), 5)
     return RecordingOutput({"slide": table.slice(first, stop - first).combine_chunks()}, attributes)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
-EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
+EVEN = 0.01  # fraction of a step between rows, by which it may differ from the others for a filter of even steps
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     t_ns = table.column("t_ns").to_numpy()
     rate_hz = _rate_hz(recording.name, t_ns)
     contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
-    still, patch_count = round(params.still_s * rate_hz), params.patch_mm * params.count_per_mm
+    still_rows, patch_count = round(params.still_s * rate_hz), params.patch_mm * params.count_per_mm
     limits = slip.Limits(
         on_sigma=params.on_sigma,
         off_sigma=params.off_sigma,
@@ -104,13 +104,15 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     labels = {name: np.zeros(len(t_ns), dtype=bool) for name in ("slip", "slip_online", "dropped")}
     grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
     for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
-        since, held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
-        lost = slip.dropped(since, still, patch_count, saturated)
-        known_lost = slip.dropped_online(since, still, patch_count, saturated)
+        grasp_values, is_held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
+        lost = slip.dropped(grasp_values, still_rows, patch_count, saturated)
+        lost_online = slip.dropped_online(grasp_values, still_rows, patch_count, saturated)
         labels["dropped"][rows] = lost
-        labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
-        known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
-        labels["slip_online"][rows] = held & ~known_lost & known
+        labels["slip"][rows] = (
+            is_held & ~lost & slip.slip_offline(grasp_values, rate_hz, params.cutoff_hz, still_rows, limits)
+        )
+        is_slipping = slip.slip_online(grasp_values, rate_hz, params.cutoff_hz, still_rows, limits)
+        labels["slip_online"][rows] = is_held & ~lost_online & is_slipping
     label = {"unit": "1", "quantity": "label"}
 
     def mark(rows: pa.Table, first: int) -> pa.Table:
@@ -124,21 +126,21 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
 
 def _proximity(name: str, channel: str, table: Columns) -> str:
     """Return the column with the distance of the object."""
-    found = of_quantity(table, "proximity")
+    proximity_columns = of_quantity(table, "proximity")
     if channel:
         if channel not in table.column_names:
             raise TacpipeError(
-                f"Recording {name} has no column {channel}; proximity is in {', '.join(found) or 'none'}."
+                f"Recording {name} has no column {channel}; proximity is in {', '.join(proximity_columns) or 'none'}."
             )
         return channel
-    if not found:
+    if not proximity_columns:
         raise absent(name, "proximity", table.schema, unit="mm")
-    if len(found) != 1:
+    if len(proximity_columns) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
-            f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
+            f"Recording {name} has {len(proximity_columns)} columns whose quantity is proximity, and slip is detected in "
+            f"one. Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
-    return found[0]
+    return proximity_columns[0]
 
 
 def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeError:

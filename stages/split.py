@@ -24,7 +24,7 @@ SHOWN = 5  # folds that a note lists before it counts the rest
 
 @dataclass(frozen=True)
 class Split:
-    """What all schemes have."""
+    """Params that all schemes have."""
 
     scheme: str
     # fraction of the recordings to validate on; where the scheme picks the test ones, of the others
@@ -40,9 +40,9 @@ class Split:
     def check(self) -> None:
         """Refuse options that need few, and an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
-            named = "few_by" if self.few_by else "few_of"
+            option = "few_by" if self.few_by else "few_of"
             raise UsageError(
-                f"{named} is {self.few_by or self.few_of} and few is 0; it must be 1 or more with {named}."
+                f"{option} is {self.few_by or self.few_of} and few is 0; it must be 1 or more with {option}."
             )
         if self.few_of and not all(self.few_of.partition("=")):
             raise UsageError(f"few_of is {self.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
@@ -143,8 +143,8 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
 def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:
     """Return the sentence on folds without validation recordings; ``enough`` is a fraction that would leave none so."""
-    named = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
-    subject = f"Folds {named} of {folds} have" if len(bare) > 1 else f"Fold {named} of {folds} has"
+    fold_numbers = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
+    subject = f"Folds {fold_numbers} of {folds} have" if len(bare) > 1 else f"Fold {fold_numbers} of {folds} has"
     advice = f"Give --val {enough:g}" if enough else "Add recordings"
     return (
         f"{subject} no validation recording: val {val:g} of {recordings} recordings gives none. {advice}, or --val 0 if "

@@ -102,22 +102,24 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.synchronization.columns import look_ahead_ns
     from tacpipe.synchronization.streams import listed
 
-    every = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
-    found = {name: columns for name, columns in every.items() if streams.is_signal(columns)} or every
+    recorded_streams = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
+    signal_streams = {
+        name: columns for name, columns in recorded_streams.items() if streams.is_signal(columns)
+    } or recorded_streams
     hold_values = params.values == "hold"
     storage = MappedArrays(IN_MEMORY)
     placed: dict[str, Stream] = {}
-    for name, stored in found.items():
+    for name, stored in signal_streams.items():
         placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
         stored.forget()
-    wanted = params.master or str(recording.attributes.get("master", ""))
-    schemas = {name: columns.schema for name, columns in found.items()}
-    master = placed[grids.master(recording.name, wanted, schemas)]
+    master_name = params.master or str(recording.attributes.get("master", ""))
+    schemas = {name: columns.schema for name, columns in signal_streams.items()}
+    master = placed[grids.master(recording.name, master_name, schemas)]
     grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, hold_values=hold_values)
     columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
-    if left := [name for name in every if name not in found]:
-        attributes["not_synchronized"] = listed(left)
+    if omitted := [name for name in recorded_streams if name not in signal_streams]:
+        attributes["not_synchronized"] = listed(omitted)
     attributes["grid_rate_hz"] = round(mean_rate_hz(grid_ns), 3) if params.rate_hz is None else params.rate_hz
     if len(grid_ns) > 1:
         attributes["step_ms"] = round(float(np.median(np.diff(grid_ns))) / 1e6, 3)

@@ -139,12 +139,12 @@ def run(
     """
     from tacpipe.engine import calling
 
-    named = {"model": model, "split": split, "codec": codec, "init": init, "extend": extend}
+    named_inputs = {"model": model, "split": split, "codec": codec, "init": init, "extend": extend}
     return calling.call(
         name,
         datasets,
         output,
-        {key: given for key, given in named.items() if given is not None},
+        {key: source for key, source in named_inputs.items() if source is not None},
         params,
         calling.How(
             fold=fold,

@@ -1,4 +1,4 @@
-"""Names for arrays by what they hold, for annotations; their shapes stand in comments where they are made."""
+"""Name array types by their content, for annotations; comments give the shapes where arrays are made."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 AnyArray = NDArray[Any]
-AnyFloats = NDArray[np.floating[Any]]  # of any precision
+AnyFloats = NDArray[np.floating[Any]]  # any precision
 Floats = NDArray[np.float64]
 Float32s = NDArray[np.float32]
-Ints = NDArray[np.integer[Any]]  # of any width, with a sign or without
+Ints = NDArray[np.integer[Any]]  # any width, signed or unsigned
 Int64s = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 Times = NDArray[np.int64]  # nanoseconds
-Indices = NDArray[np.intp]  # of rows, as numpy's own searches return them
-Counts = NDArray[np.uint16]  # what a sensor's converter gives
+Indices = NDArray[np.intp]  # row numbers, as numpy's own searches return them
+Counts = NDArray[np.uint16]  # values of a sensor's converter
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]

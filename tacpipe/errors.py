@@ -1,4 +1,4 @@
-"""What can go wrong, as sentences, and the exit code each means."""
+"""Define errors whose messages are sentences, and the exit code of each."""
 
 from __future__ import annotations
 

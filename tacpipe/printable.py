@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
-_WIDE = ("W", "F")  # of East Asian letters, which take two cells
+_WIDE = ("W", "F")  # widths of East Asian letters that take two cells
 _SHORT = reprlib.Repr()  # looks no deeper and no further than it prints, so that aliases of aliases cost nothing
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = 60
@@ -44,9 +44,9 @@ def listed(names: Iterable[object], most: int = 8) -> str:
     >>> listed(["a", "b", "c"], most=2), listed([])
     ('a, b and 1 more', 'none')
     """
-    every = [plain(str(name)) for name in names]
-    more = f" and {len(every) - most} more" if len(every) > most else ""
-    return (", ".join(every[:most]) or "none") + more
+    texts = [plain(str(name)) for name in names]
+    suffix = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return (", ".join(texts[:most]) or "none") + suffix
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:

@@ -104,14 +104,14 @@ def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
 def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_missing(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest = repair._wanted
+    honest = repair._absent_objects
     looks: list[dict[str, str]] = []
 
     def with_another(store: Store, soundness: repair.Soundness) -> dict[str, str]:
         looks.append(honest(store, soundness))
         return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
 
-    monkeypatch.setattr(repair, "_wanted", with_another)
+    monkeypatch.setattr(repair, "_absent_objects", with_another)
     assert repair.verify(littered.store).clean and len(looks) == 2
 
 

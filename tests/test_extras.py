@@ -154,7 +154,7 @@ def prepare(folder: Path) -> None:
     slide_files.write_biotac(folder / "biotac")
     slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
-    points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
+    points_m = shapes.visible_half(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
     split = "tacpipe split data/segments -o data/split-again"
     (folder / "dvc.yaml").write_text(f"stages: {{split: {{cmd: {split}, outs: [data/split-again]}}}}\n")

@@ -1,1 +1,1 @@
-"""The command line: what is typed, what is printed. Nothing outside this package knows typer."""
+"""Parse command lines and print results. Only this package imports typer."""

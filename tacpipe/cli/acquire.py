@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 DRY_RUN_S = 3.0
 NAME = re.compile(r"[\w-][\w.-]*")
-RATE_OFF = 0.1  # fraction by which a rate may differ from the rig file's before it is reported
+RATE_OFF = 0.1  # Largest relative deviation from the rig file's rate that is not reported
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -82,19 +82,19 @@ def add(program: typer.Typer, summary: str) -> None:
         store = locate(*([] if output is None else [output]))
         if rig is None and not recover:
             raise UsageError("Missing argument RIG. Give a rig file: tacpipe acquire rig.toml -o data/recordings.")
-        found = rig_of.read(rig) if rig is not None else None
-        if found is not None and dry_run:
-            terminal.result(_dry_run(found, as_json=as_json))
+        parsed_rig = rig_of.read(rig) if rig is not None else None
+        if parsed_rig is not None and dry_run:
+            terminal.result(_dry_run(parsed_rig, as_json=as_json))
             return
-        if found is not None and output is None and not recover:
+        if parsed_rig is not None and output is None and not recover:
             raise UsageError("Missing option -o. Give the dataset of recordings to append to, as -o data/recordings.")
         began_s = time.monotonic()
-        sealed, left = _recovered(store, output, quiet=quiet)
+        sealed, unsealed_count = _recovered(store, output, quiet=quiet)
         if recover and not quiet:
             _report_others(store)
-        if found is None or output is None or recover:
+        if parsed_rig is None or output is None or recover:
             _report(output, sealed, began_s, as_json=as_json)
-            raise typer.Exit(FAILED if left else DONE)
+            raise typer.Exit(FAILED if unsealed_count else DONE)
         plan = trials_of.RecordingPlan(
             output,
             checked_name(name),
@@ -107,10 +107,10 @@ def add(program: typer.Typer, summary: str) -> None:
             keep_spool,
             attributes(label or [], note),
         )
-        recorded, lost = _record(found, store, plan, quiet=quiet)
+        recorded, lost = _record(parsed_rig, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
         _report(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
-        if lost and as_json:  # the object on stdout holds the error already
+        if lost and as_json:  # The JSON object on stdout has the error already.
             terminal.note(f"tacpipe: {failed}")
             raise typer.Exit(failed.exit_code)
         if lost:
@@ -124,9 +124,9 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     from tacpipe.recording.recorder import Recorder, complete_rig
     from tacpipe.recording.watch import View
 
-    for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
-        if value not in known:
-            raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
+    for value, option, choices in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
+        if value not in choices:
+            raise UsageError(f"There is no {option} {value}; it must be one of {', '.join(choices)}.")
     checked_name(plan.name)
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
         raise UsageError("--trials and --duration-s must be above 0.")
@@ -136,32 +136,32 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
     recorder = Recorder(complete_rig(rig))
-    with EndRequest() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
-        recorder.await_first(ended)
-        recorded, lost = trials.run(recorder, store, plan, view, ended)
-    for one in recorded if not quiet else ():
-        terminal.note(one.line())
+    with EndRequest() as is_over, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+        recorder.await_first(is_over)
+        recorded, lost = trials.run(recorder, store, plan, view, is_over)
+    for recording in recorded if not quiet else ():
+        terminal.note(recording.line())
     return recorded, lost
 
 
 def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal what earlier processes of this user left behind; return that, and how many spools stay as they are."""
+    """Seal the spools that earlier processes of this user left; return the recordings and the number not sealed."""
     from tacpipe.recording import trials
 
-    sealed, left = list[Any](), 0
-    for found in trials.recover_spools(store, output):
-        if isinstance(found, trials.Unsealed):
-            terminal.note(f"tacpipe: {found.line()}")
-            left += 1
+    sealed, unsealed_count = list[Any](), 0
+    for recovered in trials.recover_spools(store, output):
+        if isinstance(recovered, trials.Unsealed):
+            terminal.note(f"tacpipe: {recovered.line()}")
+            unsealed_count += 1
             continue
-        sealed.append(found)
+        sealed.append(recovered)
         if not quiet:
-            terminal.note(f"recovered {found.line()}")
-    return sealed, left
+            terminal.note(f"recovered {recovered.line()}")
+    return sealed, unsealed_count
 
 
 def _report_others(store: Store) -> None:
-    """Print whose the spools are that another user recorded, in a store that is shared."""
+    """Print the owners of the spools that other users left in a shared store."""
     from tacpipe.recording import trials
 
     for folder, owner in trials.spools_of_others(store).items():
@@ -169,7 +169,7 @@ def _report_others(store: Store) -> None:
 
 
 def _dry_run(rig: Rig, *, as_json: bool) -> str:
-    """Open every stream and return what each does. Raises `DeviceError` for those that do not open or give nothing."""
+    """Open every stream and return its figures. Raises `DeviceError` for streams that do not open or send nothing."""
     from dataclasses import asdict
 
     from tacpipe.io.termination import EndRequest
@@ -179,33 +179,35 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
 
     rig = complete_rig(rig)
     recorder = Recorder(rig)
-    with EndRequest() as ended, recorder.open():
-        recorder.await_first(ended)
+    with EndRequest() as is_over, recorder.open():
+        recorder.await_first(is_over)
         until_s = clock.now_s() + DRY_RUN_S
-        recorder.run(lambda: ended() or clock.now_s() > until_s)
+        recorder.run(lambda: is_over() or clock.now_s() > until_s)
         figures = {name: watch.figures(clock.now_ns()) for name, watch in recorder.watches.items()}
     if as_json:
         return json.dumps({"schema_version": SCHEMA_VERSION, "streams": {n: asdict(f) for n, f in figures.items()}})
     lines = []
-    for name, found in figures.items():
-        wanted_hz = rig.streams[name].sensor.rate_hz
-        off = wanted_hz and abs(found.rate_hz / wanted_hz - 1) > RATE_OFF
-        lines.append(describe_figures(name, found) + (f"; {wanted_hz:g} Hz were expected" if off else ""))
+    for name, measured in figures.items():
+        expected_hz = rig.streams[name].sensor.rate_hz
+        off = expected_hz and abs(measured.rate_hz / expected_hz - 1) > RATE_OFF
+        lines.append(describe_figures(name, measured) + (f"; {expected_hz:g} Hz were expected" if off else ""))
     return "\n".join(lines)
 
 
 def checked_name(name: str | None) -> str:
-    """Return the name of a recording, the time now without one. Raises `UsageError` for one that names no file."""
+    """Return the name of a recording, by default the current time. Raises `UsageError` for an invalid file name."""
     from tacpipe.recording import spool_folders
 
-    found = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    if not NAME.fullmatch(found) or not spool_folders.is_name(found):
-        raise UsageError(f"--name {found!r} names no file; take letters, digits, _, - and dots, no dot in front.")
-    return found
+    recording_name = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    if not NAME.fullmatch(recording_name) or not spool_folders.is_name(recording_name):
+        raise UsageError(
+            f"--name {recording_name!r} names no file; take letters, digits, _, - and dots, no dot in front."
+        )
+    return recording_name
 
 
 def attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
-    """Return the attributes of a recording that labels and a note give. Raises `UsageError` for labels that are none."""
+    """Return labels and a note as attributes of a recording. Raises `UsageError` for malformed labels."""
     from tacpipe.datasets import labels as labels_of
 
     parsed = labels_of.parse(labels, None, include=False) if labels else {}
@@ -224,12 +226,12 @@ def _report(
 
     if as_json:
         seconds = round(time.monotonic() - began_s, 3)
-        described = [asdict(one) for one in recorded]
-        where = None if output is None else str(output)
-        rows = sum(sum(one.rows.values()) for one in recorded)
+        described = [asdict(recording) for recording in recorded]
+        output_text = None if output is None else str(output)
+        rows = sum(sum(recording.rows.values()) for recording in recorded)
         value = {
             "schema_version": SCHEMA_VERSION,
-            "output": where,
+            "output": output_text,
             "recordings": described,
             "rows": rows,
             "seconds": seconds,

@@ -1,4 +1,4 @@
-"""Addresses in the place of paths, such as ``s3://bucket/x``: refused for every argument and option of a command."""
+"""Refuse addresses, such as ``s3://bucket/x``, in all arguments and options of commands that are paths."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def refuse(program: typer.Typer) -> None:
 
 def _checked(callback: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(callback)
-    def call(*args: Any, **given: Any) -> Any:
-        for value in given.values():
+    def call(*args: Any, **options: Any) -> Any:
+        for value in options.values():
             for path in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(path, Path):
                     local(path)
-        return callback(*args, **given)
+        return callback(*args, **options)
 
     return call

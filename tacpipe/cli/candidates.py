@@ -1,4 +1,4 @@
-"""The command ``tacpipe candidates``: possible grasps on an object, and the touch that a model predicts for each."""
+"""Add the command ``tacpipe candidates``: possible grasps on an object, with the touch that a model predicts for each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacpipe.clouds.grasp import Grasp
 
 EXAMPLE = "\n\nExample: tacpipe candidates data/grasps --recording bleach-1561629162 --model models/touch"
-HEADER = "rank,score,off_deg,"  # how the CSV begins
+HEADER = "rank,score,off_deg,"  # Start of the CSV file
 PICTURES = (".pdf", ".png", ".svg")
 Row = dict[str, float]
 
@@ -65,15 +65,17 @@ def candidates(
     predict = None if model is None else _predict_grasp(model)
     from tacpipe.clouds.candidates import candidates as find
 
-    seen = _cloud(cloud, recording)
-    found = find(seen, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
-    rows = [_row(rank, candidate) for rank, candidate in enumerate(found, 1)]
+    object_cloud = _cloud(cloud, recording)
+    grasp_candidates = find(object_cloud, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
+    rows = [_row(rank, candidate) for rank, candidate in enumerate(grasp_candidates, 1)]
     if predict is not None:
-        rows = [row | predict(seen, each.grasp) for row, each in zip(rows, found, strict=True)]
+        rows = [
+            row | predict(object_cloud, candidate.grasp) for row, candidate in zip(rows, grasp_candidates, strict=True)
+        ]
     if picture is not None:
         from tacpipe.clouds.candidates import draw
 
-        draw(seen, found, picture)
+        draw(object_cloud, grasp_candidates, picture)
     if output is not None:
         _write(output, _csv(rows))
     if as_json:
@@ -102,10 +104,12 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
         return files.read(path)
     shards = pipeline.open_dataset(path).recordings
     if recording is None and len(shards) != 1:
-        raise UsageError(f"{path} has {len(shards)} recordings; pick one with --recording: {_some(list(shards))}.")
+        raise UsageError(
+            f"{path} has {len(shards)} recordings; pick one with --recording: {_name_excerpt(list(shards))}."
+        )
     name = next(iter(shards)) if recording is None else recording
     if name not in shards:
-        raise UsageError(f"{path} has no recording {name}; it has {_some(list(shards))}.")
+        raise UsageError(f"{path} has no recording {name}; it has {_name_excerpt(list(shards))}.")
     if "cloud" not in shards[name].streams:
         raise UsageError(
             f"Recording {name} of {path} has no cloud; it {describe_streams(shards[name].streams)}. Give what "
@@ -114,13 +118,15 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
     return Cloud.of(shards[name].table("cloud"))
 
 
-def _some(names: list[str]) -> str:
-    shown = ", ".join(names[:5])
-    return f"{shown} … (`tacpipe show --full` lists all {len(names)})" if len(names) > 5 else shown or "none"
+def _name_excerpt(names: list[str]) -> str:
+    first_names = ", ".join(names[:5])
+    return (
+        f"{first_names} … (`tacpipe show --full` lists all {len(names)})" if len(names) > 5 else first_names or "none"
+    )
 
 
 def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
-    """Return the function by which the model at ``path`` predicts a grasp. Raises `UsageError` if its task has none."""
+    """Return the grasp predictor of the model at ``path``. Raises `UsageError` if its task has none."""
     import tacpipe
     from tacpipe.datasets import model_files
     from tacpipe.plugins import registry
@@ -169,7 +175,7 @@ def _csv(rows: list[Row]) -> str:
 
 
 def _require_names(output: Path | None, picture: Path | None) -> None:
-    """Raise `UsageError` before anything is computed if a file's ending is none that can be written, or it is foreign."""
+    """Raise `UsageError` before anything is computed if an output has another suffix or belongs to another program."""
     if output is not None:
         if output.suffix.lower() != ".csv":
             raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
@@ -186,7 +192,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _print_table(rows: list[Row]) -> None:
-    """Print what fits a terminal: points in millimetres, of each finger the pressure and the mean of its electrodes."""
+    """Print a compact table: points in millimetres, and the pressure and mean electrode value of each finger."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""The commands other than stages: what manages datasets and the store."""
+"""Add the commands other than stages: those that manage datasets and the store."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ def _label(program: typer.Typer) -> None:
             return
         labels_from.refuse_alone(names, key, dry_run)
         assert names is not None
-        wanted = labels.parse(label or [], exclude, include=include)
-        changed = labels.change(dataset, names, wanted)
+        parsed_labels = labels.parse(label or [], exclude, include=include)
+        changed = labels.change(dataset, names, parsed_labels)
         value = {
             "schema_version": 1,
             "output": str(changed.directory),
             "recordings": changed.recordings,
-            "labels": wanted,
+            "labels": parsed_labels,
         }
         terminal.result_json(value) if as_json else terminal.result(changed.directory)
 
@@ -115,8 +115,8 @@ def _show(program: typer.Typer) -> None:
             opened = show_recording.overview(dataset, recording)
             _print(opened.to_json() if as_json else opened, show_recording.to_text, as_json=as_json, full=full)
             return
-        most = None if full or as_json else overview.SHOWN
-        _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
+        limit = None if full or as_json else overview.SHOWN
+        _print(overview.of(dataset, most=limit), overview.to_text, as_json=as_json, full=full)
 
 
 def _compare(program: typer.Typer) -> None:
@@ -128,7 +128,7 @@ def _compare(program: typer.Typer) -> None:
     )
     def compare(
         results: Annotated[list[Path], typer.Argument(help="Results of `tacpipe evaluate`.")],
-        each: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
+        unpooled: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
         as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
         as_json: AsJson = False,
     ) -> None:
@@ -137,14 +137,14 @@ def _compare(program: typer.Typer) -> None:
 
         if as_csv and as_json:
             raise UsageError("--csv and --json exclude each other. Give one of them.")
-        found = comparing.run(results, pool=not each)
+        comparison = comparing.run(results, pool=not unpooled)
         with _ends_with_its_reader():
             if as_json:
-                terminal.result_json(found.to_json())
+                terminal.result_json(comparison.to_json())
             elif as_csv:
-                terminal.result(found.to_csv())
+                terminal.result(comparison.to_csv())
             else:
-                for number, table in enumerate(found.tables()):
+                for number, table in enumerate(comparison.tables()):
                     terminal.result("") if number else None
                     terminal.show(table, on_stdout=True)
 

@@ -1,4 +1,4 @@
-"""Results of evaluations next to each other: a table a task and question, as text, JSON or CSV."""
+"""Compare results of evaluations: one table per task and question, as text, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -24,68 +24,68 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 METRICS = "metrics.json"
-_LISTED = 3  # values of a column that a cell names
-_DIGITS = 9  # as headlines are kept
+_LISTED = 3  # Largest number of values that a cell lists
+_DIGITS = 9  # Significant digits, the same as in stored headlines
 
 
 @dataclass(frozen=True)
 class Compared:
-    """Results by the paths that they were given by, and how they compare."""
+    """Results by requested path, and their comparisons."""
 
     results: Mapping[str, Dataset]
     comparisons: Sequence[Comparison]
     pooled: bool
-    places: Mapping[str, str] = field(default_factory=dict)  # where datasets lie, by the digests of their manifests
+    places: Mapping[str, str] = field(default_factory=dict)  # Paths of datasets by manifest digest
 
     def paths(self, row: engine.Row) -> list[str]:
-        """Return where the results of a row lie."""
-        places = {id(one): path for path, one in self.results.items()}
+        """Return the paths of the results of a row."""
+        places = {id(result): path for path, result in self.results.items()}
         return [places[id(run.dataset)] for run in row.method.runs]
 
     def unused(self) -> list[str]:
-        """Return the paths of results that hold nothing to compare."""
-        used = {path for one in self.comparisons for row in one.rows for path in self.paths(row)}
+        """Return the paths of results without anything to compare."""
+        used = {path for comparison in self.comparisons for row in comparison.rows for path in self.paths(row)}
         return [path for path in self.results if path not in used]
 
     def differing(self, rows: Iterable[engine.Row]) -> dict[str, list[str]]:
         """Return the columns in which rows of methods differ, by name: settings, data, and without pooling the result."""
-        every = list(rows)
-        names = dict.fromkeys(name for row in every for name in row.differing)
-        found = {name: [_text(row.differing.get(name, "")) for row in every] for name in names}
-        found["data"] = [_listed(self._data(run.dataset) for run in row.method.runs) for row in every]
+        all_rows = list(rows)
+        names = dict.fromkeys(name for row in all_rows for name in row.differing)
+        columns = {name: [_text(row.differing.get(name, "")) for row in all_rows] for name in names}
+        columns["data"] = [_listed(self._data(run.dataset) for run in row.method.runs) for row in all_rows]
         if not self.pooled:
-            found["result"] = [_below(self.paths(row)[0], list(self.results)) for row in every]
-        return {name: cells for name, cells in found.items() if len(set(cells)) > 1}
+            columns["result"] = [_below(self.paths(row)[0], list(self.results)) for row in all_rows]
+        return {name: cells for name, cells in columns.items() if len(set(cells)) > 1}
 
     def _data(self, result: Dataset) -> str:
-        """Return where the datasets lie that a result was evaluated on; the start of the digest of one that is gone."""
-        given = result.source.inputs.get("datasets", ())
-        return " ".join(self.places.get(one["manifest"], one["dataset"][:8]) for one in given)
+        """Return the paths of the datasets that a result was evaluated on; of a missing one the start of its digest."""
+        datasets = result.source.inputs.get("datasets", ())
+        return " ".join(self.places.get(dataset["manifest"], dataset["dataset"][:8]) for dataset in datasets)
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything, what is not defined as null."""
-        return {"schema_version": 1, "comparisons": [self._json(one) for one in self.comparisons]}
+        """Return all comparisons as plain values, undefined numbers as null."""
+        return {"schema_version": 1, "comparisons": [self._json(comparison) for comparison in self.comparisons]}
 
-    def _json(self, one: Comparison) -> dict[str, Any]:
+    def _json(self, comparison: Comparison) -> dict[str, Any]:
         return {
-            "task": one.task,
-            "part": one.question.part,
-            "target": one.question.target,
-            "columns": list(one.measure.columns),
-            "unit": one.measure.unit,
-            "ranked_by": one.measure.ranked_by,
-            "measure": one.measure.name,
-            "cluster": one.measure.cluster,
-            "rows": [self._row(one, row) for row in one.rows],
+            "task": comparison.task,
+            "part": comparison.question.part,
+            "target": comparison.question.target,
+            "columns": list(comparison.measure.columns),
+            "unit": comparison.measure.unit,
+            "ranked_by": comparison.measure.ranked_by,
+            "measure": comparison.measure.name,
+            "cluster": comparison.measure.cluster,
+            "rows": [self._row(comparison, row) for row in comparison.rows],
         }
 
-    def _row(self, one: Comparison, row: engine.Row) -> dict[str, Any]:
+    def _row(self, comparison: Comparison, row: engine.Row) -> dict[str, Any]:
         model = row.kind in ("model", "variant", "control") and row.predictor.startswith("model")
         return {
             "name": row.name,
             "kind": row.kind,
             "settings": dict(row.differing),
-            "errors": dict(zip(one.measure.columns, map(_number, row.values), strict=True)),
+            "errors": dict(zip(comparison.measure.columns, map(_number, row.values), strict=True)),
             "baseline": row.baseline or None,
             "gain": _number(row.gain.mean),
             "low": _number(row.gain.low),
@@ -99,17 +99,17 @@ class Compared:
         }
 
     def to_csv(self) -> str:
-        """Return a line a predictor and question; settings and errors are columns of their own."""
+        """Return one line per predictor and question; each setting and each error has its column."""
         flat = [
             {
-                **{name: one[name] for name in ("task", "part", "target", "measure")},
+                **{name: comparison[name] for name in ("task", "part", "target", "measure")},
                 **{name: value for name, value in row.items() if name not in ("settings", "errors", "results")},
                 **row["settings"],
                 **row["errors"],
                 "results": " ".join(row["results"]),
             }
-            for one in self.to_json()["comparisons"]
-            for row in one["rows"]
+            for comparison in self.to_json()["comparisons"]
+            for row in comparison["rows"]
         ]
         text = io.StringIO()
         writer = csv.DictWriter(text, list(dict.fromkeys(name for row in flat for name in row)), lineterminator="\n")
@@ -119,76 +119,86 @@ class Compared:
 
     def tables(self) -> list[Table]:
         """Return one table per task, kind of errors and unit: methods the best first, below them their best baseline."""
-        same: dict[tuple[str, ...], list[Comparison]] = {}
+        by_columns: dict[tuple[str, ...], list[Comparison]] = {}
         for comparison in self.comparisons:
             measure = comparison.measure
-            same.setdefault((comparison.task, *measure.columns, measure.name, measure.unit), []).append(comparison)
-        return [self._table(several) for several in same.values()]
+            by_columns.setdefault((comparison.task, *measure.columns, measure.name, measure.unit), []).append(
+                comparison
+            )
+        return [self._table(comparisons) for comparisons in by_columns.values()]
 
-    def _table(self, several: Sequence[Comparison]) -> Table:
-        measure = several[0].measure
-        shown = [[row for row in one.rows if _competes(row)] for one in several]
-        every = [row for rows in shown for row in rows]
-        differing, names = self.differing(every), [_first_name(row) for row in every]
-        if len(set(names)) == 1 and "result" in differing:  # each row is of the same method, and named by its result
+    def _table(self, comparisons: Sequence[Comparison]) -> Table:
+        measure = comparisons[0].measure
+        competing = [[row for row in comparison.rows if _competes(row)] for comparison in comparisons]
+        all_rows = [row for rows in competing for row in rows]
+        differing, names = self.differing(all_rows), [_first_name(row) for row in all_rows]
+        if len(set(names)) == 1 and "result" in differing:  # All rows have the same method, so results name them
             names = differing.pop("result")
-        against = [row.baseline for row in every]
-        named = len({*against}) > len(several)  # of one question, methods have other best baselines
-        pooled = any(row.runs > 1 for row in every)
+        baselines = [row.baseline for row in all_rows]
+        names_baselines = len({*baselines}) > len(comparisons)  # The best baselines differ within a question
+        pooled = any(row.runs > 1 for row in all_rows)
         heads = ["", *differing, *measure.columns, measure.name, "95 % interval"]
-        heads += [*(["vs"] if named else []), "n", *(["runs"] if pooled else [])]
-        groups, at = [], 0
-        for one, rows in zip(several, shown, strict=True):
+        heads += [*(["vs"] if names_baselines else []), "n", *(["runs"] if pooled else [])]
+        groups, index = [], 0
+        for comparison, rows in zip(comparisons, competing, strict=True):
             lines = []
             for row in rows:
-                cells = [names[at], *(cells[at] for cells in differing.values())]
+                cells = [names[index], *(cells[index] for cells in differing.values())]
                 cells += [*map(headline.number, row.values), *_gain(row, measure.name)]
-                cells += [*([row.baseline] if named else []), f"{row.n:,}", *([str(row.runs)] if pooled else [])]
+                cells += [
+                    *([row.baseline] if names_baselines else []),
+                    f"{row.n:,}",
+                    *([str(row.runs)] if pooled else []),
+                ]
                 lines.append(Row(cells, _style(row)))
-                at += 1
-            best = one.best_baseline
+                index += 1
+            best = comparison.best_baseline
             if best is not None:
                 empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
                 cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
                 lines.append(Row(cells, "dim"))
                 for reference in (
-                    row for row in one.of("baseline") if row.name == measure.reference and row is not best
+                    row for row in comparison.of("baseline") if row.name == measure.reference and row is not best
                 ):
                     cells = [reference.name, *[""] * len(differing), *map(headline.number, reference.values), *empty]
                     lines.append(Row(cells, "dim"))
-            groups.append(Group(one.question.where if len(several) > 1 or one.question.where else "", lines))
+            groups.append(
+                Group(comparison.question.where if len(comparisons) > 1 or comparison.question.where else "", lines)
+            )
         first = 1 + len(differing)
         errors = list(range(first, first + len(measure.columns)))
         spare = [*errors[1:-2], *errors[-2:-1], *errors[:1]] if len(errors) > 2 else errors[:1] * (len(errors) > 1)
-        texts = [0, *range(1, first), *([heads.index("vs")] if named else [])]
-        return Table(heads, groups, self._caption(several), spare=list(dict.fromkeys(spare)), left=texts)
+        texts = [0, *range(1, first), *([heads.index("vs")] if names_baselines else [])]
+        return Table(heads, groups, self._caption(comparisons), spare=list(dict.fromkeys(spare)), left=texts)
 
-    def _caption(self, several: Sequence[Comparison]) -> str:
-        measure = several[0].measure
-        clusters = ", ".join(dict.fromkeys(one.measure.cluster for one in several))
+    def _caption(self, comparisons: Sequence[Comparison]) -> str:
+        measure = comparisons[0].measure
+        clusters = ", ".join(dict.fromkeys(comparison.measure.cluster for comparison in comparisons))
         skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
         points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
-        least = min(row.n for one in several for row in one.rows)
-        few = f" With n below {headline.FEWEST} no interval proves a difference." if least < headline.FEWEST else ""
-        chosen = max(len(comparison.models) for comparison in several)
+        fewest = min(row.n for comparison in comparisons for row in comparison.rows)
+        few_note = (
+            f" With n below {headline.FEWEST} no interval proves a difference." if fewest < headline.FEWEST else ""
+        )
+        chosen = max(len(comparison.models) for comparison in comparisons)
         chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""
         pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
         return (
             f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
             f"jackknife over {clusters} and over seeds where there are several, method and baseline on the same ones."
-            f"{chosen_from}{few}"
+            f"{chosen_from}{few_note}"
         )
 
 
 def run(paths: Sequence[Path], *, pool: bool) -> Compared:
-    """Return the comparison of results; a warning names those that hold nothing to compare.
+    """Return the comparison of results; a warning names those without anything to compare.
 
     Raises `UsageError` for a dataset that is not a result, and where none holds anything to compare.
     """
     results = {str(path): pipeline.open_dataset(path) for path in paths}
-    for path, one in results.items():
-        if METRICS not in one.files:
-            raise UsageError(f"{path} was made by {one.source.stage}; give results of `tacpipe evaluate`.")
+    for path, result in results.items():
+        if METRICS not in result.files:
+            raise UsageError(f"{path} was made by {result.source.stage}; give results of `tacpipe evaluate`.")
     compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
     if not compared.comparisons:
         raise UsageError(
@@ -202,7 +212,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
 
 
 def _competes(row: engine.Row) -> bool:
-    """Return whether a row is of a method: what it was trained for, or a control that was trained too."""
+    """Return whether a row is of a trained method: a model, or a control that was trained too."""
     return row.kind == "model" or (row.kind == "control" and row.predictor == "model")
 
 
@@ -224,7 +234,7 @@ def _style(row: engine.Row) -> str:
 
 
 def _places(results: Sequence[Path]) -> dict[str, str]:
-    """Return where the store's datasets lie, as seen from the working directory, by the digests of their manifests."""
+    """Return the paths of the store's datasets, relative to the working directory, by manifest digest."""
     paths = {str(root["manifest"]): Path(root["path"]) for root in locate(*results).roots.all()}
     here = Path.cwd()
     return {name: str(path.relative_to(here) if path.is_relative_to(here) else path) for name, path in paths.items()}
@@ -236,16 +246,18 @@ def _below(path: str, paths: Sequence[str]) -> str:
     >>> _below("results/a/0", ["results/a/0", "results/b/0"]), _below("results/a", ["results/a"])
     ('a/0', 'results/a')
     """
-    folders = [Path(one).parent for one in paths]
+    folders = [Path(result_path).parent for result_path in paths]
     common = next(
-        one for one in (folders[0], *folders[0].parents) if all(other.is_relative_to(one) for other in folders)
+        parent
+        for parent in (folders[0], *folders[0].parents)
+        if all(folder.is_relative_to(parent) for folder in folders)
     )
     return str(Path(path).relative_to(common)) if len(paths) > 1 else path
 
 
 def _listed(values: Iterable[str]) -> str:
-    every = sorted(set(values))
-    return ", ".join(every) if len(every) <= _LISTED else f"{len(every)} datasets"
+    unique = sorted(set(values))
+    return ", ".join(unique) if len(unique) <= _LISTED else f"{len(unique)} datasets"
 
 
 def _text(value: Any) -> str:

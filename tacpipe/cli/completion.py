@@ -1,4 +1,4 @@
-"""Completion of a command line by the shell, which asks through the variables that typer's scripts set."""
+"""Read the command line that the shell completes from the variables that typer's scripts set."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import os
 import shlex
 from collections.abc import Mapping
 
-ASKED = "_TACPIPE_COMPLETE"  # set by the shell: complete_bash, complete_zsh, complete_fish or source_...
+ASKED = "_TACPIPE_COMPLETE"  # Set by the shell: complete_bash, complete_zsh, complete_fish or source_...
 
 
 def words(environment: Mapping[str, str] = os.environ) -> list[str] | None:
-    """Return the words after ``tacpipe`` of the line that the shell asks to complete; None where it asks nothing.
+    """Return the words after ``tacpipe`` of the line that the shell completes; None where it completes nothing.
 
     The word at the cursor is the last one, unless the line ends in a space.
 
@@ -23,7 +23,7 @@ def words(environment: Mapping[str, str] = os.environ) -> list[str] | None:
         return None
     line = environment.get("COMP_WORDS") or environment.get("_TYPER_COMPLETE_ARGS", "")
     try:
-        found = shlex.split(line)
-    except ValueError:  # an open quotation mark
-        found = line.split()
-    return found[1:]
+        line_words = shlex.split(line)
+    except ValueError:  # The line has an open quotation mark.
+        line_words = line.split()
+    return line_words[1:]

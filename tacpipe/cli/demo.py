@@ -1,4 +1,4 @@
-"""The main job on the simulated rig, small: the same commands that a lab would type."""
+"""Run a small version of the whole pipeline on simulated recordings, with the commands that a lab would type."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEXT = """Open the page below in a browser. What to try next:
 
 
 def run_rig(output: Path, rig_file: Path) -> Path:
-    """Emulate a rig, record it live, run the chain on that, and return the path of the report.
+    """Emulate a rig, record it live, run the chain on the recordings, and return the path of the report.
 
     Raises `TacpipeError` if a command fails.
     """
@@ -32,7 +32,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     serving = subprocess.Popen([sys.executable, "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
     try:
-        if not serving.stdout.readline():  # the path of its rig file, once all streams are served
+        if not serving.stdout.readline():  # It prints the path of its rig file once all streams are served.
             raise TacpipeError(f"The demo stopped: {rig_file} could not be emulated.")
         acquire, *chain = demo.rig(output)
         _run([acquire])
@@ -49,7 +49,7 @@ def _run(commands: list[list[str]]) -> None:
         terminal.note("$ tacpipe " + " ".join(command))
         quiet = [] if command[0] == "show" else ["--quiet"]
         process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
-        with termination.reporting(""):  # the command states it
+        with termination.reporting(""):  # The command reports interrupts itself.
             try:
                 code = process.wait()
             except KeyboardInterrupt:

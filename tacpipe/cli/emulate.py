@@ -1,4 +1,4 @@
-"""The command ``tacpipe sensors emulate``: a rig without hardware, for as long as it runs."""
+"""Add the command ``tacpipe sensors emulate``, which serves a rig without hardware while it runs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ EXAMPLE = (
     "addresses: give it to `tacpipe acquire`. FOLDER/ledger lists at the end what was sent and which bytes were changed."
     "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
 )
-MARK = b"\nsimulated = true\n"  # in the rig file of an emulated rig
-SWITCH_S = 0.0005  # that the planning thread may hold up the pacing one; Python's own 5 ms would be seen at 1 kHz
+MARK = b"\nsimulated = true\n"  # Line that marks the rig file of an emulated rig
+SWITCH_S = 0.0005  # Longest delay of the pacing thread by the planning thread; Python's 5 ms would show at 1 kHz
 
 
 def add(program: typer.Typer) -> None:
@@ -45,16 +45,16 @@ def emulate(
     from tacpipe.simulation.emulation import byte_faults
     from tacpipe.simulation.emulation.emulator import Emulator
 
-    asked, wrong, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
+    parsed_rig, parsed_faults, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
     replacing.refuse_foreign(path, MARK)
     sys.setswitchinterval(SWITCH_S)
-    with EndRequest() as ended, readable_errors(output):
-        with Emulator(asked, seed, wrong, output) as emulator:
+    with EndRequest() as is_over, readable_errors(output):
+        with Emulator(parsed_rig, seed, parsed_faults, output) as emulator:
             write_whole(str(path), rig_files.to_toml(emulator.rig).encode(), f"{path}.draft")
             terminal.result(path)
             for name, stream in emulator.rig.streams.items():
                 terminal.note(f"{name}: {stream.kind} at {stream.address}")
-            ended.wait(duration)
+            is_over.wait(duration)
         for ledger in emulator.ledger.values():
             ledger.write(output / "ledger")
     for name, ledger in emulator.ledger.items():

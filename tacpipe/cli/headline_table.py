@@ -1,4 +1,4 @@
-"""Headlines of a result, read from the store and printed: a table in colours on a terminal, in plain text elsewhere."""
+"""Read the headlines of a result from the store and print them, in colours on a terminal and else as plain text."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ EMPTY = "No recording was left to evaluate the model on: it has seen all of them
 
 
 def of_output(output: Path, file: str) -> list[Headline] | None:
-    """Return the headlines that ``file`` of the dataset at ``output`` holds, whose bytes are verified; None without it."""
-    found = manifest.find(output).manifest.files.get(file)
-    return read(locate(output).read(found["digest"])) if found else None
+    """Return the headlines in ``file`` of the dataset at ``output``, with verified bytes; None without the file."""
+    entry = manifest.find(output).manifest.files.get(file)
+    return read(locate(output).read(entry["digest"])) if entry else None
 
 
 def read(content: bytes) -> list[Headline]:
-    """Return the headlines of a file, with today's names of methods: results keep the names that they were stored with."""
-    return [replace(one, method=method(one.task, one.method)) for one in headline.read(content)]
+    """Return the headlines of a file, with the current names of methods, which may have changed since they were stored."""
+    return [replace(entry, method=method(entry.task, entry.method)) for entry in headline.read(content)]
 
 
 def method(task: object, stored: object) -> str:
@@ -38,26 +38,28 @@ def table(headlines: Sequence[Headline]) -> Table:
     first = headlines[0]
     heads = ["", *first.columns, first.measure, "95 % interval", "n"]
     groups = []
-    for one in headlines:
+    for entry in headlines:
         styles = {headline.BETTER: "green", headline.WORSE: "red"}
-        gain = [headline.signed(one.gain, one.measure) if one.best else headline.NONE, headline.bounds(one)]
-        cells = [one.method, *map(headline.number, one.model.values), gain[0], gain[1] or headline.NONE]
-        rows = [Row([*cells, f"{one.clusters:,}"], styles.get(one.verdict, ""))]
-        if one.best:
-            values = map(headline.number, one.best.values)
-            rows.append(Row([f"vs {one.best.name.replace('_', ' ')}", *values, "", _VERDICTS[one.verdict], ""], "dim"))
-            baselines = [row for row in one.table_baselines if row is not one.best]
+        gain = [headline.signed(entry.gain, entry.measure) if entry.best else headline.NONE, headline.bounds(entry)]
+        cells = [entry.method, *map(headline.number, entry.model.values), gain[0], gain[1] or headline.NONE]
+        rows = [Row([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
+        if entry.best:
+            values = map(headline.number, entry.best.values)
+            rows.append(
+                Row([f"vs {entry.best.name.replace('_', ' ')}", *values, "", _VERDICTS[entry.verdict], ""], "dim")
+            )
+            baselines = [row for row in entry.table_baselines if row is not entry.best]
             rows += [Row([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
-        groups.append(Group(one.where, rows))
-    errors = list(range(1, len(first.columns)))  # the last one ranks
+        groups.append(Group(entry.where, rows))
+    errors = list(range(1, len(first.columns)))  # Results are ranked by the last column.
     return Table(heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)])
 
 
 def caption(headlines: Sequence[Headline]) -> str:
     """Return what the columns mean, what n counts, and among how many baselines the best was found."""
-    counts = dict.fromkeys(len(one.baselines) for one in headlines if one.baselines)
+    counts = dict.fromkeys(len(entry.baselines) for entry in headlines if entry.baselines)
     best = f"vs: the best of {' or '.join(map(str, counts))} baselines. " if counts else ""
-    return f"n: {', '.join(dict.fromkeys(one.cluster for one in headlines))}. {best}{headline.caption(headlines)}"
+    return f"n: {', '.join(dict.fromkeys(entry.cluster for entry in headlines))}. {best}{headline.caption(headlines)}"
 
 
 _VERDICTS = {

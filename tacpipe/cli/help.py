@@ -51,7 +51,7 @@ PLUG_INS = "Plug-ins"
 class Command(TyperCommand):
     """A command whose help shows its options in panels: the one an option names, else that of `PANELS`."""
 
-    brief = False  # Whether to show the common options only.
+    brief = False  # True shows only the common options.
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse a command line, in which options may have the names of `OLD_NAMES` where the command has none of them."""
@@ -111,16 +111,16 @@ class Command(TyperCommand):
         optional = [param for name in panels if name not in ("Arguments", REQUIRED) for param in panels[name]]
         rows = [_brief_record(param, ctx) for param in optional]
         common = [number for name in COMMON for number, param in enumerate(optional) if param.name == name]
-        shown: set[int] = set()
+        shown_numbers: set[int] = set()
         for number in dict.fromkeys([*common, *range(len(optional))]):
             draft = type(formatter)(width=formatter.width, max_width=formatter.width)
-            draft.write_dl([rows[each] for each in sorted({*shown, number})] if rows else [])
+            draft.write_dl([rows[index] for index in sorted({*shown_numbers, number})] if rows else [])
             if (formatter.getvalue() + draft.getvalue()).count("\n") > BRIEF_LINES - 4:
                 break
-            shown.add(number)
+            shown_numbers.add(number)
         with formatter.section(OPTIONS):
-            formatter.write_dl([rows[number] for number in sorted(shown)])
-        if hidden := len(optional) - len(shown):
+            formatter.write_dl([rows[number] for number in sorted(shown_numbers)])
+        if hidden := len(optional) - len(shown_numbers):
             formatter.write(f"\n{hidden} more {'option' if hidden == 1 else 'options'}: {ctx.command_path} --help\n")
 
 
@@ -171,8 +171,8 @@ def _panel(param: Any) -> str:
     """Return the panel in which a parameter is shown."""
     if param.param_type_name == "argument":
         return "Arguments"
-    named = getattr(param, "rich_help_panel", None)
-    return str(named or (REQUIRED if param.required else PANELS.get(str(param.name), OPTIONS)))
+    panel = getattr(param, "rich_help_panel", None)
+    return str(panel or (REQUIRED if param.required else PANELS.get(str(param.name), OPTIONS)))
 
 
 def _argument_name(param: Any) -> str:
@@ -185,9 +185,9 @@ def _metavar(param: Any, ctx: Any) -> str:
     """Return the placeholder of an option's value: its choices, or its type."""
     if param.metavar:
         return str(param.metavar)
-    written = param.get_help_record(ctx)[0].split(" ", maxsplit=2 if len(param.opts) > 1 else 1)[-1]
-    kind = re.sub(r"<(?:list\[)?([\w ]+)\]?>", r"\1", written)
-    return TYPES.get(kind.lower(), "TEXT") if kind != written or kind.isupper() else kind
+    placeholder = param.get_help_record(ctx)[0].split(" ", maxsplit=2 if len(param.opts) > 1 else 1)[-1]
+    kind = re.sub(r"<(?:list\[)?([\w ]+)\]?>", r"\1", placeholder)
+    return TYPES.get(kind.lower(), "TEXT") if kind != placeholder or kind.isupper() else kind
 
 
 def _record(param: Any, ctx: Any) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""`tacpipe label DATASET --from TABLE`: the labels of many recordings, from a table."""
+"""`tacpipe label DATASET --from TABLE`: set the labels of many recordings from a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.printable import excerpt, listed, plain
 
-SHOWN = 20  # recordings whose changes are printed
+SHOWN = 20  # Largest number of recordings whose changes are printed
 
 
 def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclude: str | None, include: bool) -> None:
@@ -36,37 +36,39 @@ def run(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) ->
 
     table: list[LabelTable] = []
 
-    def wanted(known: labels.ByRecording) -> labels.ByRecording:
-        table.append(read_label_table(path, key, known))
-        return table[-1].by_recording(known)
+    def labels_for(current_labels: labels.ByRecording) -> labels.ByRecording:
+        table.append(read_label_table(path, key, current_labels))
+        return table[-1].by_recording(current_labels)
 
-    now, changes = labels.planned(dataset, wanted)
-    without = sorted(set(now) - set(table[-1].by_recording(now)))
-    value: dict[str, Any] = {"schema_version": 1, "output": str(dataset), "key": table[-1].key, "without": without}
+    current, changes = labels.planned(dataset, labels_for)
+    unmatched = sorted(set(current) - set(table[-1].by_recording(current)))
+    value: dict[str, Any] = {"schema_version": 1, "output": str(dataset), "key": table[-1].key, "without": unmatched}
     if dry_run:
         value |= {"recordings": sorted(changes), "labels": changes}
-        terminal.result_json(value) if as_json else terminal.result(_described(now, changes, len(now), without))
+        terminal.result_json(value) if as_json else terminal.result(
+            _described(current, changes, len(current), unmatched)
+        )
         return
-    changed = labels.change_each(dataset, wanted) if changes else None
+    changed = labels.change_each(dataset, labels_for) if changes else None
     value |= {"recordings": [] if changed is None else changed.recordings, "labels": changes}
-    if without:
-        terminal.note(f"tacpipe: {path} has no row for {len(without)} recordings: {listed(without)}.")
+    if unmatched:
+        terminal.note(f"tacpipe: {path} has no row for {len(unmatched)} recordings: {listed(unmatched)}.")
     if as_json:
         terminal.result_json(value)
         return
-    terminal.note(f"{len(changes)} of {len(now)} recordings changed")
+    terminal.note(f"{len(changes)} of {len(current)} recordings changed")
     terminal.result(dataset if changed is None else changed.directory)
 
 
-def _described(now: Mapping[str, Any], changes: Mapping[str, Any], count: int, without: Sequence[str]) -> str:
-    """Return one line a recording whose labels would change, and how many would."""
+def _described(current: Mapping[str, Any], changes: Mapping[str, Any], count: int, unmatched: Sequence[str]) -> str:
+    """Return one line per recording whose labels would change, then their number."""
     lines = [
         f"{plain(name)}: "
-        + ", ".join(f"{plain(key)} {_shown(now[name].get(key))} → {_shown(value)}" for key, value in labels.items())
+        + ", ".join(f"{plain(key)} {_shown(current[name].get(key))} → {_shown(value)}" for key, value in labels.items())
         for name, labels in sorted(changes.items())[:SHOWN]
     ]
     lines += [f"… and {len(changes) - SHOWN} more"] if len(changes) > SHOWN else []
-    lines += [f"no row for {listed(without)}"] if without else []
+    lines += [f"no row for {listed(unmatched)}"] if unmatched else []
     return "\n".join([*lines, f"{len(changes)} of {count} recordings would change"])
 
 

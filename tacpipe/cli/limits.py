@@ -1,4 +1,4 @@
-"""The command ``tacpipe limits``: what limits the prediction of touch on some grasps, and what more of them are worth."""
+"""Add the command ``tacpipe limits``, which measures limits of touch prediction and the value of more grasps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ABOUT = (
     "of the other finger were given. Skill is 1 - RMSE / RMSE of the constant. Takes minutes."
 )
 EXAMPLE = "\n\nExample: tacpipe limits data/grasps -o results/limits.json"
-HEADER = '{"schema_version": 1, "limits"'  # how the file begins
+HEADER = '{"schema_version": 1, "limits"'  # Start of the file
 TARGETS = ("pdc_th", "pdc_mf", "e_th", "e_mf")
 
 
@@ -46,7 +46,7 @@ def limits(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print what limits the prediction of touch on grasps."""
-    asked = _sizes(sizes)
+    training_sizes = _sizes(sizes)
     if output is not None:
         replacing.refuse_foreign(output, HEADER.encode())
     from tacpipe.engine import pipeline
@@ -55,18 +55,18 @@ def limits(
     from tacpipe.tasks.touch import limits as limits_of
 
     dataset = pipeline.open_dataset(grasps)
-    with progress.bar("limits", limits_of.steps(asked, draws)) as advance:
-        found = limits_of.limits(
-            grasps_of.read(dataset), sizes=asked, draws=draws, trees=trees, seed=seed, advance=advance
+    with progress.bar("limits", limits_of.steps(training_sizes, draws)) as advance:
+        measured = limits_of.limits(
+            grasps_of.read(dataset), sizes=training_sizes, draws=draws, trees=trees, seed=seed, advance=advance
         )
-    value = {"schema_version": 1, "limits": found.to_json()}
+    value = {"schema_version": 1, "limits": measured.to_json()}
     if output is not None:
         _write(output, json.dumps(value) + "\n")
-    terminal.result_json(value) if as_json else terminal.result(text(found))
+    terminal.result_json(value) if as_json else terminal.result(text(measured))
 
 
 def text(found: Limits) -> str:
-    """Return what was found as three tables of text."""
+    """Return the limits as three tables of text."""
     grasps = sum(found.counts.values())
     lines = [
         f"{grasps} grasps of {len(found.counts)} objects",
@@ -76,25 +76,26 @@ def text(found: Limits) -> str:
     rows = [
         [
             _bounds(low, high),
-            str(max(estimates.pairs for estimates in by.values())),
-            *(_cell(by[name].pair_skill) for name in TARGETS),
+            str(max(estimates.pairs for estimates in by_target.values())),
+            *(_cell(by_target[name].pair_skill) for name in TARGETS),
         ]
-        for low, high, by in found.near
+        for low, high, by_target in found.near
     ]
     lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
     lines += ["", "pairs of grasps: likeness of readings within an object"]
     rows = [
         [
             _bounds(low, high),
-            str(max(one.pairs for one in by.values())),
-            *(_cell(by[name].likeness) for name in TARGETS),
+            str(max(estimates.pairs for estimates in by_target.values())),
+            *(_cell(by_target[name].likeness) for name in TARGETS),
         ]
-        for low, high, by in found.near
+        for low, high, by_target in found.near
     ]
     lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
     lines += ["", "learning curve: skill on known objects"]
     rows = [
-        [str(one.grasps), f"{one.trained:.0f}", *(_cell(one.skill[name]) for name in TARGETS)] for one in found.curve
+        [str(point.grasps), f"{point.trained:.0f}", *(_cell(point.skill[name]) for name in TARGETS)]
+        for point in found.curve
     ]
     rows.append(["other finger given", "", *(_cell(found.other_finger[name]) for name in TARGETS)])
     lines += _table(["grasps an object", "trained on", *TARGETS], rows)
@@ -114,14 +115,14 @@ def _write(path: Path, content: str) -> None:
         write_whole(str(path), content.encode(), f"{path}.draft")
 
 
-def _sizes(given: str) -> list[int]:
+def _sizes(option_text: str) -> list[int]:
     try:
-        found = [int(one) for one in given.split(",")]
+        sizes = [int(size) for size in option_text.split(",")]
     except ValueError:
-        found = []
-    if not found or min(found) < 1:
-        raise UsageError(f"--sizes is {given!r}; it must be whole numbers from 1, with commas between, as 2,4,8.")
-    return sorted(set(found))
+        sizes = []
+    if not sizes or min(sizes) < 1:
+        raise UsageError(f"--sizes is {option_text!r}; it must be whole numbers from 1, with commas between, as 2,4,8.")
+    return sorted(set(sizes))
 
 
 def _bounds(low: float, high: float) -> str:
@@ -140,7 +141,7 @@ def _fixed(value: float) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    widths = [max(len(str(row[at])) for row in [heads, *rows]) for at in range(len(heads))]
+    widths = [max(len(str(row[column])) for row in [heads, *rows]) for column in range(len(heads))]
     return [
         "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in [heads, *rows]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.recording.recorder import Recorder
 
 SCHEMA_VERSION = 1
-REPEATED = ("publish",)  # settings whose option is given once for each item
+REPEATED = ("publish",)  # Settings whose option can be repeated, once per item
 HELP = """
 
 What the table [live] of the rig file states need not be given; options of the command win.
@@ -75,7 +75,7 @@ def add(program: typer.Typer, summary: str) -> None:
     ]
     complete = signature.replace(parameters=[*fixed, *_options()])
     function: Any = live
-    function.__signature__ = complete  # read by typer, as the annotations are
+    function.__signature__ = complete  # Typer reads the signature and the annotations.
     function.__annotations__ = {name: parameter.annotation for name, parameter in complete.parameters.items()}
     program.command("live", help=summary + HELP)(live)
 
@@ -209,7 +209,7 @@ def _report(
         terminal.result_json({**value, **error})
     elif output is not None:
         terminal.result(output)
-    if failed is not None and as_json:  # the object on stdout holds the error already
+    if failed is not None and as_json:  # The JSON object on stdout has the error already.
         terminal.note(f"tacpipe: {failed}")
         raise typer.Exit(failed.exit_code)
     if failed is not None:

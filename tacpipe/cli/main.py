@@ -1,4 +1,4 @@
-"""The command line: one command a registered stage, and those that manage datasets and the store.
+"""Run the command line: one command per registered stage, and those that manage datasets and the store.
 
 Only the requested command is built, and only its module imported: ``tacpipe --help``, shell completion and a hit must not
 wait for torch, pyarrow, pandas, scikit-learn or open3d. A command is built after the signal handlers are installed.
@@ -32,7 +32,7 @@ Exit codes: 0 done, 1 to 6 and 130 as in docs/reference/exit-codes.md.
 
 
 WIDEST = 1_000  # Columns of help: the terminal's, up to this.
-ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # abbreviations that help and completion do not list
+ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # Abbreviations that help and completion do not list
 
 
 def app(arguments: Sequence[str]) -> typer.Typer:
@@ -82,9 +82,9 @@ def main() -> None:
         memory.guard()
         termination.install_handlers()
         code = _printed(answer(sys.argv[1:]))
-    except KeyboardInterrupt:  # as it began, or after it was done
+    except KeyboardInterrupt:  # Interrupted before the command began or after it ended
         termination.report()
-    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be distinguished
+    except (MemoryError, RuntimeError) as error:  # Raised before a command was chosen, or outside every command
         short = memory.shortage(error)
         if short is None:
             raise
@@ -94,7 +94,7 @@ def main() -> None:
 
 
 def _printed(code: int) -> int:
-    """Return the exit code of a command once what it printed is written; one whose result could not be has failed."""
+    """Return the exit code of a command after its output is flushed; `FAILED` if its result could not be written."""
     failure = terminal.unprinted()
     if failure is None or code != DONE:
         return code
@@ -119,14 +119,14 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = INTERRUPTED, ""
     except BrokenPipeError:
         return DONE
-    except OSError as error:  # of a disk or of permissions, where nobody closer by could state more
+    except OSError as error:  # An error of a disk or of permissions that no inner code could explain better
         code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:
-        found = str(memory.shortage(error) or "") or failures.text(error)
-        if found is None and not termination.requested():
+        explanation = str(memory.shortage(error) or "") or failures.text(error)
+        if explanation is None and not termination.requested():
             raise
-        code, sentence = FAILED, str(found)
+        code, sentence = FAILED, str(explanation)
         _complain(sentence)
     if code == INTERRUPTED or (code != DONE and termination.requested()):
         termination.report()
@@ -142,13 +142,13 @@ def _complain(sentence: str) -> None:
 
 
 def _call(arguments: Sequence[str]) -> tuple[int, str]:
-    """Return the exit code of a command line, and what was wrong with how it is written."""
+    """Return the exit code of a command line, and the message for a malformed one."""
     import typer
 
     from tacpipe.cli import help as plain_help
 
     arguments = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
-    program = app(arguments if (asked := completion.words()) is None else asked)
+    program = app(arguments if (completed_words := completion.words()) is None else completed_words)
     addresses.refuse(program)
     plain_help.apply(program, brief="-h" in arguments)
     try:
@@ -165,7 +165,7 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _misuse() -> type[Any]:
-    """Return what click raises for a command line that it cannot read; typer may bring a click of its own."""
+    """Return the exception that click raises for a malformed command line; typer may bundle its own click."""
     import typer
 
     return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")

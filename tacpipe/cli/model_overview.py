@@ -1,4 +1,4 @@
-"""What a model is and what a result states: read from JSON and the headers of weights, so that nothing heavy is imported."""
+"""Describe models and results from their JSON files and weight headers, without heavy imports."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tacpipe.store.store import Store
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
-FILES = 5  # of a result that has many, before the rest is counted
-SHOWN = 8  # entries of a list, or of a nested mapping: longer ones are counted
+FILES = 5  # Files of a result that are listed before the remaining ones are counted
+SHOWN = 8  # Longest list or nested mapping that is shown; longer ones are counted
 _APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
 _ROLES = ("train", "val", "test")
 
@@ -37,7 +37,7 @@ def is_result(opened: Dataset) -> bool:
 
 
 def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
-    """Return what a person asks of a model: task, architecture, what it was trained on and how, and its validation."""
+    """Return the overview of a model: task, architecture, training data, params and validation."""
     config, history = _tree(opened, CONFIG), _history(opened)
     return {
         **_learned(config),
@@ -51,16 +51,18 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
 
 
 def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
-    """Return what a person asks of a result: how the model compares with its baselines, on how much, and of which role."""
+    """Return the overview of a result: the model against its baselines, the evaluated data and their role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
     identity = identities.of_manifests(store).get(found.digest, {})
     return {
         **_architecture(config),
-        "headline": None if headlines is None else [one.to_json() for one in headlines],
-        "baselines": list(dict.fromkeys(row.name for one in headlines or () for row in one.baselines)),
+        "headline": None if headlines is None else [entry.to_json() for entry in headlines],
+        "baselines": list(dict.fromkeys(row.name for entry in headlines or () for row in entry.baselines)),
         "evaluated_on": metrics.get("counts", {}),
-        "by_part": {name: one["counts"] for name, one in metrics.items() if isinstance(one, dict) and "counts" in one},
+        "by_part": {
+            name: part["counts"] for name, part in metrics.items() if isinstance(part, dict) and "counts" in part
+        },
         "fold": identity.get("fold"),
         "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
         "trained_on": _learned(config)["trained_on"],
@@ -70,7 +72,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
 
 
 def model_text(value: Mapping[str, Any]) -> list[str]:
-    """Return the lines that `of_model` is shown as: what it is and how well it did, params, then where it comes from."""
+    """Return the overview of `of_model` as lines: kind and validation, params, then inputs."""
     described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
@@ -81,13 +83,13 @@ def model_text(value: Mapping[str, Any]) -> list[str]:
         *value["about"].items(),
         ("params", flat(value["params"])),
         ("behind", ", then ".join(value["chain"]) or None),
-        *_from(value["inputs"]),
+        *_input_rows(value["inputs"]),
     ]
     return [_summary(value), "", *_aligned(described)]
 
 
 def _summary(value: Mapping[str, Any]) -> str:
-    """Return architecture, task, epochs and the best of them in a line."""
+    """Return architecture, task, epochs and the best epoch on one line."""
     parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
     if value["epochs"]:
         parts.append(headline.counted(value["epochs"], "epochs"))
@@ -97,13 +99,13 @@ def _summary(value: Mapping[str, Any]) -> str:
 
 
 def result_text(value: Mapping[str, Any]) -> list[str]:
-    """Return the lines that `of_result` is shown as: the headline table first."""
+    """Return the overview of `of_result` as lines, the headline table first."""
     if value["headline"] is None:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
     else:
-        found = [headline.Headline.from_json(one) for one in value["headline"]]
-        lines = headline_table.text(found, terminal.width_of(sys.stdout)).splitlines()
-    parts = {name: flat(one) for name, one in value["by_part"].items()}
+        headlines = [headline.Headline.from_json(entry) for entry in value["headline"]]
+        lines = headline_table.text(headlines, terminal.width_of(sys.stdout)).splitlines()
+    parts = {name: flat(counts) for name, counts in value["by_part"].items()}
     fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
     described = [
         ("task", value["task"]),
@@ -114,7 +116,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         ("baselines", ", ".join(value["baselines"]) or None),
         ("params", flat(value["params"]) if value["params"] else None),
         *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
-        *_from(value["inputs"]),
+        *_input_rows(value["inputs"]),
     ]
     return [*lines, "", *_aligned(described)]
 
@@ -130,8 +132,8 @@ def flat(value: Any) -> str:
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     if isinstance(value, Mapping):
-        for key, one in value.items():
-            yield from _leaves(one, f"{name} {key}".strip().replace("_", " "))
+        for key, item in value.items():
+            yield from _leaves(item, f"{name} {key}".strip().replace("_", " "))
     elif isinstance(value, list):
         if len(value) > SHOWN:
             yield name, f"{len(value)} values"
@@ -150,32 +152,33 @@ def _architecture(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return task, architecture, what was trained on, and what else a configuration states in few words."""
+    """Return the task, architecture, training data and other short entries of a configuration."""
     trained = config.get("trained_on")
     return {
         **_architecture(config),
         "trained_on": {
-            "recordings": len(trained) if isinstance(trained, Mapping) else None,  # of all roles that training read
-            "roles": {role: one for role, one in config.get("counts", {}).items() if role in _ROLES},
+            # Recordings of all roles that training read
+            "recordings": len(trained) if isinstance(trained, Mapping) else None,
+            "roles": {role: count for role, count in config.get("counts", {}).items() if role in _ROLES},
         },
         "about": {
             name.replace("_", " "): described
-            for name, one in config.items()
-            if name not in _APART and (described := _short(one)) is not None
+            for name, entry in config.items()
+            if name not in _APART and (described := _short(entry)) is not None
         },
     }
 
 
 def _short(value: Any) -> str | None:
-    """Return an entry of a configuration in few words; None for one that is empty, or large and states nothing so."""
+    """Return an entry of a configuration as short text; None for an empty or large entry."""
     if isinstance(value, Mapping):
-        if all(not isinstance(one, Mapping | list) for one in value.values()) and len(value) <= SHOWN:
+        if all(not isinstance(item, Mapping | list) for item in value.values()) and len(value) <= SHOWN:
             return flat(value) if value else None
-        if all(isinstance(one, Mapping) for one in value.values()) and len(value) <= SHOWN:
+        if all(isinstance(item, Mapping) for item in value.values()) and len(value) <= SHOWN:
             return ", ".join(value)
         return None
     if isinstance(value, list):
-        if not value or not all(isinstance(one, str | int) for one in value):
+        if not value or not all(isinstance(item, str | int) for item in value):
             return None
         names = list(dict.fromkeys(map(str, value)))
         return ", ".join(names) if len(names) <= SHOWN else f"{', '.join(names[:SHOWN])} … ({len(names)})"
@@ -183,23 +186,30 @@ def _short(value: Any) -> str | None:
 
 
 def _trained(trained: Mapping[str, Any]) -> list[str]:
-    lines = [f"{role}: {flat(one) if isinstance(one, Mapping) else one}" for role, one in trained["roles"].items()]
+    lines = [
+        f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
+        for role, counts in trained["roles"].items()
+    ]
     count = trained["recordings"]
     return [*lines, *([headline.counted(count, "recordings") + " of training and validation"] if count else [])]
 
 
-def _from(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _input_rows(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
-        (name if not at else "", described) for name, several in inputs.items() for at, described in enumerate(several)
+        (name if not at else "", described)
+        for name, descriptions in inputs.items()
+        for at, described in enumerate(descriptions)
     ]
 
 
 def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
-    """Return where each input lies now, as far as the store knows, and its digest."""
+    """Return the path of each input, if the store knows it, and its digest."""
     places = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
     return {
-        name: [f"{places.get(one['manifest'], 'in no known location')} [{one['dataset'][:12]}]" for one in several]
-        for name, several in inputs.items()
+        name: [
+            f"{places.get(entry['manifest'], 'in no known location')} [{entry['dataset'][:12]}]" for entry in entries
+        ]
+        for name, entries in inputs.items()
     }
 
 
@@ -207,10 +217,10 @@ def _tree(opened: Dataset, name: str) -> dict[str, Any]:
     if name not in opened.files:
         return {}
     try:
-        found = json.loads(opened.files[name])
+        tree = json.loads(opened.files[name])
     except ValueError:
         raise TacpipeError(f"{name} is not JSON. Run the stage that made it again.") from None
-    return found if isinstance(found, dict) else {}
+    return tree if isinstance(tree, dict) else {}
 
 
 def _history(opened: Dataset) -> list[dict[str, Any]]:
@@ -233,12 +243,12 @@ def _parameters(opened: Dataset) -> int | None:
             content = opened.files[name]
             size = int.from_bytes(content[:8], "little")
             header = json.loads(content[8 : 8 + size])
-            count += sum(math.prod(one["shape"]) for key, one in header.items() if key != "__metadata__")
+            count += sum(math.prod(tensor["shape"]) for key, tensor in header.items() if key != "__metadata__")
     return count or None
 
 
 def _aligned(described: list[tuple[str, Any]]) -> list[str]:
-    """Return names and values in two columns, long values on several lines; what is None is left out."""
+    """Return names and values in two columns, long values on several lines; values that are None are left out."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0) + 2
     room = max(terminal.width_of(sys.stdout) - width, 20)
@@ -253,13 +263,13 @@ def _wrapped(text: str, width: int) -> list[str]:
     >>> _wrapped("epochs 2, learning rate 0.002, seed 0", 20)
     ['epochs 2,', 'learning rate 0.002,', 'seed 0']
     """
-    kept = text.replace(" ", "\0").replace(",\0", ", ")
-    lines = textwrap.wrap(kept, width, break_long_words=False, break_on_hyphens=False)
+    unbroken = text.replace(" ", "\0").replace(",\0", ", ")
+    lines = textwrap.wrap(unbroken, width, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\0", " ") for line in lines]
 
 
 def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
-    """Return names and sizes of files; of many how many there are with the first ones, unless all are wanted (``full``).
+    """Return names and sizes of files; of many files the count and the first ones, unless ``full``.
 
     >>> files_text({"config.json": 15696, "history.jsonl": 188})
     ['files  config.json 15.7 kB, history.jsonl 188 bytes']

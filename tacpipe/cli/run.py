@@ -1,7 +1,7 @@
-"""`tacpipe run`: the stages of a ``dvc.yaml``, each after those that it depends on.
+"""`tacpipe run`: run the stages of a ``dvc.yaml``, each after those that it depends on.
 
-What is there already is found in this process, stage after stage. What has something to do runs as a process of its own, as
-it would from a shell: it computes, warns and ends in the same way, and leaves nothing behind in this one.
+This process looks up stored results, stage after stage. A stage that has something to do runs in a separate process, as it
+would from a shell: it computes, warns and ends in the same way, and changes nothing in this process.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from tacpipe.plugins import registry
 if TYPE_CHECKING:
     from tacpipe.cli.stage_processes import StageProcesses
 
-PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # without -P modules would be found in the folder of the chain
-_SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # what a shell does more with than splitting words
+PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # Option -P keeps the folder of the chain off the module path.
+_SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # Syntax that needs a shell
 _PATTERN = re.compile(r"[*?\[]")
 _QUOTES = re.compile(r"[\"']")
 
 
 class Became(Enum):
-    """What became of a stage."""
+    """Outcome of a stage."""
 
     UNCHANGED = "unchanged"
     RAN = "ran"
@@ -81,9 +81,9 @@ def _run(chain: Chain, *, quiet: bool) -> int:
     became: dict[str, Became] = {}
     first = DONE
     for stage in chain.stages:
-        found = _without_running(stage, chain, became)
-        if found is not None:
-            became[stage.name] = found
+        outcome = _without_running(stage, chain, became)
+        if outcome is not None:
+            became[stage.name] = outcome
             continue
         if not quiet:
             terminal.note(f"{stage.name}:")
@@ -98,7 +98,7 @@ def _run(chain: Chain, *, quiet: bool) -> int:
 
 
 def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
-    """Return what became of a stage that is not to be run: one of which another failed, or a frozen one."""
+    """Return the outcome of a stage that must not run: a dependency failed, or the stage is frozen; else None."""
     missing = sorted(name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED))
     if missing:
         terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
@@ -109,44 +109,44 @@ def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Becam
 def _summary(became: Mapping[str, Became], *, quiet: bool) -> None:
     progress.set_quiet(quiet)
     if not quiet:
-        counts = {kind: sum(one is kind for one in became.values()) for kind in Became}
+        counts = {kind: sum(outcome is kind for outcome in became.values()) for kind in Became}
         terminal.note(", ".join(f"{count} {kind.value}" for kind, count in counts.items() if count))
 
 
 class _Together:
-    """The stages of a chain, several of them at work: each begins when all that it depends on are done."""
+    """Runs stages of a chain at the same time; each begins when all that it depends on are done."""
 
     def __init__(self, chain: Chain, processes: StageProcesses, *, quiet: bool) -> None:
         self._chain, self._processes, self._quiet = chain, processes, quiet
         self._waiting = list(chain.stages)
-        self._at_work: dict[str, tuple[ChainStage, list[str]]] = {}  # with the commands that follow
+        self._at_work: dict[str, tuple[ChainStage, list[str]]] = {}  # Running stages with their remaining commands
         self.became: dict[str, Became] = {}
-        self.first = DONE  # exit code that is not 0
+        self.first = DONE  # First exit code that is not 0
 
     def run(self) -> None:
         """Run all stages."""
         while self._waiting or self._processes.busy:
             while self._processes.free and (stage := self._ready()) is not None:
                 self._waiting.remove(stage)
-                found = _without_running(stage, self._chain, self.became)
-                if found is None:
+                outcome = _without_running(stage, self._chain, self.became)
+                if outcome is None:
                     self._announce(f"{stage.name}:")
                     self._advance(stage, list(stage.commands), Became.UNCHANGED)
                 else:
-                    self.became[stage.name] = found
+                    self.became[stage.name] = outcome
             if self._processes.busy:
                 self._end(*self._processes.next(before=self._announce))
 
     def _ready(self) -> ChainStage | None:
-        """Return the next stage of which everything that it depends on is done."""
+        """Return the next stage whose dependencies are done."""
         return next(self._ready_stages(), None)
 
     def _ready_stages(self) -> Iterator[ChainStage]:
-        done = self.became.keys()
-        return (stage for stage in self._waiting if self._chain.after[stage.name] <= done)
+        finished = self.became.keys()
+        return (stage for stage in self._waiting if self._chain.after[stage.name] <= finished)
 
     def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
-        """Go through the commands of a stage up to the first that has something to do, and start that one."""
+        """Start the first remaining command of a stage that has something to do."""
         while commands:
             command = commands.pop(0)
             words = _words(command)
@@ -154,8 +154,8 @@ class _Together:
                 continue
             self._announce(f"{stage.name} begins: {command}")
             self._at_work[stage.name] = stage, commands
-            together = min(self._processes.jobs, len(self._at_work) + sum(1 for _ in self._ready_stages()))
-            self._processes.start(stage.name, command if words is None else words[1:], together)
+            concurrent_count = min(self._processes.jobs, len(self._at_work) + sum(1 for _ in self._ready_stages()))
+            self._processes.start(stage.name, command if words is None else words[1:], concurrent_count)
             return
         self.became[stage.name] = became
 
@@ -185,14 +185,14 @@ def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
         termination.reporting(""),
         stage_processes.StageProcesses(jobs, Path(folder), modules) as processes,
     ):
-        together = _Together(chain, processes, quiet=quiet)
-        together.run()
-    _summary(together.became, quiet=quiet)
-    return together.first
+        scheduler = _Together(chain, processes, quiet=quiet)
+        scheduler.run()
+    _summary(scheduler.became, quiet=quiet)
+    return scheduler.first
 
 
 def _stage(stage: ChainStage) -> tuple[Became, int]:
-    """Run the commands of a stage until one fails; return what became of it, and the exit code."""
+    """Run the commands of a stage until one fails; return the outcome of the stage and the exit code."""
     became = Became.UNCHANGED
     for command in stage.commands:
         words = _words(command)
@@ -206,28 +206,28 @@ def _stage(stage: ChainStage) -> tuple[Became, int]:
 
 
 def _words(command: str) -> list[str] | None:
-    """Return the words of a command of tacpipe, its patterns expanded as a shell does; None for what only a shell reads."""
+    """Return the words of a command of tacpipe, with patterns expanded as by a shell; None if it needs a shell."""
     if _SHELL.search(command):
         return None
     try:
         words, raw = shlex.split(command), shlex.split(command, posix=False)
-    except ValueError:  # a quotation that does not end
+    except ValueError:  # The command has an open quotation mark.
         return None
     if not words or words[0] != "tacpipe" or len(words) != len(raw):
         return None
-    found = []
-    for word, written in zip(words, raw, strict=True):
-        quoted = _QUOTES.search(written) is not None
+    expanded = []
+    for word, raw_word in zip(words, raw, strict=True):
+        quoted = _QUOTES.search(raw_word) is not None
         if quoted and _PATTERN.search(word):
-            return None  # of which some letters may be meant as they are
-        found += (sorted(glob.glob(word)) or [word]) if _PATTERN.search(word) else [word]  # noqa: PTH207  (as it is written)
-    return found
+            return None  # A quoted pattern may be literal.
+        expanded += (sorted(glob.glob(word)) or [word]) if _PATTERN.search(word) else [word]  # noqa: PTH207  (as it is written)
+    return expanded
 
 
 def _answered(arguments: Sequence[str]) -> bool:
-    """Return whether a command had nothing to do; it has reported so then, as it does by itself.
+    """Return whether a command had nothing to do, in which case it has printed its report.
 
-    Whatever else became of it is for its own process to report.
+    Every other outcome is reported by the process of the command.
     """
     groups = {name.partition(".")[0] for name in registry.stages()}
     if not arguments or arguments[0] not in groups:
@@ -245,7 +245,7 @@ def _answered(arguments: Sequence[str]) -> bool:
 
 
 def _process(command: str | list[str]) -> int:
-    """Run a command, by the shell where it is a text, and return its exit code; an interrupt is the command's to report."""
+    """Run a command, by the shell where it is a text, and return its exit code; the command reports interrupts."""
     sys.stdout.flush()
     shell = isinstance(command, str)
     with termination.reporting(""):
@@ -254,7 +254,7 @@ def _process(command: str | list[str]) -> int:
             code = process.wait()
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGINT)  # a terminal has sent it already, a scheduler has not
+                process.send_signal(signal.SIGINT)  # A terminal has sent the signal already, a scheduler has not.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(termination.GRACE_S)
             raise

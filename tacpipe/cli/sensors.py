@@ -1,4 +1,4 @@
-"""The commands of ``tacpipe sensors``."""
+"""Add the commands of ``tacpipe sensors``."""
 
 from __future__ import annotations
 
@@ -69,16 +69,16 @@ def probe(
     """
     from tacpipe.links import probing
 
-    found = [(_address(port), _usb_id(port))] if port else list(probing.list_addresses())
+    ports = [(_address(port), _usb_id(port))] if port else list(probing.list_addresses())
     reports = []
-    for address, usb_id in found:
-        unasked = passive or (port is None and not usb_id)  # a machine's own port may lead anywhere, a console even
-        reports.append(probing.probe(address, usb_id, passive=unasked, progress=_report))
+    for address, usb_id in ports:
+        listen_only = passive or (port is None and not usb_id)  # An internal port may be a console.
+        reports.append(probing.probe(address, usb_id, passive=listen_only, progress=_report))
         if not as_json:
             terminal.result(_text(reports[-1]))
     if as_json:
         terminal.result_json({"schema_version": SCHEMA_VERSION, "ports": [_json(report) for report in reports]})
-    elif not found:
+    elif not ports:
         terminal.result("No serial port and no HID device is present. Plug one in, or name an address.")
     if not any(report.findings for report in reports):
         raise typer.Exit(DEVICE)
@@ -87,7 +87,7 @@ def probe(
 def _row(name: str) -> dict[str, Any]:
     try:
         kind = registry.load_sensor(name)
-    except TacpipeError as error:  # a plug-in's, which must not hide the others
+    except TacpipeError as error:  # An error of one plug-in must not hide the other sensors.
         return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error), "exclusive": ""}
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     described = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
@@ -121,7 +121,9 @@ def _usb_id(port: str) -> str:
 
     if not port.startswith(("/", "serial:")):
         return ""
-    return next((there.usb_id for there in ports.serial_ports() if there.address == str(_address(port))), "")
+    return next(
+        (serial_port.usb_id for serial_port in ports.serial_ports() if serial_port.address == str(_address(port))), ""
+    )
 
 
 def _report(step: str) -> None:
@@ -137,16 +139,16 @@ def _text(report: Report) -> str:
     if not report.findings:
         described = f"{report.address}: {report.heard:,} bytes came that match no driver"
         return f"{described}; describe the sensor with `generic`, or with `lines` if it sends text."
-    first, *others = report.findings
-    at = f" at {report.baud:,} baud" if report.baud else ""
-    when = " once asked" if report.requested else ""
-    lines = [f"{report.address} speaks {first}{at}{when}."]
-    lines += [f"    or {other}" for other in others]
+    first, *alternatives = report.findings
+    baud_text = f" at {report.baud:,} baud" if report.baud else ""
+    request_text = " once asked" if report.requested else ""
+    lines = [f"{report.address} speaks {first}{baud_text}{request_text}."]
+    lines += [f"    or {alternative}" for alternative in alternatives]
     return "\n".join([*lines, *(f"    {line}" for line in _stanza(report))])
 
 
 def _stanza(report: Report) -> list[str]:
-    """Return what to write into a rig file for the likeliest sensor, with a comment on what is a guess."""
+    """Return the lines of a rig file for the likeliest sensor, with comments on guessed options."""
     candidate = report.findings[0].candidate
     options = dict(candidate.options)
     if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):
@@ -162,12 +164,12 @@ def _stanza(report: Report) -> list[str]:
 
 
 def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str]:
-    """Return options as a table, one a line, a list of tables over several, each with what it rests on."""
+    """Return options as a TOML table, one per line, lists of tables over several lines, each with its note."""
     lines = ["", "[stream.options]"]
     for name, value in options.items():
         note = f"  # {notes[name]}" if name in notes else ""
-        if isinstance(value, list) and any(isinstance(one, Mapping) for one in value):
-            lines += [f"{name} = [{note}", *(f"    {toml.toml_value(one)}," for one in value), "]"]
+        if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+            lines += [f"{name} = [{note}", *(f"    {toml.toml_value(item)}," for item in value), "]"]
         else:
             lines.append(f"{name} = {toml.toml_value(value)}{note}")
     return lines

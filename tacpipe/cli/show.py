@@ -1,6 +1,6 @@
-"""What is in a dataset: the streams of recordings, a split's roles, what a model learned from, how a result came out.
+"""Describe a dataset: the streams of recordings, the roles of a split, a model's training data, or a result's headline.
 
-What is shown follows from what the dataset holds, whichever stage made it.
+The contents of the dataset decide what is shown, not the stage that made it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from tacpipe.plugins.stage import ROLES
 from tacpipe.recording import ending
 from tacpipe.store.location import locate
 
-SHOWN = 20  # recordings listed before the rest is counted
-READ_BYTES = 1 << 28  # stored bytes that are read; further streams are listed with their rows only
-_TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
-_SPLIT = ("recording", "fold", "role")  # columns of a split
+SHOWN = 20  # Recordings that are listed before the remaining ones are counted
+READ_BYTES = 1 << 28  # Largest number of stored bytes to read; only rows of further streams are listed
+_TRUTH = "gt_"  # Prefix of a simulator's ground-truth labels
+_SPLIT = ("recording", "fold", "role")  # Columns of a split
 
 
 def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
-    """Return what is in the dataset at ``path``: its ``kind``, files, and the rest by kind.
+    """Return the contents of the dataset at ``path``: its ``kind``, files, and further entries by kind.
 
     The kind is recordings, split, model, result or export. Of recordings, labels, and numbers a stream of the first ``most``
     by name (None: of all), whose shards alone are read; with ``most`` labels are read when they are asked for. Of a split,
     recordings by fold and role; of a model and of a result, what `tacpipe.cli.model_overview` finds.
     """
-    found = manifest_of.find(path)
-    store = locate(found.directory)
-    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),), found.manifest))
+    stored = manifest_of.find(path)
+    store = locate(stored.directory)
+    opened = Dataset(stored.manifest, execution.reader(store, (str(stored.directory.absolute()),), stored.manifest))
     about = _about(opened)
     if model_overview.is_result(opened):
-        return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}
+        return {"kind": "result", **about, **model_overview.of_result(opened, stored, store)}
     if model_overview.is_model(opened):
         return {"kind": "model", **about, **model_overview.of_model(opened, store)}
     if opened.source.exported:
@@ -67,7 +67,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
 
 
 def _about(opened: Dataset) -> dict[str, Any]:
-    """Return what every dataset has: who made it, files and sizes."""
+    """Return the entries that every dataset has: stage, files and sizes."""
     manifest = opened.source
     return {
         "stage": manifest.stage,
@@ -80,21 +80,21 @@ def _about(opened: Dataset) -> dict[str, Any]:
 
 
 def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
-    """Return how many recordings have each role, by fold, where the dataset is a split; else nothing."""
+    """Return how many recordings have each role, by fold; an empty mapping if the dataset is no split."""
     if len(opened) != 1 or (shard := next(iter(opened))).streams != ("",):
         return {}
     table = shard.table()
     if not set(_SPLIT) <= set(table.column_names):
         return {}
-    found: dict[str, dict[str, int]] = {}
+    folds: dict[str, dict[str, int]] = {}
     for fold, role in zip(table["fold"].to_pylist(), table["role"].to_pylist(), strict=True):
-        counts = found.setdefault(str(fold), {})
+        counts = folds.setdefault(str(fold), {})
         counts[str(role)] = counts.get(str(role), 0) + 1
-    return found
+    return folds
 
 
 def _excluded(opened: Dataset) -> dict[str, str]:
-    return {name: str(why) for name, why in opened.source.excluded.items()}
+    return {name: str(reason) for name, reason in opened.source.excluded.items()}
 
 
 def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:
@@ -115,7 +115,7 @@ def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> d
 
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
-    """Return the overview as lines: one a stream of each recording that was read, then labels; then files and totals."""
+    """Return the overview as lines: one per stream of each recording, then labels, files and totals."""
     texts: dict[str, Callable[[dict[str, Any]], list[str]]] = {
         "model": model_overview.model_text,
         "result": model_overview.result_text,
@@ -123,19 +123,19 @@ def to_text(value: dict[str, Any], *, full: bool = False) -> str:
         "export": lambda _: [],
     }
     if value["kind"] in texts:
-        made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
+        origin = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
         files = model_overview.files_text(value["files"], full=full)
-        return printable.lines([*texts[value["kind"]](value), *files, made])
+        return printable.lines([*texts[value["kind"]](value), *files, origin])
     return printable.lines(_recordings_text(value, full))
 
 
 def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
-    shown, count = sorted(value["recordings"]), len(value["attributes"])
+    listed_names, count = sorted(value["recordings"]), len(value["attributes"])
     lines = [
         f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
         f"{'gaps':>5} {'held':>5} {'saturated':>9}"
     ]
-    for name in shown:
+    for name in listed_names:
         cell = printable.padded(printable.shown(name), 24)
         for stream, figures in value["recordings"][name].items():
             repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
@@ -144,9 +144,9 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
                 f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {gaps_text(figures):>5} "
                 f"{repeated:>5} {figures.get('saturated', ''):>9}"
             )
-    if count > len(shown):
-        lines.append(f"… and {count - len(shown)} more (--full)")
-    every_stream = [figures for name in shown for figures in value["recordings"][name].values()]
+    if count > len(listed_names):
+        lines.append(f"… and {count - len(listed_names)} more (--full)")
+    every_stream = [figures for name in listed_names for figures in value["recordings"][name].values()]
     if any("rate_hz" in figures for figures in every_stream):
         lines.append(RATES)
     if unread := sum("columns" not in figures for figures in every_stream):
@@ -164,7 +164,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
 
 
 def _split_text(value: dict[str, Any]) -> list[str]:
-    """Return how many recordings have each role, a line a fold."""
+    """Return how many recordings have each role, one line per fold."""
     roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
     widths = {role: max(8, len(role) + 2) for role in roles}
     lines = [f"{'fold':<6}" + "".join(f"{role:>{width}}" for role, width in widths.items())]
@@ -178,10 +178,10 @@ def _role_order(role: str) -> tuple[int, str]:
 
 
 class _Values:
-    """The values of a label, one after another: how often each is taken, or the range of numbers that are not whole."""
+    """Summary of a label's values: the count of each, or the range of fractional numbers."""
 
     def __init__(self) -> None:
-        self._counts: Counter[str] | None = Counter()  # None once one of them was a float
+        self._counts: Counter[str] | None = Counter()  # None after a float was added
         self._least, self._most = float("inf"), float("-inf")
 
     def add(self, value: Any) -> None:
@@ -194,7 +194,7 @@ class _Values:
             self._counts[str(value)] += 1
 
     def __str__(self) -> str:
-        """Return the range, or each value with its count; of many different ones their number."""
+        """Return the range, or each value with its count, or the number of values where there are many."""
         if self._counts is None:
             return f"{self._least:g} to {self._most:g}"
         if len(self._counts) > SHOWN:
@@ -203,18 +203,18 @@ class _Values:
 
 
 def _labels(attributes: Mapping[str, Mapping[str, Any]], full: bool) -> list[str]:
-    """Return one line a label that takes few values, with how often it takes each; a simulator's truth on one in all."""
+    """Return one line per label with its values, and one line for all labels of a simulator's ground truth."""
     lines = []
-    found: dict[str, _Values] = {}
+    values_by_label: dict[str, _Values] = {}
     for labels in attributes.values():
         for label, value in labels.items():
-            found.setdefault(label, _Values()).add(value)
-    names = sorted(found)
+            values_by_label.setdefault(label, _Values()).add(value)
+    names = sorted(values_by_label)
     truth = [name for name in names if name.startswith(_TRUTH)]
     if truth and not full:
         names = [name for name in names if name not in truth]
         lines.append(
             f"{_TRUTH}*: {counted(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
         )
-    lines += [f"{label}: {found[label]}" for label in names]
+    lines += [f"{label}: {values_by_label[label]}" for label in names]
     return lines

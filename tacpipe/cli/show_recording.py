@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.traces.spans import Span
 
-SAMPLED_ROWS = 1 << 20  # first rows of a stream, in which repeated rows and saturated values are counted
-_LISTED = 6  # gaps, spans and events before the remaining ones are counted
-_LABELS = 40  # labels of the recording
-_NAMED = 5  # recordings that an error names
+SAMPLED_ROWS = 1 << 20  # First rows of a stream, in which repeated rows and saturated values are counted
+_LISTED = 6  # Gaps, spans and events before the remaining ones are counted
+_LABELS = 40  # Largest number of labels of the recording that are listed
+_NAMED = 5  # Largest number of recordings that an error names
 RATES = "Hz: by the device's counter `seq`, else by the median step, so lost samples do not lower it."
 _MEAN_RATES = (
     "mean Hz: rows per second of the recorded stamps; the labels STREAM_rate_hz are the same on the clock that "
@@ -64,7 +64,7 @@ class Column:
 class Interval:
     """A gap of a stream, or a time in which a label of rows has one value; in seconds since the start of the recording."""
 
-    name: str  # the stream or the label
+    name: str  # Name of the stream or of the label
     text: str
     start_s: float
     stop_s: float

@@ -1,4 +1,4 @@
-"""Arguments and options of a stage's command, from its signature and its params, and its help."""
+"""Build the arguments, options and help of a stage's command from its signature and params."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import Device
 
 PRINT_PARAMS = "--print-params"
-EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
+EXAMPLE = "Example: "  # Start of the last paragraph of a stage's docstring
 
 
 def of(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
@@ -30,7 +30,7 @@ def of(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
 
 def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
-    default = None if PRINT_PARAMS in sys.argv else ...  # params are printed without any data
+    default = None if PRINT_PARAMS in sys.argv else ...  # Params are printed without any data.
     arguments: list[tuple[str, Any, str]] = []
     if "Files" in kinds:
         arguments.append(("source", Path, "Folder of the recordings."))
@@ -43,9 +43,9 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
 
 def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     output = typer.Option(None, "-o", "--output", help="Directory to write.", rich_help_panel=REQUIRED)
-    found = [_parameter("output", Path | None, output)]
+    parameters = [_parameter("output", Path | None, output)]
     if stage.reads_split:
-        found += [
+        parameters += [
             _parameter(
                 "split",
                 Path | None,
@@ -65,43 +65,44 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
             ),
         ]
     if stage.reads_model and not stage.needs_split:
-        found.append(
+        parameters.append(
             _parameter(
                 "role", str | None, typer.Option(None, "--role", help="Role to read: train, val, calibration or test.")
             )
         )
     if stage.fit is not None:
         text = "A dataset whose fitted codec to apply."
-        found.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
+        parameters.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
     if "init" in stage.arguments:
         text = "A model to begin with."
-        found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+        parameters.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
     if stage.trains:
         text = "What to train on; auto: cuda where there is one, else cpu."
         option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
-        found.append(_parameter("device", str | None, option))
+        parameters.append(_parameter("device", str | None, option))
     if stage.tracked:
         text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
-        found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
+        parameters.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
     if "extend" in stage.arguments:
         text = "An older split whose roles to keep."
-        found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
-    return found
+        parameters.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
+    return parameters
 
 
 def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     panels = params_of.panels(stage)
     choice = _shown_choice(stage)
-    found = []
-    for name, wanted in fields.items():
-        kind = fields_of.bare(wanted)
-        many = get_origin(kind) is tuple
+    parameters = []
+    for name, hint in fields.items():
+        kind = fields_of.bare(hint)
+        is_sequence = get_origin(kind) is tuple
         flag = f"--{name.replace('_', '-')}"
         flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
-        annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
+        # The text of an option is parsed like that of --set.
+        annotation = bool | None if kind is bool else list[str] | None if is_sequence else str | None
         text = _about(stage, name, helps.get(name, ""))
-        metavar = None if kind is bool else _metavar(wanted)
+        metavar = None if kind is bool else _metavar(hint)
         owners = params_of.having(stage, name)
         option = typer.Option(
             None,
@@ -112,8 +113,8 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             rich_help_panel=panels.get(name),
             hidden=bool(owners) and choice not in owners,
         )
-        found.append(_parameter(name, annotation, option))
-    more: list[tuple[str, Any, Any]] = [
+        parameters.append(_parameter(name, annotation, option))
+    common_options: list[tuple[str, Any, Any]] = [
         (
             "preset",
             str | None,
@@ -159,30 +160,30 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
         ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
     ]
-    return [*found, *(_parameter(*item) for item in more)]
+    return [*parameters, *(_parameter(*item) for item in common_options)]
 
 
 def _looks(stage: AnyStage) -> list[inspect.Parameter]:
-    """Return the options that print something of a source and write nothing."""
-    found = []
+    """Return the options that print information and write nothing."""
+    parameters = []
     if stage.guess is not None:
         text = "Print a first layout file for this folder, and stop."
-        found.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
+        parameters.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
     if stage.preview is not None:
         text = "Describe what would be read, and stop."
-        found.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
+        parameters.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
     if stage.requirements is not None:
         text = "Print what recordings must hold, and stop."
         show = typer.Option(False, "--requirements", help=text, is_eager=True, callback=_shows(stage.requirements))
-        found.append(_parameter("requirements", bool, show))
-    return found
+        parameters.append(_parameter("requirements", bool, show))
+    return parameters
 
 
 def _shows(requirements: Requirements) -> Callable[[bool], None]:
-    """Return what prints the requirements of a task, before the arguments of its command are missed."""
+    """Return a callback that prints the requirements of a task before missing arguments are reported."""
 
-    def show(given: bool) -> None:
-        if given:
+    def show(requested: bool) -> None:
+        if requested:
             terminal.result(requirements.to_text())
             raise typer.Exit
 
@@ -190,7 +191,7 @@ def _shows(requirements: Requirements) -> Callable[[bool], None]:
 
 
 def _shown_choice(stage: AnyStage) -> str | None:
-    """Return the architecture, or what else distinguishes params of several kinds, whose options the help shows."""
+    """Return the architecture, or other choice between kinds of params, whose options the help shows."""
     tag = params_of.tag(stage)
     if tag is None:
         return None
@@ -222,13 +223,13 @@ def _default(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return ("" if value else "no-") + name.replace("_", "-")
     if isinstance(value, dict):
-        return ",".join(f"{key}={each}" for key, each in value.items())
+        return ",".join(f"{key}={item}" for key, item in value.items())
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _metavar(wanted: Any) -> str:
-    """Return what represents an option's value in its help: the choices, or the type."""
-    kind = fields_of.bare(wanted)
+def _metavar(hint: Any) -> str:
+    """Return the placeholder of an option's value in its help: the choices, or the type."""
+    kind = fields_of.bare(hint)
     if get_origin(kind) is tuple:
         return f"{_metavar(get_args(kind)[0])}..."
     if get_origin(kind) is Literal:
@@ -245,8 +246,8 @@ def summary(name: str, stage: AnyStage) -> str:
 
     Its last paragraph is an example; one is made of the stage's arguments where it has none.
     """
-    own, module = stage.function.__doc__, sys.modules[stage.function.__module__].__doc__
-    text = inspect.cleandoc((own or module if "." in name else module or own) or "")
+    function_text, module_text = stage.function.__doc__, sys.modules[stage.function.__module__].__doc__
+    text = inspect.cleandoc((function_text or module_text if "." in name else module_text or function_text) or "")
     return text if EXAMPLE in text else f"{text}\n\n{EXAMPLE}{example(name, stage)}"
 
 

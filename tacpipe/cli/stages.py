@@ -1,4 +1,4 @@
-"""A stage as a command: arguments from its signature, options from its params."""
+"""Add stages as commands: arguments from the signature of a stage, options from its params."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class UnansweredError(Exception):
 
 @contextlib.contextmanager
 def answering() -> Iterator[None]:
-    """Have the commands of stages in the block report what is there already, and raise `UnansweredError` where it is not."""
+    """Have commands of stages in the block report only stored results, and raise `UnansweredError` without them."""
     token = _answering.set(True)
     try:
         yield
@@ -44,17 +44,17 @@ def answering() -> Iterator[None]:
 
 
 def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> None:
-    """Add the command ``group`` to ``program``: a stage, or those whose names begin so, of which ``arguments`` name one."""
+    """Add the command ``group`` to ``program``: a stage, or the stages of a group, of which ``arguments`` name one."""
     names = [name for name in registry.stages() if name.partition(".")[0] == group]
     if names == [group]:
         add(program, group, group)
         return
     methods = typer.Typer(help=registry.commands()[group], no_args_is_help=True, rich_markup_mode=None)
     by_method = {name.partition(".")[2]: name for name in names}
-    asked = [method for method in by_method if method in arguments]
-    for method in asked:  # and no other: a broken method spoils itself alone
+    requested = [method for method in by_method if method in arguments]
+    for method in requested:  # A broken method does not affect the other methods.
         add(methods, by_method[method], method)
-    for method in () if asked else by_method:
+    for method in () if requested else by_method:
         methods.command(method, help=registry.summary(by_method[method]))(nothing)
     program.add_typer(methods, name=group)
 
@@ -69,81 +69,83 @@ def add(program: typer.Typer, name: str, command: str) -> None:
     fields = params_of.fields(stage)
     parameters = stage_options.of(stage, fields)
 
-    def call(**given: Any) -> None:
-        _call(name, stage, given, [field for field in fields if given.get(field) is not None])
+    def call(**options: Any) -> None:
+        _call(name, stage, options, [field for field in fields if options.get(field) is not None])
 
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     program.command(command, help=stage_options.summary(name, stage))(call)
 
 
-def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str]) -> None:
+def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequence[str]) -> None:
     answering = _answering.get()
-    if answering and any(given.get(look) for look in ("guess", "print_params", "dry_run")):
+    if answering and any(options.get(look) for look in ("guess", "print_params", "dry_run")):
         raise UnansweredError
-    progress.set_quiet(given["quiet"])
+    progress.set_quiet(options["quiet"])
     for flag, kind in OPTIONS.items():
-        if flag != "fold" and given.get(flag) is not None:  # not every stage has each of them
-            fields_of.check(given[flag], kind, f"--{flag}")
-    if given.get("guess") and stage.guess is not None:
-        terminal.result(stage.guess(given["source"]).rstrip("\n"))
+        if flag != "fold" and options.get(flag) is not None:  # Some stages lack some of these options.
+            fields_of.check(options[flag], kind, f"--{flag}")
+    if options.get("guess") and stage.guess is not None:
+        terminal.result(stage.guess(options["source"]).rstrip("\n"))
         return
     params = given_params.build(
         name,
         stage,
-        file=_params_file(given),
-        block=given["block"],
-        preset=given["preset"],
-        sets=given["set_"] or (),
-        options={field: _parsed(given[field], params_of.fields(stage)[field]) for field in named},
+        file=_params_file(options),
+        block=options["block"],
+        preset=options["preset"],
+        sets=options["set_"] or (),
+        options={field: _parsed(options[field], params_of.fields(stage)[field]) for field in param_names},
     )
-    if given["print_params"]:
+    if options["print_params"]:
         terminal.result(json.dumps(params_of.to_input(params), indent=1))
         return
-    if given.get("dry_run") and stage.preview is not None:
-        terminal.result(stage.preview(params, given["source"]))
+    if options.get("dry_run") and stage.preview is not None:
+        terminal.result(stage.preview(params, options["source"]))
         return
-    if given["output"] is None:
+    if options["output"] is None:
         raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")
-    from tacpipe.engine import grid, pipeline  # help needs neither
+    from tacpipe.engine import grid, pipeline  # Help needs neither module.
 
-    requests = grid.requests(_request(name, stage, params, given), grid.folds(given.get("fold") or "0"))
-    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
-    how = {"as_json": given["json_"], "quiet": given["quiet"]}
+    requests = grid.requests(_request(name, stage, params, options), grid.folds(options.get("fold") or "0"))
+    headline_file = (
+        stage.headline if not (options["check"] or options["compare"]) else None
+    )  # Checks and comparisons write nothing.
+    report_options = {"as_json": options["json_"], "quiet": options["quiet"]}
     if answering:
-        _report_answers(requests, shown, **how)
+        _report_answers(requests, headline_file, **report_options)
     elif len(requests) == 1:
-        _report(pipeline.run(requests[0]), shown, **how)
+        _report(pipeline.run(requests[0]), headline_file, **report_options)
     else:
-        if stage.trains and not (given["quiet"] or given["check"] or given["compare"]):
+        if stage.trains and not (options["quiet"] or options["check"] or options["compare"]):
             _estimate(requests)
-        _run_folds(requests, shown, **how)
+        _run_folds(requests, headline_file, **report_options)
 
 
-def _request(name: str, stage: AnyStage, params: Any, given: Mapping[str, Any]) -> Request:
+def _request(name: str, stage: AnyStage, params: Any, options: Mapping[str, Any]) -> Request:
     """Return what the options of a command request."""
-    paths: dict[str, Any] = {key: given.get(key) for key in PATHS}
+    paths: dict[str, Any] = {key: options.get(key) for key in PATHS}
     return Request(
         name,
         params,
-        given["output"],
-        datasets=given.get("datasets") or (),
-        role=given.get("role"),
-        jobs=given["jobs"],
-        executor=given["executor"] or "",
-        device=given.get("device") or devices.AUTO,
-        skip_bad=given["skip_bad"],
-        check=given["check"],
-        compare=given["compare"],
-        rerun=given["rerun"],
-        replace=given["replace"],
-        track=tuple(given.get("track") or ()),
+        options["output"],
+        datasets=options.get("datasets") or (),
+        role=options.get("role"),
+        jobs=options["jobs"],
+        executor=options["executor"] or "",
+        device=options.get("device") or devices.AUTO,
+        skip_bad=options["skip_bad"],
+        check=options["check"],
+        compare=options["compare"],
+        rerun=options["rerun"],
+        replace=options["replace"],
+        track=tuple(options.get("track") or ()),
         **paths,
     )
 
 
 def _report_answers(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Report what is there already. Raises `UnansweredError` where some is not."""
+    """Report stored results. Raises `UnansweredError` if a result is missing."""
     from tacpipe.engine import pipeline
 
     outcomes = [outcome for request in requests if (outcome := pipeline.answered(request)) is not None]
@@ -154,7 +156,7 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
 
 
 def _estimate(requests: Sequence[Request]) -> None:
-    """Print how long the models that are missing take, as far as it can be known before."""
+    """Print the estimated training time of the missing models, if it can be estimated."""
     from tacpipe.engine import estimate
 
     sentence = estimate.estimate_duration(requests, requests[0].jobs)
@@ -163,19 +165,19 @@ def _estimate(requests: Sequence[Request]) -> None:
 
 
 def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end where some failed."""
+    """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end if folds failed."""
     from tacpipe.engine import by_recording, grid
 
     failed: list[TacpipeError] = []
-    for one, became in grid.run(requests, requests[0].jobs):
-        if isinstance(became, TacpipeError):
-            failed.append(became)
-            terminal.note(f"tacpipe: fold {one.fold}: {became}")
+    for request, result in grid.run(requests, requests[0].jobs):
+        if isinstance(result, TacpipeError):
+            failed.append(result)
+            terminal.note(f"tacpipe: fold {request.fold}: {result}")
         else:
-            _report(became, headline, as_json=as_json, quiet=quiet)
+            _report(result, headline, as_json=as_json, quiet=quiet)
     if failed:
-        what = f"{len(failed)} of {len(requests)} folds failed; the others are written."
-        raise by_recording.error(max(one.exit_code for one in failed), what)
+        message = f"{len(failed)} of {len(requests)} folds failed; the others are written."
+        raise by_recording.error(max(error.exit_code for error in failed), message)
 
 
 def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
@@ -189,10 +191,10 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
     if headline is not None and (as_json or not quiet):
         from tacpipe.cli import headline_table
 
-        found = headline_table.of_output(outcome.output, headline)
-        extra["headline"] = [one.to_json() for one in found or ()]
-        if not quiet and found is not None:  # a task of another package may state none
-            headline_table.show(found)
+        headlines = headline_table.of_output(outcome.output, headline)
+        extra["headline"] = [entry.to_json() for entry in headlines or ()]
+        if not quiet and headlines is not None:  # Tasks of other packages may have no headline.
+            headline_table.show(headlines)
     if as_json:
         terminal.result_json({"schema_version": 1, **outcome.to_json(), **extra})
     else:
@@ -202,15 +204,15 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         raise typer.Exit(FAILED)
 
 
-def _params_file(given: dict[str, Any]) -> Path | None:
-    if given["params_file"] is not None:
-        return Path(given["params_file"])
+def _params_file(options: dict[str, Any]) -> Path | None:
+    if options["params_file"] is not None:
+        return Path(options["params_file"])
     default = Path("params.yaml")
-    return default if given["block"] is not None or default.exists() else None
+    return default if options["block"] is not None or default.exists() else None
 
 
-def _parsed(given: Any, wanted: Any) -> Any:
-    """Return what was given for an option, as its annotation has it where that is possible."""
-    if isinstance(given, list):
-        return [fields_of.parsed(text, get_args(fields_of.bare(wanted))[0]) for text in given]
-    return fields_of.parsed(given, wanted) if isinstance(given, str) else given
+def _parsed(value: Any, annotation: Any) -> Any:
+    """Return the value of an option, converted to its annotation where that is possible."""
+    if isinstance(value, list):
+        return [fields_of.parsed(text, get_args(fields_of.bare(annotation))[0]) for text in value]
+    return fields_of.parsed(value, annotation) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""The commands of ``tacpipe store``."""
+"""Add the commands of ``tacpipe store``."""
 
 from __future__ import annotations
 
@@ -111,9 +111,14 @@ def checkout(
     from tacpipe.maintenance import transfer
 
     source = None if store is None else transfer.remote_store(store)
-    made = checkouts.checkout(dataset, output, replace=replace, source=source)
-    value = {"schema_version": 1, "output": str(output), "stage": made.stage, "recordings": len(made.recordings)}
-    _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
+    manifest = checkouts.checkout(dataset, output, replace=replace, source=source)
+    value = {
+        "schema_version": 1,
+        "output": str(output),
+        "stage": manifest.stage,
+        "recordings": len(manifest.recordings),
+    }
+    _print({**value, "labelled": len(manifest.labels)}, as_json=as_json, text=str(output))
 
 
 def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
@@ -129,13 +134,13 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
 
     store = locate() if remote is None else transfer.remote_store(remote)
     if isinstance(store, Store) and store.distant:
-        found = cache.verify(cache.distant(store))
+        soundness = cache.verify(cache.distant(store))
     else:
-        found = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
-    _print(asdict(found), as_json=as_json, text=found.to_text(changed=isinstance(store, Store)))
-    if found.damaged or found.missing or found.lost:
+        soundness = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
+    _print(asdict(soundness), as_json=as_json, text=soundness.to_text(changed=isinstance(store, Store)))
+    if soundness.damaged or soundness.missing or soundness.lost:
         raise typer.Exit(DAMAGED)
-    _end_unread(found)
+    _end_unread(soundness)
 
 
 def repair(as_json: AsJson = False) -> None:
@@ -149,18 +154,18 @@ def repair(as_json: AsJson = False) -> None:
     from tacpipe.maintenance import repair as upkeep
 
     store = locate()
-    found = cache.repair_damaged(cache.distant(store)) if store.distant else upkeep.repair(store)
-    _print(asdict(found), as_json=as_json, text=found.to_text())
-    if found.lost:
+    soundness = cache.repair_damaged(cache.distant(store)) if store.distant else upkeep.repair(store)
+    _print(asdict(soundness), as_json=as_json, text=soundness.to_text())
+    if soundness.lost:
         raise typer.Exit(DAMAGED)
-    _end_unread(found)
+    _end_unread(soundness)
 
 
-def _end_unread(found: Soundness) -> None:
-    """End with 1 where the system failed to read something, which states nothing of what was not read."""
-    if found.unread:
+def _end_unread(soundness: Soundness) -> None:
+    """Exit with 1 if the system failed to read objects, whose state stays unknown."""
+    if soundness.unread:
         progress.report(
-            f"{len(found.unread)} objects or records could not be read: {next(iter(found.unread.values()))}"
+            f"{len(soundness.unread)} objects or records could not be read: {next(iter(soundness.unread.values()))}"
         )
         raise typer.Exit(FAILED)
 
@@ -188,24 +193,27 @@ def gc(
     """
     from tacpipe.maintenance import remote_upkeep, transfer
 
-    if not 0 <= grace_days < math.inf:  # false for nan
+    if not 0 <= grace_days < math.inf:  # NaN fails this check too.
         raise UsageError(f"--grace-days is {grace_days:g}; it must be a number of days of 0 or more.")
     store = locate() if remote is None else transfer.remote_store(remote)
     if isinstance(store, Store) and store.distant:
-        found = _collect_distant(store, forget or [], dry_run, recordings, grace_days, cache=cache)
+        collected = _collect_distant(store, forget or [], dry_run, recordings, grace_days, cache=cache)
     elif cache:
         raise UsageError(f"--cache is for a store in a bucket, and {store.place} has no folder in front of it.")
     else:
         _forget(store, forget or [], dry_run=dry_run)
         collect = garbage.collect if isinstance(store, Store) else remote_upkeep.collect
-        found = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
+        collected = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
     verb = "would remove" if dry_run else "removed"
     text = (
-        f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
+        f"{verb} {collected.objects} objects ({collected.bytes / 1e6:.1f} MB), {collected.records} records, "
+        f"{collected.drafts} drafts"
     )
-    if found.kept_recordings:
-        text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
-    _print(asdict(found), as_json=as_json, text=text)
+    if collected.kept_recordings:
+        text += (
+            f"; kept {collected.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
+        )
+    _print(asdict(collected), as_json=as_json, text=text)
 
 
 def _collect_distant(
@@ -231,8 +239,8 @@ def _forget(store: AnyStore, names: list[str], *, dry_run: bool) -> None:
         for root in local if not dry_run else ():
             store.roots.remove(root)
         if not pushed.forget(store, name, dry_run=dry_run) and not local:
-            known = sorted(pushed.label(root, roots) for root in roots)
-            raise UsageError(f"{store.place} keeps no dataset {name}; it keeps {', '.join(known) or 'nothing'}.")
+            stored_names = sorted(pushed.label(root, roots) for root in roots)
+            raise UsageError(f"{store.place} keeps no dataset {name}; it keeps {', '.join(stored_names) or 'nothing'}.")
 
 
 def link(datasets: Paths) -> None:
@@ -273,8 +281,8 @@ def push(
     """
     from tacpipe.maintenance import transfer
 
-    done = transfer.push(remote, datasets, ancestors=ancestors, verify=verify, replace=replace, project=project)
-    _print(asdict(done), as_json=as_json, text=_moved("pushed", done))
+    transferred = transfer.push(remote, datasets, ancestors=ancestors, verify=verify, replace=replace, project=project)
+    _print(asdict(transferred), as_json=as_json, text=_moved("pushed", transferred))
 
 
 def pull(
@@ -292,14 +300,17 @@ def pull(
     """
     from tacpipe.maintenance import transfer
 
-    done = transfer.pull(remote, datasets, ancestors=ancestors, replace=replace)
-    _print(asdict(done), as_json=as_json, text=_moved("pulled", done))
+    transferred = transfer.pull(remote, datasets, ancestors=ancestors, replace=replace)
+    _print(asdict(transferred), as_json=as_json, text=_moved("pulled", transferred))
 
 
-def _moved(verb: str, done: Any) -> str:
-    names = plain(", ".join(done.datasets), 1000)
-    text = f"{verb} {names}: {done.objects} objects ({done.bytes / 1e6:.1f} MB); {done.there} were there already"
-    return f"{text}; replaced {done.replaced} that were damaged there" if done.replaced else text
+def _moved(verb: str, transferred: Any) -> str:
+    names = plain(", ".join(transferred.datasets), 1000)
+    text = (
+        f"{verb} {names}: {transferred.objects} objects ({transferred.bytes / 1e6:.1f} MB); "
+        f"{transferred.there} were there already"
+    )
+    return f"{text}; replaced {transferred.replaced} that were damaged there" if transferred.replaced else text
 
 
 def _print(value: Any, *, as_json: bool, text: str) -> None:

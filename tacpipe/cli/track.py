@@ -1,4 +1,4 @@
-"""Stored models and results, given to trackers of experiments as if they were trained now."""
+"""Send stored models and results to trackers of experiments, as if they were trained now."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def run(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
     A run has the name that ``--track`` gives it, so that what was tracked as it was trained is the same run. Raises
     `UsageError` for a dataset without epochs and figures, and for an unknown tracker.
     """
-    found = [manifest.find(path) for path in paths]
-    for path, one in zip(paths, found, strict=True):
-        if not {CONFIG, HISTORY} & set(one.manifest.files):
-            raise UsageError(f"{path} was made by {one.manifest.stage}; give a model or a result.")
-    names, known = [], functools.cache(identities.of_manifests)
-    for path, one in zip(paths, found, strict=True):
-        store = locate(one.directory)
-        identity, made = known(store).get(one.digest, {}), one.manifest
-        params = {**made.params, "stage": made.stage, "fold": identity.get("fold", 0)}
-        name = tracking.name_of(path, digest(identity) if identity else one.digest)
+    stored = [manifest.find(path) for path in paths]
+    for path, entry in zip(paths, stored, strict=True):
+        if not {CONFIG, HISTORY} & set(entry.manifest.files):
+            raise UsageError(f"{path} was made by {entry.manifest.stage}; give a model or a result.")
+    names, identities_of = [], functools.cache(identities.of_manifests)
+    for path, entry in zip(paths, stored, strict=True):
+        store = locate(entry.directory)
+        identity, run_manifest = identities_of(store).get(entry.digest, {}), entry.manifest
+        params = {**run_manifest.params, "stage": run_manifest.stage, "fold": identity.get("fold", 0)}
+        name = tracking.name_of(path, digest(identity) if identity else entry.digest)
         Tracking(tracking.open_trackers(trackers), name, tracker.params(params)).finish(
-            path, tracking.files(made, store)
+            path, tracking.files(run_manifest, store)
         )
         names.append(name)
     return names

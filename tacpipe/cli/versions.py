@@ -1,4 +1,4 @@
-"""The versions of tacpipe, of Python and of the installed libraries that results depend on."""
+"""List the versions of tacpipe, of Python and of the installed libraries that results depend on."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def of_parts() -> dict[str, Any]:
 
 
 def to_text(found: dict[str, Any]) -> str:
-    """Return the versions as lines: tacpipe, Python, and one line an extra."""
+    """Return the versions as lines: tacpipe, Python, and one line per extra."""
     lines = [f"tacpipe {found['tacpipe']}", f"Python {found['python']} on {found['platform']}"]
     for extra, libraries in found["parts"].items():
         shown = ", ".join(f"{name} {version or 'not installed'}" for name, version in libraries.items())

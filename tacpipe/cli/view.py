@@ -1,4 +1,4 @@
-"""The command ``tacpipe view``: recordings in Rerun's viewer, as a file for it, or in a browser."""
+"""Add the command ``tacpipe view``: show recordings in Rerun's viewer or a browser, or save them as a file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXAMPLE = (
     "recordings are in the viewer's own list. Nothing is sent over the network."
     "\n\nExample: tacpipe view data/recordings trial-003 --predictions data/predictions"
 )
-MAGIC, ENDING = b"RRF", ".rrd"  # of a file of Rerun's
+MAGIC, ENDING = b"RRF", ".rrd"  # First bytes and suffix of a file of Rerun
 LIMIT = 8
 
 
@@ -63,18 +63,19 @@ def view(
     _require(save, web=web, port=port)
     extras.require("tacpipe view", "rerun", "rerun_cli")
     chosen = _chosen(dataset, recording or [], where or [], split, role, fold)
-    shown = list(chosen)[:limit]
-    if save is not None and len(shown) > 1 and save.suffix.lower() == ENDING:
+    recordings = list(chosen)[:limit]
+    if save is not None and len(recordings) > 1 and save.suffix.lower() == ENDING:
         raise UsageError(
-            f"{save} is one file, for one recording, and {len(shown)} are chosen; name one, or a folder for a file each."
+            f"{save} is one file, for one recording, and {len(recordings)} are chosen; name one, or a folder for a "
+            f"file each."
         )
-    if len(shown) < len(chosen):
-        terminal.note(f"{len(shown)} of {len(chosen)} recordings; --limit {len(chosen)} shows all.")
+    if len(recordings) < len(chosen):
+        terminal.note(f"{len(recordings)} of {len(chosen)} recordings; --limit {len(chosen)} shows all.")
     with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.explain_missing("tacpipe view"):
         from tacpipe.viewer import session
 
-        drawn = _drawn(shown, _predictions(predictions))
-        files = session.write(drawn, Path(folder), str(dataset), with_list=len(shown) > 1, all_rows=all_rows)
+        drawn = _drawn(recordings, _predictions(predictions))
+        files = session.write(drawn, Path(folder), str(dataset), with_list=len(recordings) > 1, all_rows=all_rows)
         if save is not None:
             _save(files, save)
             terminal.result(save)
@@ -85,7 +86,7 @@ def view(
 
 
 def _require(save: Path | None, *, web: bool, port: int | None) -> None:
-    """Raise `UsageError` before anything is read for options that contradict each other, or a file of another program."""
+    """Raise `UsageError` before anything is read for contradictory options or a file of another program."""
     from tacpipe.datasets import replacing
 
     if save is not None and web:
@@ -108,44 +109,44 @@ def conditions(where: Sequence[str]) -> dict[str, Attribute]:
     """
     from tacpipe.datasets import labels
 
-    found = {}
+    conditions_by_name = {}
     for text in where:
         name, equals, value = text.partition("=")
         if not equals or not name:
             raise UsageError(f"--where {text} should read name=value, as in --where object=cup.")
-        found[name] = labels.of_text(value)
-    return found
+        conditions_by_name[name] = labels.of_text(value)
+    return conditions_by_name
 
 
 def _chosen(
-    path: Path, names: Sequence[str], where: Sequence[str], split: Path | None, role: str | None, fold: int
+    path: Path, names: Sequence[str], label_texts: Sequence[str], split: Path | None, role: str | None, fold: int
 ) -> Dataset:
     import tacpipe
 
-    wanted = conditions(where)
+    required_labels = conditions(label_texts)
     opened = tacpipe.open(path)
     if not len(opened):
         raise UsageError(f"{path} has no recordings; `tacpipe view` shows those of a dataset of recordings.")
-    return opened.select(*names, split=split, role=role, fold=fold, labels=wanted)
+    return opened.select(*names, split=split, role=role, fold=fold, labels=required_labels)
 
 
 def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[Contents]:
-    """Yield what is drawn of each recording. Raises `UsageError` where one has nothing that can be drawn."""
+    """Yield the contents of each recording. Raises `UsageError` for a recording with nothing to draw."""
     from tacpipe.viewer import contents
 
-    for one in recordings:
+    for recording in recordings:
         table, row = None, None
         if predictions is not None:
-            table, row = predicted(predictions, one.name)
+            table, row = predicted(predictions, recording.name)
             if table is None and row is None:
-                terminal.note(f"There are no predictions of {one.name} in {predictions.path}.")
-        found = contents.of(one, table, row, chain=one.alone.source.chain)
-        if found.empty:
+                terminal.note(f"There are no predictions of {recording.name} in {predictions.path}.")
+        recording_contents = contents.of(recording, table, row, chain=recording.alone.source.chain)
+        if recording_contents.empty:
             raise UsageError(
-                f"Recording {one.name} has no stream with times and no cloud, so there is nothing to draw; "
-                f"its streams are {', '.join(map(repr, one.streams))}. Give a dataset of recordings."
+                f"Recording {recording.name} has no stream with times and no cloud, so there is nothing to draw; "
+                f"its streams are {', '.join(map(repr, recording.streams))}. Give a dataset of recordings."
             )
-        yield found
+        yield recording_contents
 
 
 def _predictions(path: Path | None) -> Dataset | None:
@@ -155,13 +156,13 @@ def _predictions(path: Path | None) -> Dataset | None:
 
 
 def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
-    """Return the predictions of one recording: the table of its own, or its row, a table too, where one has a row each."""
+    """Return the predictions of one recording: its table, or its one-row slice of a table of all recordings."""
     if name in predictions:
         return predictions[name].table(), None
-    for one in predictions:
-        if one.streams != ("",):
+    for recording in predictions:
+        if recording.streams != ("",):
             continue
-        table = one.table()
+        table = recording.table()
         if "recording" in table.column_names:
             names = table.column("recording").to_pylist()
             if name in names:

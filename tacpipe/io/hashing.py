@@ -1,4 +1,4 @@
-"""Digests: what names content, and keys, which name results before they exist."""
+"""Compute digests of content, and keys, which name results before they exist."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.printable import excerpt
 
-DIGEST = re.compile(r"[0-9a-f]{64}")  # as it is written, in whole or within a text
+DIGEST = re.compile(r"[0-9a-f]{64}")  # a digest in hex, a whole text or part of one
 SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
 _remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system stated of the file, its digest
 
@@ -36,21 +36,21 @@ class _WithinError(Exception):
 
 def parts(value: Any) -> Iterator[bytes]:
     """Yield `canonical` of a value in parts: those of a `Written` in it as they come. Raises as that does."""
-    within: dict[str, Written] = {}
+    written_by_name: dict[str, Written] = {}
 
-    def named(one: Any) -> str:
-        if not isinstance(one, Written):
-            raise TypeError(f"Object of type {type(one).__name__} is not JSON serializable")
+    def placeholder(item: Any) -> str:
+        if not isinstance(item, Written):
+            raise TypeError(f"Object of type {type(item).__name__} is not JSON serializable")
         name = f"written {uuid.uuid4().hex}"
-        within[name] = one
+        written_by_name[name] = item
         return name
 
-    text = _canonical(value, _encoder(named))
-    for found in re.split("|".join(f'"({name})"' for name in within), text) if within else [text]:
-        if found in within:
-            yield from within[found].written()
-        elif found:
-            yield found.encode()
+    text = _canonical(value, _encoder(placeholder))
+    for piece in re.split("|".join(f'"({name})"' for name in written_by_name), text) if written_by_name else [text]:
+        if piece in written_by_name:
+            yield from written_by_name[piece].written()
+        elif piece:
+            yield piece.encode()
 
 
 def canonical(value: Any) -> bytes:
@@ -67,17 +67,17 @@ def canonical(value: Any) -> bytes:
         return b"".join(parts(value))
 
 
-def _refused(one: Any) -> str:
-    if isinstance(one, Written):
+def _refuse(item: Any) -> str:
+    if isinstance(item, Written):
         raise _WithinError
-    raise TypeError(f"Object of type {type(one).__name__} is not JSON serializable")
+    raise TypeError(f"Object of type {type(item).__name__} is not JSON serializable")
 
 
 def _encoder(default: Callable[[Any], str]) -> json.JSONEncoder:
     return json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False, default=default)
 
 
-_PLAIN = _encoder(_refused)  # made once: a dataset has a digest per recording
+_PLAIN = _encoder(_refuse)  # made once: a dataset has a digest per recording
 
 
 def _canonical(value: Any, encoder: json.JSONEncoder) -> str:
@@ -101,10 +101,10 @@ def digest(value: Any) -> str:
     try:
         return hashlib.sha256(_canonical(value, _PLAIN).encode()).hexdigest()
     except _WithinError:
-        found = hashlib.sha256()
+        hasher = hashlib.sha256()
         for part in parts(value):
-            found.update(part)
-        return found.hexdigest()
+            hasher.update(part)
+        return hasher.hexdigest()
 
 
 def bytes_digest(content: bytes) -> str:
@@ -134,13 +134,13 @@ def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], s
     """
     name = os.fspath(path)
     before = _traits(name)
-    known = _remembered.get(name)
-    if known is not None and known[0] == before:
-        return known[1]
-    found = (digest_of or file_digest)(path)
+    remembered = _remembered.get(name)
+    if remembered is not None and remembered[0] == before:
+        return remembered[1]
+    content_digest = (digest_of or file_digest)(path)
     if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
-        _remembered[name] = before, found
-    return found
+        _remembered[name] = before, content_digest
+    return content_digest
 
 
 def _traits(path: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""A table and its Parquet bytes: encodings chosen by measurement, units and layout kept as field metadata."""
+"""Write a table as Parquet and read it: encodings chosen by measurement, units and layout kept as field metadata."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the columns of a Parquet file declare, counted page by page before anything is unpacked.
+"""Count what the columns of a Parquet file declare, page by page, before anything is unpacked.
 
 A file of some hundred bytes can declare any number of rows, and a page any size: pyarrow checks neither, and takes the
 memory. Every page has a header (https://parquet.apache.org/docs/file-format/, Thrift's compact protocol) that states its
@@ -52,7 +52,7 @@ class _Leaf(NamedTuple):
 
 
 class Page(NamedTuple):
-    """What a page's header states."""
+    """Fields of a page's header."""
 
     kind: int
     unpacked: int  # bytes
@@ -76,7 +76,7 @@ class Claims:
         self._leaves = [_Leaf(leaf.path, leaf.physical_type, leaf.length) for leaf in leaves]
         self._groups: list[list[Any]] = [group.get(1) or [] for group in footer.get(4) or ()]
         self._counted: dict[tuple[int, bool], tuple[int, int]] = {}  # column and `shared`: its bytes, its largest page
-        rows = sum(_whole(group.get(3)) for group in footer.get(4) or ())
+        rows = sum(_expect_number(group.get(3)) for group in footer.get(4) or ())
         if footer.get(3) != rows:
             raise ValueError(f"it declares {footer.get(3)} rows, and its groups of {rows}")
 
@@ -127,10 +127,10 @@ class Claims:
 
 def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
     """Return where the pages of a column's chunk begin and end."""
-    start = _whole(chunk.get(9))
-    words = chunk.get(11)  # where its dictionary is, if it has one
+    start = _expect_number(chunk.get(9))
+    words = chunk.get(11)  # position of its dictionary, if it has one
     start = min(start, words) if isinstance(words, int) and words > 0 else start
-    stop = start + _whole(chunk.get(7))
+    stop = start + _expect_number(chunk.get(7))
     if not 0 <= start <= stop <= end:
         raise ValueError(f"column {name!r:.60} lies at bytes {start} to {stop} of {end}")
     return start, stop
@@ -156,11 +156,16 @@ def _pages(content: Bytes, place: int, stop: int) -> Iterator[Page]:
             page = Page(DATA, _varint(usual[1]), _varint(usual[2]), _varint(usual[4]), usual[5][0] >> 1)
             place = usual.end()
         else:
-            told, place = _struct(content, place, stop, 0)
-            inner: dict[int, Any] = next((told[field] for field in (5, 7, 8) if isinstance(told.get(field), dict)), {})
-            encoding = inner.get(4 if 8 in told else 2, -1)
+            header, place = _struct(content, place, stop, 0)
+            inner: dict[int, Any] = next(
+                (header[field] for field in (5, 7, 8) if isinstance(header.get(field), dict)), {}
+            )
+            encoding = inner.get(4 if 8 in header else 2, -1)
             page = Page(
-                *(_whole(value) for value in (told.get(1), told.get(2), told.get(3), inner.get(1, 0), encoding))
+                *(
+                    _expect_number(value)
+                    for value in (header.get(1), header.get(2), header.get(3), inner.get(1, 0), encoding)
+                )
             )
         if page.unpacked < 0 or page.size < 0 or page.values < 0 or place + page.size > stop:
             raise ValueError(f"a page declares {page.size} bytes, {page.unpacked} unpacked, of {stop - place}")
@@ -168,7 +173,7 @@ def _pages(content: Bytes, place: int, stop: int) -> Iterator[Page]:
         yield page
 
 
-def _whole(value: Any) -> int:
+def _expect_number(value: Any) -> int:
     if not isinstance(value, int):
         raise ValueError("a page's header lacks a number")
     return value
@@ -188,23 +193,23 @@ def _varint(text: Bytes) -> int:
 
 def _struct(content: Bytes, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
     """Return the fields of a structure by number, whole numbers and structures alone, and where it ends."""
-    found: dict[int, Any] = {}
+    fields: dict[int, Any] = {}
     number = 0
     while place < stop:
         head = content[place]
         place += 1
         if not head:
-            return found, place
+            return fields, place
         kind = head & 15
         if head >> 4:
             number += head >> 4
         else:
             number, place = _number(content, place, stop)
         if 3 < kind < 7 and place < stop and content[place] < 128:  # a number of one byte, as most are
-            found[number] = content[place] >> 1 ^ -(content[place] & 1)
+            fields[number] = content[place] >> 1 ^ -(content[place] & 1)
             place += 1
         else:
-            found[number], place = _value(content, place, stop, kind, depth)
+            fields[number], place = _value(content, place, stop, kind, depth)
     raise ValueError("its footer or a page's header was cut off")
 
 
@@ -233,18 +238,18 @@ def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any],
     if count == 15:
         length, place = _number(content, place, stop)
         count = 2 * length if length >= 0 else -2 * length - 1
-    found: list[Any] = []
+    values: list[Any] = []
     for _ in range(count):
         usual = _usual(content, place, stop) if kind == 12 else None
         if usual is not None:
-            found.append(usual[0])
+            values.append(usual[0])
             place = usual[1]
             continue
         value, place = _byte(content, place, stop) if kind in (1, 2) else _value(content, place, stop, kind, depth)
         if place > stop:
             raise ValueError("its footer or a page's header was cut off")
-        found.append(value)
-    return found, place
+        values.append(value)
+    return values, place
 
 
 def _usual(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:

@@ -1,4 +1,4 @@
-"""The rows of a Parquet file in the groups in which they are written: of batches one is put aside, column by column."""
+"""Collect the rows of a Parquet file into the groups in which they are written, column by column."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ class _RowGroup:
         self._mapped: mmap.mmap | None = None
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Discard the rows, so that the next group begins."""
         self.count = self._spilled = self._bytes = 0
         self._waiting, self._mapped = [], None  # it is unmapped with the last table that reads it
         for column in self._columns:

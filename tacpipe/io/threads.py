@@ -1,4 +1,4 @@
-"""Work that waits for other computers, some of it at once."""
+"""Run work that waits for other computers in several threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values as TOML writes them, which Python reads and does not write."""
+"""Write values as TOML, which Python reads and does not write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML from anywhere, read without trust: plain values alone, and no more of them than a person writes.
+"""Read untrusted YAML: plain values only, and no more of them than a person writes.
 
 A few lines of YAML can represent any amount of data, by aliases of aliases and merged mappings, and brackets within
 brackets end the parser's stack. So the text's events are counted first, each alias as what it represents.

@@ -1,1 +1,1 @@
-"""What manages a store beyond one command: collection, repair, transfer to other stores, checkout."""
+"""Manage a store beyond one command: collection, repair, transfer to other stores, checkout."""

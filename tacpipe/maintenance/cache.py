@@ -1,4 +1,4 @@
-"""Upkeep of a store in a bucket by a computer that works on it: its folder in front, and the datasets that are gone here."""
+"""Maintain a store in a bucket, its folder in front, and the roots of datasets whose directories are gone here."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def distant(store: Store) -> CachedStore:
 
 
 def status(store: CachedStore) -> dict[str, Any]:
-    """Return what `repair.status` does, of the bucket, and where the folder in front is and what it takes."""
+    """Return the status of the bucket as `repair.status` does, and the path and sizes of the folder in front."""
     bucket = store.bucket
-    there = bucket.check()
+    exists = bucket.check()
     measured = {name: _measured(bucket.files.list(name)) for name in ("objects", "records", "tmp")}
-    every = bucket.roots.all()
-    roots = [{**root, "path": pushed.label(root, every), "reachable": True} for root in every]
-    here = repair.status(store)
-    cache = {"path": str(store.root), **{name: here[name] for name in ("objects", "records", "checkpoints")}}
+    all_roots = bucket.roots.all()
+    roots = [{**root, "path": pushed.label(root, all_roots), "reachable": True} for root in all_roots]
+    folder_status = repair.status(store)
+    cache = {"path": str(store.root), **{name: folder_status[name] for name in ("objects", "records", "checkpoints")}}
     running = [run.note for _, run in bucket.runs().values()]
-    return {"store": store.place, "there": there, **measured, "roots": roots, "running": running, "cache": cache}
+    return {"store": store.place, "there": exists, **measured, "roots": roots, "running": running, "cache": cache}
 
 
 def _measured(entries: Iterable[Entry]) -> dict[str, int]:
@@ -55,7 +55,7 @@ def _measured(entries: Iterable[Entry]) -> dict[str, int]:
 def verify(store: CachedStore) -> Soundness:
     """Return the soundness of what the bucket holds, having moved what is damaged in the folder in front to quarantine.
 
-    That is brought again when it is read, so it is not counted.
+    A damaged object in that folder is copied there again when it is read, so it is not counted.
     """
     repair.verify(store)
     return remote_upkeep.verify(store.bucket)
@@ -65,43 +65,43 @@ def repair_damaged(store: CachedStore) -> Soundness:
     """Return the soundness of the bucket after what is damaged or missing there was sent again.
 
     A damaged object is moved to quarantine there. It comes from the folder in front, from a dataset's directory, or is
-    recomputed; what this computer cannot have again is lost as far as it is concerned. A damaged record stays, and is
-    replaced by whoever computes its key.
+    recomputed; what this computer cannot have again is lost as far as it is concerned. A damaged record stays until
+    a command computes its key.
     """
     if not store.bucket.check():
         return Soundness(there=False)
     with store.at_work():
-        found = verify(store)
-        damaged = [name for name in found.damaged if DIGEST.fullmatch(name) and store.bucket.has(name)]
+        soundness = verify(store)
+        damaged = [name for name in soundness.damaged if DIGEST.fullmatch(name) and store.bucket.has(name)]
         for name in damaged:
             store.bucket.quarantine(name)
-        paths, directories = _shown(store)
+        paths, directories = _local_objects(store)
         read = execution.reader(store, tuple(directories))
-        wanted, tried = {*damaged, *found.missing}, set[str]()
-        while wanted:
-            for name in sorted(wanted):
+        absent, tried = {*damaged, *soundness.missing}, set[str]()
+        while absent:
+            for name in sorted(absent):
                 try:
                     read(name, paths.get(name, name[:12]))
                     store.send([name])
-                    found.repaired.append(name)
+                    soundness.repaired.append(name)
                 except StorageError as error:
-                    found.unread[name] = str(error)
+                    soundness.unread[name] = str(error)
                 except TacpipeError as error:
-                    found.lost[name] = str(error)
-            tried |= wanted
-            wanted = remote_upkeep.missing(store.bucket) - tried  # of manifests that are there again
-        found.missing = []
-    return found
+                    soundness.lost[name] = str(error)
+            tried |= absent
+            absent = remote_upkeep.missing(store.bucket) - tried  # restored manifests name more objects
+        soundness.missing = []
+    return soundness
 
 
-def _shown(store: CachedStore) -> tuple[dict[str, str], list[str]]:
-    """Return the paths of all that datasets of this computer name, by digest, and the directories of these."""
+def _local_objects(store: CachedStore) -> tuple[dict[str, str], list[str]]:
+    """Return the paths of all objects of this computer's datasets by digest, and the directories of these datasets."""
     paths: dict[str, str] = {}
     directories = []
     for root in store.roots.all():
         with contextlib.suppress(TacpipeError):
-            found = manifest.find(Path(root["path"]))
-            paths |= {name: path for path, name in found.manifest.objects()} | {found.digest: manifest.NAME}
+            dataset = manifest.find(Path(root["path"]))
+            paths |= {name: path for path, name in dataset.manifest.objects()} | {dataset.digest: manifest.NAME}
             directories.append(root["path"])
     return paths, directories
 
@@ -111,41 +111,41 @@ def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: 
 
     A dataset that a command of this computer wrote, and whose directory is gone for the whole grace, is forgotten first.
     """
-    for root in [] if dry_run else _gone(store, grace_days):
+    for root in [] if dry_run else _expired_roots(store, grace_days):
         folder, name = projects.place(Path(root["path"]))
         owner = projects.identity_of(store, folder)
-        there = None if owner is None else store.bucket.roots.pushed(name, owner.id)
-        if there is not None and there.get("output") and there["manifest"] == root["manifest"]:
-            store.bucket.roots.remove(there)
+        pushed_root = None if owner is None else store.bucket.roots.pushed(name, owner.id)
+        if pushed_root is not None and pushed_root.get("output") and pushed_root["manifest"] == root["manifest"]:
+            store.bucket.roots.remove(pushed_root)
             store.roots.remove(root)
     return remote_upkeep.collect(store.bucket, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
-def _gone(store: CachedStore, grace_days: float) -> list[dict[str, Any]]:
-    found = []
+def _expired_roots(store: CachedStore, grace_days: float) -> list[dict[str, Any]]:
+    expired = []
     for root in store.roots.all():
         content, reached = garbage.content(Path(root["path"]))
         if content is None and garbage.has_expired(store, root, grace_days, reached=reached, dry_run=False):
-            found.append(root)
-    return found
+            expired.append(root)
+    return expired
 
 
 def clear(store: CachedStore, *, dry_run: bool) -> Collected:
     """Remove from the folder in front what the bucket has as well; a run at work here keeps what it uses.
 
-    Whoever reads what was removed brings it again.
+    A command that reads a removed object copies it here again.
     """
     collected = Collected()
     if not store.check():
         return collected
     used = {name for run in store.leases.runs() for name in run.objects}
     objects = {path.name: path for path in layout.entries(store.root, "objects") if path.name not in used}
-    there = store.bucket.sizes(objects)
+    bucket_sizes = store.bucket.sizes(objects)
     with readable_errors(store.root):
         for name, path in objects.items():
             with contextlib.suppress(FileNotFoundError):
                 size = path.lstat().st_size
-                if there.get(name) == size:
+                if bucket_sizes.get(name) == size:
                     collected.objects, collected.bytes = collected.objects + 1, collected.bytes + size
                     if not dry_run:
                         path.unlink()

@@ -1,4 +1,4 @@
-"""Datasets that the store still knows, whatever their directories hold now, and bringing one back."""
+"""List the datasets that the store still has, whatever their directories hold now, and bring one back."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class Known:
     labelled: int  # recordings with labels that were set by hand
     path: str
     state: str
-    project: str = ""  # of what was pushed: the name of the project, or digits of its id; then ":" and the path name it
+    project: str = ""  # name of the project that pushed it, or digits of its id; PROJECT:PATH names the dataset
 
 
 def known(store: AnyStore) -> list[Known]:
     """Return the manifests that roots of the store name or named before, newest first."""
-    found: dict[tuple[str, str], Known] = {}
+    by_label: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
     for root in roots:
-        name_of = pushed.label(root, roots)
+        root_label = pushed.label(root, roots)
         for entry in [root, *root.get("history", [])]:
             name, path = entry["manifest"], str(root["path"])
             try:
@@ -63,7 +63,7 @@ def known(store: AnyStore) -> list[Known]:
                 continue  # collected, or damaged
             earlier = EARLIER if root["kind"] == PUSHED else REPLACED
             state = _state(root, name) if entry is root else earlier
-            found[name, name_of] = Known(
+            by_label[name, root_label] = Known(
                 name,
                 manifest.digest,
                 manifest.stage,
@@ -72,9 +72,10 @@ def known(store: AnyStore) -> list[Known]:
                 len(manifest.labels),
                 path,
                 state,
-                name_of.removesuffix(f":{path}") if root["kind"] == PUSHED else "",
+                root_label.removesuffix(f":{path}") if root["kind"] == PUSHED else "",
             )
-    return sorted(found.values(), key=lambda one: (-one.written_s, one.path))  # of a path, as its history has them
+    # the order is stable: ties keep that of a path's history
+    return sorted(by_label.values(), key=lambda listing: (-listing.written_s, listing.path))
 
 
 def _state(root: dict[str, Any], name: str) -> str:
@@ -85,35 +86,35 @@ def _state(root: dict[str, Any], name: str) -> str:
     if path.is_file():
         return SHOWN
     try:
-        there = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
+        current_digest = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
     except (FileNotFoundError, NotADirectoryError, regular.IrregularError):
         return GONE
     except (OSError, StorageError):
         return UNREAD
-    return SHOWN if there == name else REPLACED
+    return SHOWN if current_digest == name else REPLACED
 
 
 def to_json(listed: list[Known]) -> dict[str, Any]:
     """Return the list as one object."""
-    return {"schema_version": 1, "manifests": [asdict(one) for one in listed]}
+    return {"schema_version": 1, "manifests": [asdict(entry) for entry in listed]}
 
 
 def to_text(listed: list[Known]) -> str:
-    """Return one line a manifest; times are those of this computer's zone."""
+    """Return one line per manifest; times are those of this computer's zone."""
     lines = [f"{'manifest':<12}  {'written':<16}  {'stage':<20}  {'recordings':>10}  {'labelled':>8}  path"]
-    for one in listed:
-        written = time.strftime("%Y-%m-%d %H:%M", time.localtime(one.written_s))
-        state = "" if one.state == SHOWN else f"  ({one.state})"
+    for entry in listed:
+        date = time.strftime("%Y-%m-%d %H:%M", time.localtime(entry.written_s))
+        state = "" if entry.state == SHOWN else f"  ({entry.state})"
         lines.append(
-            f"{one.manifest[:12]}  {written}  {plain(one.stage):<20}  {one.recordings:>10}  {one.labelled:>8}  "
-            f"{plain(_place(one), 200)}{state}"
+            f"{entry.manifest[:12]}  {date}  {plain(entry.stage):<20}  {entry.recordings:>10}  {entry.labelled:>8}  "
+            f"{plain(_place(entry), 200)}{state}"
         )
     return printable.lines(lines)
 
 
-def _place(one: Known) -> str:
+def _place(entry: Known) -> str:
     """Return the path of a manifest, behind its project where it was pushed."""
-    return f"{one.project}:{one.path}" if one.state in (IN_STORE, EARLIER) else one.path
+    return f"{entry.project}:{entry.path}" if entry.state in (IN_STORE, EARLIER) else entry.path
 
 
 def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore | None = None) -> Manifest:
@@ -128,10 +129,10 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     store = locate()
     if source is None and store.distant:
         source = cache.behind(store)
-    wanted = _named(source or store, name)
-    with store.at_work([wanted]):
-        content = (source or store).read(wanted, regular.JSON_BYTES)
-        manifest = manifest_of.parse(content, wanted, StoredPages(source or store), verified=source is None)
+    manifest_digest = _manifest_digest(source or store, name)
+    with store.at_work([manifest_digest]):
+        content = (source or store).read(manifest_digest, regular.JSON_BYTES)
+        manifest = manifest_of.parse(content, manifest_digest, StoredPages(source or store), verified=source is None)
         directory_of.check_output(store, output)
         if not replace:
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
@@ -163,7 +164,7 @@ def _is_manifest(store: AnyStore, name: str) -> bool:
     return True
 
 
-def _named(store: AnyStore, name: str) -> str:
+def _manifest_digest(store: AnyStore, name: str) -> str:
     """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
     root = store.roots.get(Path(name).absolute())
     if root is not None:
@@ -177,10 +178,12 @@ def _named(store: AnyStore, name: str) -> str:
                 f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "
                 f"{store.place} has seen a dataset; `tacpipe store list` names both. {error}"
             ) from None
-    matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
+    matching = {
+        entry.manifest for entry in known(store) if entry.manifest.startswith(name) or entry.dataset.startswith(name)
+    }
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.place} begin with {name}; give more of its hex digits.")
-    if not matching and _is_manifest(store, name):  # that no root names any more
+    if not matching and _is_manifest(store, name):  # a manifest that no root names any more
         return name
     if not matching:
         raise UsageError(f"{store.place} knows no manifest {name}; `tacpipe store list` names those that it knows.")

@@ -1,4 +1,4 @@
-"""What is copied of a dataset from one store to another, in the order in which what names something comes after it."""
+"""Copy a dataset from one store to another: objects first, then manifests, then the records that name them."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from tacpipe.store.store import MissingError
 
 @dataclass
 class Transferred:
-    """How much went over, and how much was there already."""
+    """Counts of objects that were copied, and of those that the other store had already."""
 
     objects: int = 0
     bytes: int = 0
     there: int = 0
-    replaced: int = 0  # of the objects that went over: those that were there and damaged
-    datasets: list[str] = field(default_factory=list)  # as they are named in the other store
+    replaced: int = 0  # copied objects that were damaged in the other store
+    datasets: list[str] = field(default_factory=list)  # labels in the other store
 
 
 @dataclass
 class _Plan:
-    """What is to be copied."""
+    """Manifests and objects that are to be copied."""
 
     manifests: dict[str, bytes] = field(default_factory=dict)  # content by digest
     objects: dict[str, tuple[str, int]] = field(default_factory=dict)  # path within the dataset and bytes, by digest
@@ -44,24 +44,24 @@ class _Plan:
         }
 
 
-def _planned(source: AnyStore, target: AnyStore, found: manifest_of.Found, *, ancestors: bool) -> _Plan:
+def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, ancestors: bool) -> _Plan:
     """Return what a dataset needs: its manifest and objects, the manifests it descends from, perhaps their objects too."""
     plan = _Plan()
-    todo, seen = [found.digest], set()
+    todo, visited = [dataset.digest], set()
     while todo:
         name = todo.pop()
-        if name in seen:
+        if name in visited:
             continue
-        seen.add(name)
+        visited.add(name)
         try:
-            manifest = found.manifest if name == found.digest else _manifest(source, target, name)
+            manifest = dataset.manifest if name == dataset.digest else _manifest(source, target, name)
         except MissingError:
             continue
         plan.manifests[name] = manifest.content
         todo += garbage.ancestors(manifest)
-        if ancestors or name == found.digest:
+        if ancestors or name == dataset.digest:
             _expect_formed(manifest, name)
-            plan.objects.update({one: (path, size) for path, one, size in manifest.contents()})
+            plan.objects.update({digest: (path, size) for path, digest, size in manifest.contents()})
         elif manifest.pages is not None:
             plan.objects.update({page.digest: (page.path, page.bytes) for page in manifest.pages.pages})
     return plan
@@ -92,14 +92,16 @@ def copy(
     """
     plan = _planned(source, target, found, ancestors=ancestors)
     sizes = plan.sizes()
-    target.announce(sizes)  # before looking what is there
-    there = target.sizes(sizes)
-    absent = [name for name in plan.objects if there.get(name) != sizes[name]]
+    target.announce(sizes)  # announced before the sizes are read, so that no collection removes one
+    present_sizes = target.sizes(sizes)
+    absent = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
     _expect_room(target, sum(sizes[name] for name in absent))
-    absent += _damaged(target, [name for name in plan.objects if there.get(name) == sizes[name]], sizes, verify=verify)
+    absent += _damaged(
+        target, [name for name in plan.objects if present_sizes.get(name) == sizes[name]], sizes, verify=verify
+    )
     _send(source, target, plan, absent, beside)
     target.settle(layout.object_name(name) for name in absent)
-    fresh = [name for name in plan.manifests if there.get(name) != sizes[name]]
+    fresh = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
     fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
     for name in fresh:
         target.take(name, [plan.manifests[name]])
@@ -108,7 +110,7 @@ def copy(
     done.objects += len(moved)
     done.bytes += sum(sizes[name] for name in moved)
     done.there += len(sizes) - len(moved)
-    done.replaced += sum(name in there for name in moved)
+    done.replaced += sum(name in present_sizes for name in moved)
     _copy_records(source, target, found, sizes, before)
 
 
@@ -131,7 +133,7 @@ def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *
     ]
 
 
-def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], beside: tuple[str, ...]) -> None:
+def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], directories: tuple[str, ...]) -> None:
     """Copy objects, several at once where another computer is asked. Raises `DamagedError` for what is nowhere sound."""
     sizes = plan.sizes()
 
@@ -145,38 +147,40 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
 
     failed = []
     total = sum(sizes[name] for name in names)
-    went = 0
+    sent_bytes = 0
     with progress.bar("copying", len(names)) as advance:
         for name, error in threads.map_in_threads(send, names, max(source.at_once, target.at_once)):
             failed += [] if error is None else [(name, error)]
-            went += sizes[name]
-            advance(note=f"{went / 1e6:,.1f} of {total / 1e6:,.1f} MB")
+            sent_bytes += sizes[name]
+            advance(note=f"{sent_bytes / 1e6:,.1f} of {total / 1e6:,.1f} MB")
     for name, error in failed:  # a copy next to the manifest or the stage that made it may bring it back
         path, size = plan.objects[name]
         if isinstance(source, RemoteStore):
             raise DamagedError(f"{path}: {error}") from error
-        target.take(name, _counted([execution.reader(source, beside, sizes)(name, path)], size, path))
+        target.take(name, _counted([execution.reader(source, directories, sizes)(name, path)], size, path))
 
 
 def _copy_records(
-    source: AnyStore, target: AnyStore, found: manifest_of.Found, moved: Collection[str], before: str
+    source: AnyStore, target: AnyStore, dataset: manifest_of.Found, moved: Collection[str], before: str
 ) -> None:
     """Copy the records of what was copied, and note in ``target`` which those are."""
-    there = target.noted(found.digest) | (target.noted(before) if before else set())
+    noted_keys = target.noted(dataset.digest) | (target.noted(before) if before else set())
 
-    def commit(one: tuple[str, dict[str, Any]]) -> str:
-        key, record = one
-        if key not in there:
+    def commit(keyed_record: tuple[str, dict[str, Any]]) -> str:
+        key, record = keyed_record
+        if key not in noted_keys:
             target.commit(record["identity"], record["result"], record["provenance"])
         return key
 
     names = set(moved)
-    several = (
-        (key, one) for key, one in source.records_of(found.digest) if _named(one) & names and _named(one) <= names
+    keyed_records = (
+        (key, record)
+        for key, record in source.records_of(dataset.digest)
+        if _named_digests(record) & names and _named_digests(record) <= names
     )
-    keys = list(threads.map_in_threads(commit, several, max(source.at_once, target.at_once)))
+    keys = list(threads.map_in_threads(commit, keyed_records, max(source.at_once, target.at_once)))
     target.settle(layout.record_name(key) for key in keys)
-    target.note_records(found.digest, keys)
+    target.note_records(dataset.digest, keys)
 
 
 def _manifest(source: AnyStore, target: AnyStore, name: str) -> Manifest:
@@ -219,12 +223,12 @@ def _expect_room(target: AnyStore, needed: int) -> None:
         )
 
 
-def _named(record: Mapping[str, Any]) -> set[str]:
+def _named_digests(record: Mapping[str, Any]) -> set[str]:
     """Return the digests of what a record names; none where it has not the form of a record: a store may hold anything."""
     identity, provenance = record["identity"], record["provenance"]
     try:
         formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)
-        named = set(records.digests(record["result"])) if formed else set()
+        digests = set(records.digests(record["result"])) if formed else set()
     except (TypeError, KeyError, AttributeError):
         return set()
-    return named if all(isinstance(name, str) for name in named) else set()
+    return digests if all(isinstance(name, str) for name in digests) else set()

@@ -1,7 +1,7 @@
-"""What in a store is still needed, and removing the rest.
+"""Find what in a store is still needed, and remove the rest.
 
-No clock decides what is needed: who uses an object announces it before it looks whether the object is there, and a
-collection moves objects aside before it reads the announcements. So either sees the other.
+No clock decides what is needed. A process announces an object before it looks whether the object exists, and a collection
+moves objects aside before it reads the announcements. So one of the two sees the other.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from tacpipe.store.store import MissingError, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
-_YOUNG_S = 60.0  # what was just written is left alone, whoever wrote it
+_YOUNG_S = 60.0  # a younger file is left alone
 
 
 @dataclass
 class Collected:
-    """What `collect` removed, or would remove."""
+    """Counts of what `collect` removed, or would remove."""
 
     objects: int = 0
     bytes: int = 0
@@ -47,13 +47,13 @@ class Collected:
 
 @dataclass
 class Live:
-    """What is needed: by roots, by what lies at their paths, by running processes, and by what these descend from."""
+    """Everything that is needed by roots, by what lies at their paths, by running processes, or as an ancestor of these."""
 
     objects: set[str] = field(default_factory=set)  # digests, of manifests too
     lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
     replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
     pages: set[str] = field(default_factory=set)  # digests of the pages of manifests, among all these
-    manifests: list[Manifest] = field(default_factory=list)  # of recordings, among all these
+    manifests: list[Manifest] = field(default_factory=list)  # manifests of recordings, among all these
     doubtful: set[Path] = field(default_factory=set)  # files in quarantine that name what may be recordings
     runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
 
@@ -63,30 +63,32 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
 
     Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
     """
-    found, wanted, replaced = Live(), [], []
-    for run in store.leases.runs():  # before the roots: a run that ends meanwhile has written its root by then
-        found.runs.add(run.path.stem)
-        found.objects |= run.objects
-        wanted += run.manifests
-    shown: dict[str, manifest_of.Found] = {}  # manifests that directories show, by digest
+    needed, pending, replaced = Live(), [], []
+    for run in store.leases.runs():  # runs are read before roots: one that ends meanwhile has written its root
+        needed.runs.add(run.path.stem)
+        needed.objects |= run.objects
+        pending += run.manifests
+    datasets: dict[str, manifest_of.Found] = {}  # manifests that directories show, by digest
     walked: dict[str, set[str]] = {}  # digests of all that a page names, by its digest
     for root in store.roots.all():
         path = Path(root["path"])
-        here, reached = None, root["kind"] == PUSHED
+        manifest_bytes, reached = None, root["kind"] == PUSHED
         if not reached:
-            here, reached = content(path)
-        if here is not None:
-            one = _sound(here, path)
-            shown[one.digest] = one
-            wanted.append(one.digest)
+            manifest_bytes, reached = content(path)
+        if manifest_bytes is not None:
+            dataset = _sound(manifest_bytes, path)
+            datasets[dataset.digest] = dataset
+            pending.append(dataset.digest)
         expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
-        if here is None and not expired:
-            wanted.append(root["manifest"])
+        if manifest_bytes is None and not expired:
+            pending.append(root["manifest"])
         if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
-            wanted += [one["manifest"] for one in root.get("history", [])]
+            pending += [entry["manifest"] for entry in root.get("history", [])]
         elif lasting:
-            replaced += [one["manifest"] for one in root.get("history", []) if one["lasting"]]
-            replaced += [root["manifest"]] if here is None and expired and _lasting(store, root["manifest"]) else []
+            replaced += [entry["manifest"] for entry in root.get("history", []) if entry["lasting"]]
+            replaced += (
+                [root["manifest"]] if manifest_bytes is None and expired and _lasting(store, root["manifest"]) else []
+            )
     damaged = store.roots.damaged()
     if damaged:
         raise DamagedError(
@@ -95,11 +97,11 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
             f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
     doubtful = _doubtful(store)
-    found.doubtful = set(doubtful)
-    found.objects |= _closure(store, wanted, shown, walked, found.manifests).union(*doubtful.values())
-    found.lasting = _closure(store, list(replaced), shown, walked, found.manifests) - found.objects
-    found.pages, found.replaced = set(walked), set(replaced)
-    return found
+    needed.doubtful = set(doubtful)
+    needed.objects |= _closure(store, pending, datasets, walked, needed.manifests).union(*doubtful.values())
+    needed.lasting = _closure(store, list(replaced), datasets, walked, needed.manifests) - needed.objects
+    needed.pages, needed.replaced = set(walked), set(replaced)
+    return needed
 
 
 def _lasting(store: Store, name: str) -> bool:
@@ -126,26 +128,27 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    records = [*map(_brief, store.records())]  # before what is needed: a damaged one goes to quarantine, and counts
+    # records are read before `live`: a damaged one goes to quarantine, which `live` reads
+    records = [*map(_brief, store.records())]
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
-    kept, unneeded = set(needed.lasting), []
+    retained, unneeded = set(needed.lasting), []
     for key, named_text, irreplaceable in records:
         names = set(named_text.split())
-        if names <= needed.objects or names <= kept:
+        if names <= needed.objects or names <= retained:
             continue
         if irreplaceable and not recordings:
-            kept |= names - needed.objects
+            retained |= names - needed.objects
             continue
         unneeded.append(key)
-    kept |= needed.objects
-    objects = [name for name in layout.names(store.root, "objects") if name not in kept]
+    retained |= needed.objects
+    objects = [name for name in layout.names(store.root, "objects") if name not in retained]
     named_by = {} if recordings else unnamed.kept(store, objects, needed.manifests)
-    kept = kept.union(named_by, *named_by.values())
+    retained = retained.union(named_by, *named_by.values())
     collected.records = sum(_remove_record(store.record_path(key), dry_run=dry_run) for key in unneeded)
-    collected.kept_recordings = len(kept - needed.objects - needed.replaced - needed.pages - set(named_by))
-    aside = []
-    for name in (name for name in objects if name not in kept):
+    collected.kept_recordings = len(retained - needed.objects - needed.replaced - needed.pages - set(named_by))
+    moved_names = []
+    for name in (name for name in objects if name not in retained):
         path = store.object_path(name)
         if _young(path):
             continue
@@ -154,26 +157,26 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         else:
             with contextlib.suppress(FileNotFoundError):
                 os.rename(path, store.aside_path(name))  # noqa: PTH104
-                aside.append(name)
-    if aside:
-        shown = {root["manifest"] for root in store.roots.all()}
-        aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
-        _remove(store, aside, live(store, grace_days).objects, collected)
+                moved_names.append(name)
+    if moved_names:
+        root_manifests = {root["manifest"] for root in store.roots.all()}
+        moved_names.sort(key=lambda name: name not in root_manifests)  # manifests of roots go before what they name
+        _remove(store, moved_names, live(store, grace_days).objects, collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
 
 
-def _brief(found: tuple[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
+def _brief(keyed_record: tuple[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
     """Return the key of a record, the digests that it names, and whether it marks a recording: memory holds all records."""
-    key, record = found
+    key, record = keyed_record
     return key, " ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable"))
 
 
-def _remove(store: Store, aside: list[str], needed: set[str], collected: Collected) -> None:
+def _remove(store: Store, moved_names: list[str], needed: set[str], collected: Collected) -> None:
     """Remove the objects that were moved aside, but for those that somebody needed in the meantime."""
-    for name in aside:
+    for name in moved_names:
         if name in needed:
-            store.has(name)  # which puts it back
+            store.has(name)  # this puts it back
             continue
         path = store.aside_path(name)
         _count(collected, path)
@@ -188,7 +191,7 @@ def _put_back(store: Store) -> None:
 
 
 def _count(collected: Collected, path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):  # put back by who needs it, or removed by another collection
+    with contextlib.suppress(FileNotFoundError):  # a process put it back, or another collection removed it
         collected.bytes += os.stat(path).st_size  # noqa: PTH116
         collected.objects += 1
 
@@ -210,38 +213,38 @@ def _remove_record(path: str, *, dry_run: bool) -> bool:
 
 def _closure(
     store: Store,
-    wanted: list[str],
-    shown: Mapping[str, manifest_of.Found],
+    pending: list[str],
+    datasets: Mapping[str, manifest_of.Found],
     walked: dict[str, set[str]],
-    of_recordings: list[Manifest],
+    recording_manifests: list[Manifest],
 ) -> set[str]:
     """Return the digests of manifests, of those they descend from, and of all objects that these name.
 
-    Manifests of recordings are added to ``of_recordings``. A page that was ``walked`` is not read again. Raises
+    Manifests of recordings are added to ``recording_manifests``. A page that was ``walked`` is not read again. Raises
     `DamagedError` where something damaged is needed to know that, as a page of a manifest that a directory shows.
     """
     objects: set[str] = set()
     manifests: set[str] = set()
-    while wanted:
-        name = wanted.pop()
+    while pending:
+        name = pending.pop()
         if name in manifests:
             continue
         manifests.add(name)
         try:
-            manifest = shown[name].manifest if name in shown else manifest_of.stored(store, name)
+            manifest = datasets[name].manifest if name in datasets else manifest_of.stored(store, name)
             objects |= manifest.reached(walked)
         except StorageError:  # the disk failed, or memory is short: what the manifest names is not known
             raise
         except TacpipeError as error:
-            if name in shown or store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
+            if name in datasets or store.quarantined(name) or store.has(name):  # it came here once
                 raise DamagedError(
                     f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
                     "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
                     "continue without it, remove it from objects/ and quarantine/."
                 ) from error
             continue  # it never came here: of a dataset that was copied or pulled without what it descends from
-        wanted += ancestors(manifest)
-        of_recordings += [manifest] if manifest.recorded else []
+        pending += ancestors(manifest)
+        recording_manifests += [manifest] if manifest.recorded else []
     return objects | manifests
 
 
@@ -250,21 +253,21 @@ def _doubtful(store: Store) -> dict[Path, set[str]]:
 
     Those that were recomputed, or brought back, are in doubt no longer.
     """
-    found = {}
+    names_by_path = {}
     for path in layout.entries(store.root, "quarantine"):
         name, _, kind = path.name.rpartition(".")[0].partition(".")
         if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
             continue
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # what is larger was a shard
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # a larger file was a shard
             names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
             if names:
-                found[path] = names | unnamed.named_by_pages(store, names)
-    return found
+                names_by_path[path] = names | unnamed.named_by_pages(store, names)
+    return names_by_path
 
 
 def ancestors(manifest: manifest_of.Manifest) -> list[str]:
     """Return the digests of the manifests that this one was made from."""
-    return [given["manifest"] for several in manifest.inputs.values() for given in several]
+    return [reference["manifest"] for references in manifest.inputs.values() for reference in references]
 
 
 def content(path: Path) -> tuple[bytes | None, bool]:
@@ -284,16 +287,16 @@ def content(path: Path) -> tuple[bytes | None, bool]:
 
 def _sound(content: bytes, path: Path) -> manifest_of.Found:
     """Return the manifest that lies at a path. Raises `DamagedError` where it is not sound."""
-    found = manifest_of.Found(path, content)
+    dataset = manifest_of.Found(path, content)
     try:
-        found.manifest  # noqa: B018  (is it sound?)
+        dataset.manifest  # noqa: B018  (is it sound?)
     except StorageError:
         raise
     except TacpipeError as error:
         raise DamagedError(
             f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."
         ) from None
-    return found
+    return dataset
 
 
 def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
@@ -304,9 +307,9 @@ def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reache
     now_s = int(time.time())
     since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # a clock may have been set back
     if since_s != root.get("missing_since_s") and not dry_run:
-        kept = {key: value for key, value in root.items() if key != "missing_since_s"}
+        unmarked_root = {key: value for key, value in root.items() if key != "missing_since_s"}
         with contextlib.suppress(TacpipeError):
-            store.roots.write(kept if since_s is None else {**kept, "missing_since_s": since_s})
+            store.roots.write(unmarked_root if since_s is None else {**unmarked_root, "missing_since_s": since_s})
     if since_s is None:
         return False
     return grace_days <= 0 or now_s - since_s > grace_days * 86400

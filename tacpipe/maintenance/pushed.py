@@ -1,4 +1,4 @@
-"""Datasets that projects pushed to a store: how they are named, which one is meant, and what a push may replace.
+"""Name the datasets that projects pushed, find one by its name, and refuse a push that would replace a newer one.
 
 A name belongs to a project: ``exp:data/rec`` is ``data/rec`` of the project ``exp``, and ``:data/rec`` one that was pushed
 before projects had an identity. Each push is a snapshot. The newest one is what a pull takes, and those before it are the
@@ -22,14 +22,14 @@ from tacpipe.store.store import Store
 
 AnyStore = Store | RemoteStore
 SHORTEST = 6  # digits by which a project or a manifest may be named
-_SHOWN_DIGITS = 8  # of a project whose name another one has too
+_SHOWN_DIGITS = 8  # digits of a project's id, shown where another project has its name too
 _SHOWN = 20  # datasets listed before the rest is counted
 
 
 def roots(store: AnyStore) -> list[Root]:
     """Return the roots of what was pushed to a store, by name."""
-    found = [root for root in store.roots.all() if root["kind"] == PUSHED]
-    return sorted(found, key=lambda root: (str(root["path"]), project_id(root)))
+    pushed_roots = [root for root in store.roots.all() if root["kind"] == PUSHED]
+    return sorted(pushed_roots, key=lambda root: (str(root["path"]), project_id(root)))
 
 
 def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
@@ -44,7 +44,10 @@ def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
     every = list(every)
     ids = {project_id(root): str(root.get("project", {}).get("name", "")) for root in every}
     shared = Counter(ids.values())
-    names = {one: one[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name for one, name in ids.items()}
+    names = {
+        identifier: identifier[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name
+        for identifier, name in ids.items()
+    }
     return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in every}
 
 
@@ -52,19 +55,21 @@ def label(root: Root, every: Iterable[Root]) -> str:
     """Return how a root of a store is named among all ``every`` of them: by its path, behind its project if pushed."""
     if root["kind"] != PUSHED:
         return str(root["path"])
-    return labels([*(one for one in every if one["kind"] == PUSHED), root])[project_id(root), root["path"]]
+    return labels([*(candidate for candidate in every if candidate["kind"] == PUSHED), root])[
+        project_id(root), root["path"]
+    ]
 
 
-def _of_project(wanted: str, every: Iterable[Root]) -> list[Root]:
+def _roots_of_project(requested: str, pushed_roots: Iterable[Root]) -> list[Root]:
     """Return the pushed roots that ``PROJECT:PATH`` names.
 
     A project is given by its name, by `SHORTEST` or more digits of its id, or by nothing for what has none.
     """
-    project, colon, path = wanted.partition(":")
-    return [root for root in every if colon and root["path"] == path and _is_of(project, root)]
+    project, colon, path = requested.partition(":")
+    return [root for root in pushed_roots if colon and root["path"] == path and _belongs_to(project, root)]
 
 
-def _is_of(project: str, root: Root) -> bool:
+def _belongs_to(project: str, root: Root) -> bool:
     if not project:
         return not project_id(root)
     by_id = len(project) >= SHORTEST and project_id(root).startswith(project)
@@ -73,17 +78,19 @@ def _is_of(project: str, root: Root) -> bool:
 
 def project_in(store: AnyStore, wanted: str) -> Project:
     """Return the project of a store that has this name, or an id that begins so. Raises `UsageError` if there is not one."""
-    known = {project_id(root): root["project"]["name"] for root in roots(store) if project_id(root)}
-    found = [
-        one for one, name in known.items() if wanted == name or (len(wanted) >= SHORTEST and one.startswith(wanted))
+    names_by_id = {project_id(root): root["project"]["name"] for root in roots(store) if project_id(root)}
+    matching = [
+        identifier
+        for identifier, name in names_by_id.items()
+        if wanted == name or (len(wanted) >= SHORTEST and identifier.startswith(wanted))
     ]
-    if len(found) != 1:
-        names = listed((f"{name} ({one[:_SHOWN_DIGITS]})" for one, name in known.items()), _SHOWN)
-        several = "several projects are" if found else "no project is"
+    if len(matching) != 1:
+        names = listed((f"{name} ({identifier[:_SHOWN_DIGITS]})" for identifier, name in names_by_id.items()), _SHOWN)
+        subject = "several projects are" if matching else "no project is"
         raise UsageError(
-            f"{several} called {wanted} in {store.place}; it has {names}. Give one's name, or digits of its id."
+            f"{subject} called {wanted} in {store.place}; it has {names}. Give one's name, or digits of its id."
         )
-    return Project(found[0], known[found[0]])
+    return Project(matching[0], names_by_id[matching[0]])
 
 
 def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
@@ -93,30 +100,35 @@ def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
     as on a second computer; and what was pushed before projects had an identity may be anybody's. Raises `UsageError`
     where none or several are meant, and names what is there.
     """
-    every = roots(store)
-    found = _of_project(wanted, every) or _of_name(name, every, own)
-    if len(found) == 1:
-        return found[0]
-    names = labels(every)
-    same = found or [root for root in every if root["path"] == name]
-    others = sorted(names[project_id(root), root["path"]] for root in same)
-    if others:
+    all_roots = roots(store)
+    matching = _roots_of_project(wanted, all_roots) or _roots_of_name(name, all_roots, own)
+    if len(matching) == 1:
+        return matching[0]
+    names = labels(all_roots)
+    same_name = matching or [root for root in all_roots if root["path"] == name]
+    other_labels = sorted(names[project_id(root), root["path"]] for root in same_name)
+    if other_labels:
         raise UsageError(
-            f"{store.place} has no dataset {wanted} of this project, but of others: {listed(others, _SHOWN)}. Give one of "
-            f"these names."
+            f"{store.place} has no dataset {wanted} of this project, but of others: {listed(other_labels, _SHOWN)}. Give "
+            f"one of these names."
         )
-    known = [(root, names[project_id(root), root["path"]]) for root in every]
-    shown = [root["path"] if _of_name(root["path"], every, own) == [root] else named for root, named in known]
-    there = listed(sorted(shown), _SHOWN) if shown else "nothing that was pushed"
-    raise UsageError(f"{store.place} has no dataset {wanted}; it has {there}.")
+    labelled = [(root, names[project_id(root), root["path"]]) for root in all_roots]
+    shown_names = [
+        root["path"] if _roots_of_name(root["path"], all_roots, own) == [root] else root_label
+        for root, root_label in labelled
+    ]
+    available = listed(sorted(shown_names), _SHOWN) if shown_names else "nothing that was pushed"
+    raise UsageError(f"{store.place} has no dataset {wanted}; it has {available}.")
 
 
-def _of_name(name: str, every: Iterable[Root], own: Project | None) -> list[Root]:
-    """Return the pushed roots that a name alone may mean for the project ``own``."""
-    same = [root for root in every if root["path"] == name]
-    if own is None:
-        return same
-    return [root for root in same if project_id(root) == own.id] or [root for root in same if not project_id(root)]
+def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | None) -> list[Root]:
+    """Return the pushed roots that a name alone may mean for a project."""
+    same_name = [root for root in pushed_roots if root["path"] == name]
+    if project is None:
+        return same_name
+    return [root for root in same_name if project_id(root) == project.id] or [
+        root for root in same_name if not project_id(root)
+    ]
 
 
 def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str) -> None:
@@ -124,9 +136,9 @@ def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str
     manifest = str(before["manifest"])
     if manifest in seen:
         return
-    written = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
+    date = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
     raise UsageError(
-        f"{there.place} holds another {name} than this project has had here: {manifest[:12]}, pushed on {written}. `tacpipe "
+        f"{there.place} holds another {name} than this project has had here: {manifest[:12]}, pushed on {date}. `tacpipe "
         f"store checkout {manifest[:12]} --remote {there.place} -o DIRECTORY` brings it; --replace pushes all the same, and "
         f"keeps it as an earlier snapshot."
     )
@@ -135,12 +147,12 @@ def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str
 def lasting(store: AnyStore, manifest: str) -> bool:
     """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
     try:
-        found = manifest_of.stored(store, manifest)
+        pushed_manifest = manifest_of.stored(store, manifest)
     except StorageError:
         raise
     except TacpipeError:
         return True
-    return replacing.lasting(found)
+    return replacing.lasting(pushed_manifest)
 
 
 def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
@@ -148,38 +160,41 @@ def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
 
     Returns whether there was any. Raises `UsageError` where several are meant.
     """
-    every = roots(store)
-    found = _of_project(wanted, every) or [root for root in every if root["path"] == wanted]
-    if len(found) > 1:
-        names = listed((label(root, every) for root in found), _SHOWN)
+    all_roots = roots(store)
+    matching = _roots_of_project(wanted, all_roots) or [root for root in all_roots if root["path"] == wanted]
+    if len(matching) > 1:
+        names = listed((label(root, all_roots) for root in matching), _SHOWN)
         raise UsageError(f"{store.place} keeps several datasets {wanted}: {names}. Give one of these names.")
-    if found:
+    if matching:
         if not dry_run:
-            store.roots.remove(found[0])
+            store.roots.remove(matching[0])
         return True
     snapshots = {
-        one for root in every for one in _manifests(root) if len(wanted) >= SHORTEST and one.startswith(wanted)
+        digest
+        for root in all_roots
+        for digest in _manifests(root)
+        if len(wanted) >= SHORTEST and digest.startswith(wanted)
     }
     if len(snapshots) > 1:
         raise UsageError(
             f"{len(snapshots)} snapshots in {store.place} begin with {wanted}; give more of its hex digits."
         )
-    for root in every if snapshots and not dry_run else ():
-        _without(store, root, *snapshots)
+    for root in all_roots if snapshots and not dry_run else ():
+        _remove_manifest(store, root, *snapshots)
     return bool(snapshots)
 
 
 def _manifests(root: Root) -> list[str]:
     """Return the digests of a root's manifests, newest first."""
-    return [str(one["manifest"]) for one in (root, *root.get("history", []))]
+    return [str(entry["manifest"]) for entry in (root, *root.get("history", []))]
 
 
-def _without(store: AnyStore, root: Root, manifest: str) -> None:
+def _remove_manifest(store: AnyStore, root: Root, manifest: str) -> None:
     """Take a manifest out of a pushed root; of those that stay the newest is what a pull takes."""
-    kept = [one for one in (root, *root.get("history", [])) if one["manifest"] != manifest]
-    if kept and len(kept) <= len(root.get("history", [])):
-        newest = {key: kept[0].get(key) for key in ("manifest", "written_s")}
-        previous = kept[1]["manifest"] if len(kept) > 1 else None
-        store.roots.write({**root, **newest, "previous": previous, "history": kept[1:]})
+    retained = [entry for entry in (root, *root.get("history", [])) if entry["manifest"] != manifest]
+    if retained and len(retained) <= len(root.get("history", [])):
+        newest = {key: retained[0].get(key) for key in ("manifest", "written_s")}
+        previous = retained[1]["manifest"] if len(retained) > 1 else None
+        store.roots.write({**root, **newest, "previous": previous, "history": retained[1:]})
     if manifest in _manifests(root):
-        store.roots.remove(root)  # what was just written is another one
+        store.roots.remove(root)  # the root that was just written is another one

@@ -1,4 +1,4 @@
-"""A store as a whole: what is in it, whether it is sound, and its repair."""
+"""Show what is in a store, verify that it is sound, and repair it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders
 
 @dataclass
 class Soundness:
-    """What was looked at, what was wrong, and what could be done about it."""
+    """Counts of objects and records that were read, the faults among them, and the repairs."""
 
     there: bool = True  # False where there is no store yet
     objects: int = 0
@@ -47,7 +47,7 @@ class Soundness:
 
     @property
     def clean(self) -> bool:
-        """Whether all was read, nothing was damaged and nothing is missing."""
+        """Return whether all was read, nothing was damaged and nothing is missing."""
         return not (self.damaged or self.missing or self.lost or self.unread)
 
     def to_text(self, *, changed: bool = True) -> str:
@@ -61,8 +61,8 @@ class Soundness:
         lines += [f"damaged{', now in quarantine' if changed else ''}: {name}" for name in self.damaged]
         lines += [f"missing: {name}" for name in self.missing]
         lines += [f"recomputed: {name}" for name in self.repaired]
-        lines += [f"cannot be recomputed: {name}: {why}" for name, why in self.lost.items()]
-        lines += [f"not read, and perhaps sound: {name}: {why}" for name, why in [*self.unread.items()][:_SHOWN]]
+        lines += [f"cannot be recomputed: {name}: {reason}" for name, reason in self.lost.items()]
+        lines += [f"not read, and perhaps sound: {name}: {reason}" for name, reason in [*self.unread.items()][:_SHOWN]]
         if len(self.unread) > _SHOWN:
             lines.append(f"not read, and perhaps sound: {len(self.unread) - _SHOWN} more")
         if self.clean:
@@ -81,28 +81,29 @@ def verify(store: Store) -> Soundness:
     """
     if not store.check():
         return Soundness(there=False)
-    found = Soundness(foreign=layout.foreign(store.root))
+    soundness = Soundness(foreign=layout.foreign(store.root))
     for name in layout.names(store.root, "objects"):
-        found.objects += _read(store.read, name, found)
+        soundness.objects += _read(store.read, name, soundness)
     for key in layout.names(store.root, "records"):
-        found.records += _read(store.read_record, key, found)
+        soundness.records += _read(store.read_record, key, soundness)
     store.roots.all()
-    found.damaged += [f"root {name}" for name in store.roots.damaged()]
-    missing = set(_wanted(store, found)) - set(found.damaged)
-    found.missing = sorted(missing & set(_wanted(store, found))) if missing else []  # a root may have changed meanwhile
-    return found
+    soundness.damaged += [f"root {name}" for name in store.roots.damaged()]
+    missing = set(_absent_objects(store, soundness)) - set(soundness.damaged)
+    # a root may have changed meanwhile, so absent objects are looked for twice
+    soundness.missing = sorted(missing & set(_absent_objects(store, soundness))) if missing else []
+    return soundness
 
 
-def _read(read: Callable[[str], object], name: str, found: Soundness) -> bool:
+def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> bool:
     """Return whether something was there to read; note its name where it was damaged, or where the disk failed."""
     try:
         read(name)
     except AbsentError:
         return False
     except MissingError:
-        found.damaged.append(name)
+        soundness.damaged.append(name)
     except StorageError as error:
-        found.unread[name] = str(error)
+        soundness.unread[name] = str(error)
     return True
 
 
@@ -111,48 +112,48 @@ def repair(store: Store) -> Soundness:
     if not store.check():
         return Soundness(there=False)
     with store.at_work():
-        found = verify(store)
-        found.repaired += _roots_again(store)
+        soundness = verify(store)
+        soundness.repaired += _rewrite_roots(store)
         roots = store.roots.all()
-        found.repaired += [name for root in roots for name in _manifest_again(store, root)]
-        manifests = [one for one in (_find(root) for root in roots) if one is not None]
-        for one in manifests:
-            if not store.has(one.digest):
-                one.manifest.keep(store)
-                found.repaired.append(one.digest)
-        wanted = _wanted(store, found)
+        soundness.repaired += [name for root in roots for name in _rewrite_manifest(store, root)]
+        datasets = [dataset for dataset in (_find(root) for root in roots) if dataset is not None]
+        for dataset in datasets:
+            if not store.has(dataset.digest):
+                dataset.manifest.keep(store)
+                soundness.repaired.append(dataset.digest)
+        paths_by_digest = _absent_objects(store, soundness)
         read = execution.reader(store, tuple(root["path"] for root in roots))
-        for name, path in sorted(wanted.items()):
+        for name, path in sorted(paths_by_digest.items()):
             try:
                 read(name, path)
-                found.repaired.append(name)
+                soundness.repaired.append(name)
             except StorageError as error:
-                found.unread[name] = str(error)
+                soundness.unread[name] = str(error)
             except TacpipeError as error:
-                found.lost[name] = str(error)
-        found.missing = []
-    return found
+                soundness.lost[name] = str(error)
+        soundness.missing = []
+    return soundness
 
 
-def _roots_again(store: Store) -> list[str]:
-    """Write damaged roots anew whose datasets lie next to the store; return their names."""
-    names, found = store.roots.damaged(), []
+def _rewrite_roots(store: Store) -> list[str]:
+    """Write damaged roots again whose datasets lie next to the store; return their names."""
+    names, rewritten = store.roots.damaged(), []
     for place, folders, files in walk(store.root.parent, links=False) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]
         if manifest_of.NAME not in files:
             continue
-        one = _sound(Path(place))
-        if one is None:
+        dataset = _sound(Path(place))
+        if dataset is None:
             continue
         for name in names:
             if store.roots.is_of(name, Path(place)):
-                store.roots.set(Path(place), one.digest)
-                found.append(f"root {name}")
-    return found
+                store.roots.set(Path(place), dataset.digest)
+                rewritten.append(f"root {name}")
+    return rewritten
 
 
-def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
-    """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine.
+def _rewrite_manifest(store: Store, root: dict[str, Any]) -> list[str]:
+    """Write the manifest at a root's path again where it is damaged; return its digest. What lay there goes to quarantine.
 
     Only at paths that this user's own roots name: another user's could name any file that is called so.
     """
@@ -177,17 +178,21 @@ def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
 
 
 def link(path: Path) -> int:
-    """Link the shards of the dataset at ``path`` anew where they do not match its manifest; return how many."""
-    found = manifest_of.find(path)
-    manifest, directory = found.manifest, found.directory
+    """Link the shards of the dataset at ``path`` again where they do not match its manifest; return how many."""
+    dataset = manifest_of.find(path)
+    manifest, directory = dataset.manifest, dataset.directory
     store = locate(directory)
-    with store.at_work([found.digest]), directory_of.changing(store, directory):
+    with store.at_work([dataset.digest]), directory_of.changing(store, directory):
         sizes = dict(manifest.sizes())
         read = execution.reader(store, (str(directory.absolute()),), sizes)
         stale = []
         for name, digest in manifest.objects():
-            there = directory / name
-            matches = there.is_file() and there.stat().st_size == sizes[digest] and file_digest(there) == digest
+            shard_path = directory / name
+            matches = (
+                shard_path.is_file()
+                and shard_path.stat().st_size == sizes[digest]
+                and file_digest(shard_path) == digest
+            )
             if not (matches and store.has(digest)):
                 read(digest, name)  # heals the store first
             if not matches:
@@ -199,17 +204,17 @@ def link(path: Path) -> int:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
         manifest.keep(store)
         deliver(store, directory.absolute(), manifest)
-        store.roots.set(directory.absolute(), found.digest)
+        store.roots.set(directory.absolute(), dataset.digest)
     return len(stale)
 
 
 def status(store: Store) -> dict[str, Any]:
-    """Return where the store is, counts and bytes of what lies in it, its roots and who is at work."""
-    there = store.check()
+    """Return where the store is, counts and bytes of what lies in it, its roots and the runs at work."""
+    exists = store.check()
     folders = {name: _measured(store, name) for name in _COUNTED}
     roots = [{**root, "reachable": _reachable(root)} for root in store.roots.all()]
     running = [run.note for run in store.leases.runs()]
-    return {"store": str(store.root), "there": there, **folders, "roots": roots, "running": running}
+    return {"store": str(store.root), "there": exists, **folders, "roots": roots, "running": running}
 
 
 def _measured(store: Store, name: str) -> dict[str, int]:
@@ -227,7 +232,7 @@ def _measured(store: Store, name: str) -> dict[str, int]:
 def _reachable(root: dict[str, Any]) -> bool:
     try:
         return root["kind"] == PUSHED or Path(root["path"]).exists()
-    except OSError:  # as behind a folder that may not be entered
+    except OSError:  # a folder above it may not be entered
         return False
 
 
@@ -252,33 +257,33 @@ def _find(root: dict[str, Any]) -> manifest_of.Found | None:
 
 def _sound(directory: Path) -> manifest_of.Found | None:
     try:
-        found = manifest_of.find(directory)
-        found.manifest  # noqa: B018  (is it sound?)
+        dataset = manifest_of.find(directory)
+        dataset.manifest  # noqa: B018  (is it sound?)
     except TacpipeError:
         return None
-    return found
+    return dataset
 
 
-def _wanted(store: Store, found: Soundness) -> dict[str, str]:
+def _absent_objects(store: Store, soundness: Soundness) -> dict[str, str]:
     """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name.
 
-    What the system fails to read, or to look for, is noted in ``found``.
+    What the system fails to read, or to look for, is noted in ``soundness``.
     """
-    wanted = {}
+    paths_by_digest = {}
     for root in store.roots.all():
-        here = _find(root)
+        dataset = _find(root)
         if root["kind"] == PUSHED and not store.has(root["manifest"]):
-            wanted[root["manifest"]] = manifest_of.NAME
+            paths_by_digest[root["manifest"]] = manifest_of.NAME
             continue
         try:
-            manifest = manifest_of.stored(store, root["manifest"]) if here is None else here.manifest
+            manifest = manifest_of.stored(store, root["manifest"]) if dataset is None else dataset.manifest
             if not store.has(manifest.content_digest):
-                wanted[manifest.content_digest] = manifest_of.NAME
+                paths_by_digest[manifest.content_digest] = manifest_of.NAME
             absent = [] if manifest.pages is None else manifest.pages.missing(store.has)
-            wanted.update({page.digest: page.path for page in absent})
-            wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
+            paths_by_digest.update({page.digest: page.path for page in absent})
+            paths_by_digest.update({name: path for path, name in manifest.objects() if not store.has(name)})
         except StorageError as error:
-            found.unread[root["manifest"]] = str(error)
+            soundness.unread[root["manifest"]] = str(error)
         except TacpipeError:
             continue
-    return wanted
+    return paths_by_digest

@@ -1,4 +1,4 @@
-"""Copies of datasets to and from another store, a folder or a bucket, so that CI evaluates what a rig recorded."""
+"""Copy datasets to and from another store, a folder or a bucket, so that CI evaluates what a rig recorded."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _LOOKS = 100  # pushes of one name that may come first
 
 def named_store(remote: Path | str) -> AnyStore:
     """Return the store at a path or an address, whether or not there is one. Raises `UsageError` for another address."""
-    found = addresses.parsed(str(remote))
-    if isinstance(found, Path):
-        return Store(files.local(found).absolute())
-    return RemoteStore(Bucket(found))
+    address = addresses.parsed(str(remote))
+    if isinstance(address, Path):
+        return Store(files.local(address).absolute())
+    return RemoteStore(Bucket(address))
 
 
 def remote_store(remote: Path | str) -> AnyStore:
@@ -77,37 +77,39 @@ def push(
     Raises `UsageError` where another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
     a shard that is damaged here and cannot be recomputed.
     """
-    there, done = named_store(remote), Transferred()
+    target, transferred = named_store(remote), Transferred()
     for path in paths:
-        here = locate(path)
-        found = manifest_of.find(path)
-        found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
-        folder, name = projects.place(found.directory)
+        local_store = locate(path)
+        dataset = manifest_of.find(path)
+        dataset.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
+        folder, name = projects.place(dataset.directory)
         if project:
-            projects.join(here, folder, pushed.project_in(there, project))
-        with _announced(here, found.digest) as writable, there.at_work([found.digest]):
-            owner = projects.identify(here, folder, writable=writable)
+            projects.join(local_store, folder, pushed.project_in(target, project))
+        with _announced(local_store, dataset.digest) as writable, target.at_work([dataset.digest]):
+            owner = projects.identify(local_store, folder, writable=writable)
             if writable:
-                replacing.outgoing(here, found.directory.absolute())
+                replacing.outgoing(local_store, dataset.directory.absolute())
             lock = digest(["pushed", owner.id, name])
-            with there.exclusively(lock, f"the pushed dataset {name}"):
-                before = _before(there, here, found, owner, name, replace=replace)
+            with target.exclusively(lock, f"the pushed dataset {name}"):
+                before = _predecessor(target, local_store, dataset, owner, name, replace=replace)
                 copying.copy(
-                    here,
-                    there,
-                    found,
-                    done,
-                    beside=(str(found.directory.absolute()),),
+                    local_store,
+                    target,
+                    dataset,
+                    transferred,
+                    beside=(str(dataset.directory.absolute()),),
                     ancestors=ancestors,
                     verify=verify,
                     before="" if before is None else before["manifest"],
                 )
-                _name(there, here, found, owner, name, before, replace=replace)
+                _publish_name(target, local_store, dataset, owner, name, before, replace=replace)
             if writable:
-                here.roots.note_pushed(found.directory.absolute(), found.digest)
-        every = pushed.roots(there)
-        done.datasets += [pushed.label(root, every) for root in every if _is(root, owner, name)]
-    return done
+                local_store.roots.note_pushed(dataset.directory.absolute(), dataset.digest)
+        pushed_roots = pushed.roots(target)
+        transferred.datasets += [
+            pushed.label(root, pushed_roots) for root in pushed_roots if _is_root_of(root, owner, name)
+        ]
+    return transferred
 
 
 def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, replace: bool = False) -> Transferred:
@@ -115,23 +117,24 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
 
     ``PROJECT:PATH`` is what another project pushed, and is written to that path of this one.
     """
-    there, done = remote_store(remote), Transferred()
+    source, transferred = remote_store(remote), Transferred()
     for path in paths:
-        found, name = _wanted(path, there)
-        local_store = locate(found.directory)
-        manifest = found.manifest  # one edited by hand is refused before anything moves
-        directory_of.check_output(local_store, found.directory)
-        occupant = replacing.occupant(local_store, found.directory)
+        dataset, name = _find_dataset(path, source)
+        local_store = locate(dataset.directory)
+        manifest = dataset.manifest  # one edited by hand is refused before anything moves
+        directory_of.check_output(local_store, dataset.directory)
+        occupant = replacing.occupant(local_store, dataset.directory)
         if occupant is not None and occupant.content != manifest.content and not replace:
             raise UsageError(
-                f"{found.directory} holds another dataset than {name}. --replace writes {name} there, and what is there now "
-                f"stays in the store; `tacpipe store checkout {name} --remote {remote} -o DIRECTORY` writes it elsewhere."
+                f"{dataset.directory} holds another dataset than {name}. --replace writes {name} there, and what is there "
+                f"now stays in the store; `tacpipe store checkout {name} --remote {remote} -o DIRECTORY` writes it "
+                f"elsewhere."
             )
-        with local_store.at_work([found.digest]):
-            bring(there, local_store, found, done, ancestors=ancestors)
-            directory_of.publish(local_store, manifest, found.directory, replace=replace)
-        done.datasets.append(name)
-    return done
+        with local_store.at_work([dataset.digest]):
+            bring(source, local_store, dataset, transferred, ancestors=ancestors)
+            directory_of.publish(local_store, manifest, dataset.directory, replace=replace)
+        transferred.datasets.append(name)
+    return transferred
 
 
 def bring(
@@ -166,10 +169,10 @@ def _announced(store: Store, manifest: str) -> Iterator[bool]:
             ) from error
 
 
-def _name(
-    there: AnyStore,
-    here: Store,
-    found: manifest_of.Found,
+def _publish_name(
+    target: AnyStore,
+    local_store: Store,
+    dataset: manifest_of.Found,
     owner: Project,
     name: str,
     before: Root | None,
@@ -179,68 +182,68 @@ def _name(
     """Have ``name`` mean what was copied. Raises as `push` does where another push came first."""
     project = {"id": owner.id, "name": owner.name}
     for _ in range(_LOOKS):
-        lasting = before is not None and pushed.lasting(there, before["manifest"])
-        if there.roots.push(name, project, found.digest, before, lasting=lasting):
+        lasting = before is not None and pushed.lasting(target, before["manifest"])
+        if target.roots.push(name, project, dataset.digest, before, lasting=lasting):
             break
-        before = _before(there, here, found, owner, name, replace=replace)
+        before = _predecessor(target, local_store, dataset, owner, name, replace=replace)
     else:
-        raise TacpipeError(f"{name} is pushed to {there.place} by others all the time. Run the same command again.")
-    _expect_kept(there, name, owner, found.digest)
+        raise TacpipeError(f"{name} is pushed to {target.place} by others all the time. Run the same command again.")
+    _expect_kept(target, name, owner, dataset.digest)
     if before is not None and not project_id(before):
-        there.roots.remove(before)  # its manifests are in the history of the new one
+        target.roots.remove(before)  # its manifests are in the history of the new one
 
 
-def _before(
-    there: AnyStore, here: Store, found: manifest_of.Found, owner: Project, name: str, *, replace: bool
+def _predecessor(
+    target: AnyStore, local_store: Store, dataset: manifest_of.Found, owner: Project, name: str, *, replace: bool
 ) -> Root | None:
     """Return the root that a push succeeds, None if there is none. Raises `UsageError` as `push` does.
 
     What was pushed before projects had an identity is succeeded where this one has had it, and left alone else.
     """
-    local = here.roots.get(found.directory.absolute()) or {}
-    seen = {found.digest, local.get("manifest"), local.get("previous"), *local.get("pushed", ())}
-    seen |= {one["manifest"] for one in local.get("history", ())}
-    before = there.roots.pushed(name, owner.id)
+    local = local_store.roots.get(dataset.directory.absolute()) or {}
+    seen_manifests = {dataset.digest, local.get("manifest"), local.get("previous"), *local.get("pushed", ())}
+    seen_manifests |= {entry["manifest"] for entry in local.get("history", ())}
+    before = target.roots.pushed(name, owner.id)
     if before is None:
-        older = there.roots.pushed(name)
-        return older if older is not None and older["manifest"] in seen else None
+        older = target.roots.pushed(name)
+        return older if older is not None and older["manifest"] in seen_manifests else None
     if not replace:
-        every = pushed.roots(there)
-        pushed.refuse_newer(there, before, seen, pushed.label(before, every))
+        pushed_roots = pushed.roots(target)
+        pushed.refuse_newer(target, before, seen_manifests, pushed.label(before, pushed_roots))
     return before
 
 
-def _expect_kept(there: AnyStore, name: str, owner: Project, manifest: str) -> None:
+def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> None:
     """Raise `TacpipeError` where a push of the same name wrote its root over this one's at the same time.
 
     The lease excludes that, but for file systems without locks; in a bucket it takes three pushes during one of them.
     """
-    root = there.roots.pushed(name, owner.id) or {}
-    if manifest not in (root.get("manifest"), *(one["manifest"] for one in root.get("history", ()))):
+    root = target.roots.pushed(name, owner.id) or {}
+    if manifest not in (root.get("manifest"), *(entry["manifest"] for entry in root.get("history", ()))):
         raise TacpipeError(
-            f"Another push of {name} to {there.place} ended at the same time and wrote over this one: there are no locks. "
+            f"Another push of {name} to {target.place} ended at the same time and wrote over this one: there are no locks. "
             f"Run the same command again, and one push at a time."
         )
 
 
-def _is(root: Root, owner: Project, name: str) -> bool:
+def _is_root_of(root: Root, owner: Project, name: str) -> bool:
     return project_id(root) == owner.id and root["path"] == name
 
 
-def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
+def _find_dataset(path: Path, source: AnyStore) -> tuple[manifest_of.Found, str]:
     """Return the manifest at a path, else that which was pushed from there or by the project that is named, and its name."""
     directory = path.parent if path.name == manifest_of.NAME else path
     if (directory / manifest_of.NAME).exists():
-        return manifest_of.Found(directory, manifest_of.find(directory).content, there), str(directory)
+        return manifest_of.Found(directory, manifest_of.find(directory).content, source), str(directory)
     folder, name = projects.place(directory)
     local_store = locate(directory)
-    root = pushed.find(there, str(path), name, projects.identity_of(local_store, folder))
+    root = pushed.find(source, str(path), name, projects.identity_of(local_store, folder))
     if root["path"] != name:  # PROJECT:PATH
         if not paths.safe_path(root["path"]):
             raise UsageError(
                 f"{plain(root['path'])} is not a path within a project. `tacpipe store checkout {root['manifest'][:12]} "
-                f"--remote {there.place} -o DIRECTORY` writes it elsewhere."
+                f"--remote {source.place} -o DIRECTORY` writes it elsewhere."
             )
         directory = folder / root["path"]
-    content = there.read(root["manifest"], regular.JSON_BYTES)
-    return manifest_of.Found(directory, content, there), pushed.label(root, pushed.roots(there))
+    content = source.read(root["manifest"], regular.JSON_BYTES)
+    return manifest_of.Found(directory, content, source), pushed.label(root, pushed.roots(source))

@@ -1,4 +1,4 @@
-"""Manifests in a store that no root names any more, and that hold what cannot be computed again.
+"""Find manifests in a store that no root names any more, and that hold what cannot be computed again.
 
 A recording is marked as one by its record, by the manifests that name it, and by the roots that name these. Each of the
 three is enough: a manifest states by itself what it holds, so it is found among the objects where its root was lost. So is a
@@ -22,7 +22,7 @@ from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.store.store import Store
 
-_BEGINS = b"{\n"  # every manifest, and no Parquet file
+_BEGINS = b"{\n"  # every manifest begins with it, and no Parquet file
 _SHARD = b"PAR1"  # a Parquet file begins and ends with it
 
 
@@ -41,9 +41,9 @@ def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dic
     Those are the ones with recordings or labels that are neither in a ``known`` manifest nor in another one that is kept. An
     object that may be a manifest or a page and is damaged is kept with whatever it names: nobody knows what it held.
     """
-    covered = {one for manifest in known for one, _ in replacing.possessions(manifest)}
+    covered = {possession for manifest in known for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
-    candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether it is a page
+    candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # keyed by whether the candidate is a page
     for name, content in _beginning(store, objects, (_BEGINS, pages.BEGINS)):
         if bytes_digest(content) != name:
             names[name] = digests(content)
@@ -58,17 +58,21 @@ def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dic
         except TacpipeError:
             continue
         try:
-            unlike = {(*one, value) for one, value in replacing.possessions(manifest) if one not in covered}
+            unlike = {
+                (*possession, value)
+                for possession, value in replacing.possessions(manifest)
+                if possession not in covered
+            }
             if unlike:
-                named = {digest for _, digest in manifest.objects()}
-                candidates[is_page].append(_Candidate(name, unlike, named))
+                object_digests = {digest for _, digest in manifest.objects()}
+                candidates[is_page].append(_Candidate(name, unlike, object_digests))
         except MissingPageError:  # it may have held anything
             names[name] = manifest.reached({}, lenient=True)
-    there: set[tuple[object, ...]] = set()
-    for is_page in (False, True):  # what is appended to comes first
-        for candidate in sorted(candidates[is_page], key=lambda one: (-len(one.holds), one.name)):
-            if not candidate.holds <= there:
-                there |= candidate.holds
+    retained: set[tuple[object, ...]] = set()
+    for is_page in (False, True):  # manifests come before pages
+        for candidate in sorted(candidates[is_page], key=lambda candidate: (-len(candidate.holds), candidate.name)):
+            if not candidate.holds <= retained:
+                retained |= candidate.holds
                 names[candidate.name] = candidate.objects
     return names
 
@@ -94,7 +98,7 @@ def digests(content: bytes) -> set[str]:
 
 def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
     """Return the digests in those objects of these names that are pages of a manifest."""
-    return {one for _, content in _beginning(store, names, (pages.BEGINS,)) for one in digests(content)}
+    return {digest for _, content in _beginning(store, names, (pages.BEGINS,)) for digest in digests(content)}
 
 
 def _beginning(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:

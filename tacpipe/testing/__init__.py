@@ -1,1 +1,1 @@
-"""What only tests and benchmarks need. Nothing in the package imports it at run time."""
+"""Helpers that only tests and benchmarks need. Nothing in the package imports them at run time."""

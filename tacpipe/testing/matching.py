@@ -1,4 +1,4 @@
-"""Samples of a recording compared with those that a ledger lists as sent: all their values, and where they stand."""
+"""Compare samples of a recording with those that a ledger lists as sent: all their values, and their rows."""
 
 from __future__ import annotations
 

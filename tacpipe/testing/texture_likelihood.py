@@ -1,4 +1,4 @@
-"""Which material a simulated slide is of, classified with known spectra: a yardstick for classifiers that have to learn.
+"""Classify the material of a simulated slide with known spectra, as a reference for classifiers that have to learn.
 
 Known are the spectra of all materials, where the sensor was on its way, how sensitive each channel is and how hard it was
 pressed; not known are phases, backgrounds, wear, the session's gain and offsets, and noise. All channels measure one
@@ -22,11 +22,11 @@ import numpy as np
 from tacpipe.arrays import Floats, Int32s
 from tacpipe.simulation import fingertip, forearm, slide, texture
 
-FRAMES = 400  # from the middle of a BioTac's slide, as classifiers are given them
-STEP_M = 0.0005  # of a track
+FRAMES = 400  # frames from the middle of a BioTac's slide, as classifiers read them
+STEP_M = 0.0005  # distance between two places of a track
 SHORTEST_M = {"biotac": 0.002, "roboskin": 0.0035}  # wavelength that is compared; shorter ones do not pass the aperture
 LONGEST_M = 0.020  # longer ones went with the levels
-LEAST = 0.02  # of the largest weight of a place of a track; what was measured less does not count
+LEAST = 0.02  # fraction of the largest weight of a place; places with less do not count
 GAINS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 MISFIT = 0.003  # fraction of a texture's power at other wave numbers than expected, of stretch, wear and levels
 FINE = 16  # wave numbers at which a taper's spectrum is known, between two of the periodogram
@@ -34,7 +34,7 @@ FINE = 16  # wave numbers at which a taper's spectrum is known, between two of t
 
 @dataclass(frozen=True)
 class Track:
-    """What was measured along the way; arrays are (place,)."""
+    """Measurements along the way; arrays are (place,)."""
 
     texture_n: Floats
     noise_n2: Floats  # variance
@@ -43,8 +43,8 @@ class Track:
 
 def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.Rig) -> float:
     """Return the fraction of trials ``indices`` of the rig whose material is classified correctly."""
-    wanted = [slide.place(index, rig).material for index in indices]
-    return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(wanted)))
+    materials = [slide.place(index, rig).material for index in indices]
+    return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(materials)))
 
 
 def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.Rig) -> Int32s:
@@ -55,22 +55,22 @@ def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.Rig) -> I
 def log_likelihoods(seed: int, index: int, rig: slide.Rig) -> Floats:
     """Return Whittle's log-likelihood of each material for trial ``index`` (material,), but for a constant."""
     sensor = slide.place(index, rig).sensor
-    known = felt_track(seed, index, rig)
-    size = 2 * len(known.taper)
+    track = felt_track(seed, index, rig)
+    size = 2 * len(track.taper)
     number = np.fft.rfftfreq(size, STEP_M)
-    kept = (number >= 1 / LONGEST_M) & (number <= 1 / SHORTEST_M[sensor])
-    observed = np.abs(np.fft.rfft(known.taper * known.texture_n, size)[kept]) ** 2
-    floor = float((known.taper**2 * known.noise_n2).sum())
-    window = np.abs(np.fft.fft(known.taper, FINE * size)) ** 2
+    compared = (number >= 1 / LONGEST_M) & (number <= 1 / SHORTEST_M[sensor])
+    observed = np.abs(np.fft.rfft(track.taper * track.texture_n, size)[compared]) ** 2
+    floor = float((track.taper**2 * track.noise_n2).sum())
+    window = np.abs(np.fft.fft(track.taper, FINE * size)) ** 2
     aperture_m = fingertip.APERTURE_M if sensor == "biotac" else forearm.APERTURE_M
-    found = []
-    for one in range(1, rig.materials + 1):
-        wave, power = texture.spectrum(slide.material(seed, sensor, one, rig), aperture_m)
-        apart = np.rint((number[kept, None] - wave) * FINE * size * STEP_M).astype(int) % len(window)
-        passed = window[apart] @ power / 2 + MISFIT * power.sum()
+    likelihoods = []
+    for material in range(1, rig.materials + 1):
+        wave, power = texture.spectrum(slide.material(seed, sensor, material, rig), aperture_m)
+        offsets = np.rint((number[compared, None] - wave) * FINE * size * STEP_M).astype(int) % len(window)
+        passed = window[offsets] @ power / 2 + MISFIT * power.sum()
         expected = np.outer(np.square(GAINS), passed) + floor  # (gain, wave number)
-        found.append(-(np.log(expected) + observed / expected).sum(axis=1).min() / 2)
-    return np.array(found)
+        likelihoods.append(-(np.log(expected) + observed / expected).sum(axis=1).min() / 2)
+    return np.array(likelihoods)
 
 
 def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
@@ -89,7 +89,7 @@ def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
         weight, noise, rounding = gain**2, fingertip.NOISE_COUNT, 1 / 12
     else:
         weight, noise, rounding = gain**2 * (counts > 0), forearm.NOISE_COUNT, 0.0
-        counts += forearm.DEAD_COUNT  # which the sensor takes off what it measures
+        counts += forearm.DEAD_COUNT  # the sensor subtracts it from each reading
     texture_n = counts / gain - pressed_n
     texture_n -= (weight * texture_n).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
     at_m = scene.position_m[rows, None] + along_m
@@ -99,9 +99,9 @@ def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
     enough = total > LEAST * total.max()
     span = slice(enough.argmax(), len(enough) - enough[::-1].argmax())
     total, summed, enough = total[span], summed[span], enough[span]
-    whole = np.where(enough, total, 1.0)
-    taper = np.hanning(len(whole) + 2)[1:-1] * enough
-    contact_n = np.where(enough, summed / whole, 0.0)
+    divisor = np.where(enough, total, 1.0)
+    taper = np.hanning(len(divisor) + 2)[1:-1] * enough
+    contact_n = np.where(enough, summed / divisor, 0.0)
     contact_n -= (taper * contact_n).sum() / taper.sum()
-    noise_n2 = ((rig.noise_scale * noise) ** 2 + rounding) / whole
+    noise_n2 = ((rig.noise_scale * noise) ** 2 + rounding) / divisor
     return Track(contact_n, noise_n2, taper / np.sqrt((taper**2).sum()))

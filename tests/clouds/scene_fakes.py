@@ -11,8 +11,8 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.segmentation import Limits
 
-STEP = 0.003  # between rays, as tangents: 3.3 mm on the table
-DEPTH_M = 1.1  # of the table's middle
+STEP = 0.003  # Spacing of the rays, as tangents: 3.3 mm on the table
+DEPTH_M = 1.1  # Depth of the table's middle
 LIMITS = Limits(
     plane_m=0.006,
     plane_fraction=0.2,
@@ -28,13 +28,13 @@ LIMITS = Limits(
 
 @dataclass(frozen=True)
 class Scene:
-    """What the camera sees, which of its points are what, and the grasp of the ball."""
+    """A view of the camera, masks of the points of each object, and the grasp of the ball."""
 
     cloud: Cloud
     ball: Bools  # (point,)
     box: Bools  # (point,)
     grasp: Grasp
-    normal: Floats  # of the table (xyz), to the camera's side
+    normal: Floats  # Normal of the table (xyz), to the camera's side
 
 
 def scene(
@@ -63,14 +63,14 @@ def scene(
             _box_depth(rays, foot_m + beside_m * direction + 0.05 * normal, axes, np.array([0.03, 0.04, 0.05])),
         ]
     )  # (thing, ray): table, ball, box
-    seen, nearest_m = depth_m.argmin(axis=0), depth_m.min(axis=0)
+    nearest_shape, nearest_m = depth_m.argmin(axis=0), depth_m.min(axis=0)
     nearest_m += noise * nearest_m**2 * rng.normal(size=len(rays))
     stray = rng.random(len(rays)) < 0.005
     nearest_m[stray] *= rng.uniform(0.7, 1.0, np.count_nonzero(stray))
     cloud = Cloud((rays * nearest_m[:, None]).astype(np.float32), rng.integers(0, 256, (len(rays), 3)).astype(np.uint8))
     closing = axes[:2].T @ _unit(rng.normal(size=2))
     grasp = Grasp(centre_m - radius_m * closing, centre_m + radius_m * closing)
-    return Scene(cloud, (seen == 1) & ~stray, (seen == 2) & ~stray, grasp, normal)
+    return Scene(cloud, (nearest_shape == 1) & ~stray, (nearest_shape == 2) & ~stray, grasp, normal)
 
 
 def _unit(vector: Floats) -> Floats:
@@ -85,8 +85,8 @@ def _ball_depth(rays: Floats, centre_m: Floats, radius_m: float) -> Floats:
 
 
 def _box_depth(rays: Floats, centre_m: Floats, axes: Floats, half_m: Floats) -> Floats:
-    """Return at which depth each ray meets a box first, infinite where it does not (ray,)."""
-    across, start_m = rays @ axes.T, -axes @ centre_m  # in the box's own axes
+    """Return the depth at which each ray meets a box first, infinite where it misses, shape (ray,)."""
+    across, start_m = rays @ axes.T, -axes @ centre_m  # Coordinates along the box's axes
     ends = (np.stack([-half_m, half_m])[:, None] - start_m) / across  # (side, ray, axis)
-    entered, left = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
-    return np.where(entered < left, entered, np.inf)
+    entered, exited = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
+    return np.where(entered < exited, entered, np.inf)

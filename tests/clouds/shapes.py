@@ -7,7 +7,7 @@ import numpy as np
 from tacpipe.arrays import Floats
 from tacpipe.clouds.cloud import Cloud
 
-PLACE_M = np.array([0.05, -0.1, 1.2])  # in front of the camera
+PLACE_M = np.array([0.05, -0.1, 1.2])  # Place in front of the camera
 
 
 def cylinder(radius_m: float, length_m: float, seed: int = 0, points: int = 6000) -> Cloud:
@@ -40,7 +40,7 @@ def placed(surface_m: Floats) -> Cloud:
     return Cloud((surface_m + PLACE_M).astype(np.float32))
 
 
-def seen(cloud: Cloud) -> Cloud:
-    """The half of a convex body's cloud that the camera at the origin sees, by the ray to its middle."""
+def visible_half(cloud: Cloud) -> Cloud:
+    """Return the half of a convex body's cloud that the camera at the origin sees, by the ray to its middle."""
     nearer = (cloud.points_m - PLACE_M) @ PLACE_M < 0
     return Cloud(cloud.points_m[nearer])

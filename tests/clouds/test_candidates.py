@@ -19,15 +19,15 @@ from tests.conftest import sample_data
 PUBLISHED = sample_data() / "vision2tactile"
 
 
-def ends(found: list[Candidate]) -> Floats:
+def ends(proposals: list[Candidate]) -> Floats:
     """All grasp points (candidate, finger, xyz)."""
-    return np.array([[candidate.grasp.g1_m, candidate.grasp.g2_m] for candidate in found])
+    return np.array([[candidate.grasp.g1_m, candidate.grasp.g2_m] for candidate in proposals])
 
 
 def test_a_cylinder_is_grasped_across_at_its_diameter() -> None:
-    found = candidates(shapes.cylinder(0.035, 0.2))
-    assert len(found) == 10
-    for candidate in found:
+    proposals = candidates(shapes.cylinder(0.035, 0.2))
+    assert len(proposals) == 10
+    for candidate in proposals:
         assert candidate.grasp.opening_m == pytest.approx(0.07, abs=0.003)
         assert abs(candidate.grasp.closing @ [1, 0, 0]) > np.cos(np.radians(12))
         assert candidate.off_deg < 20
@@ -35,16 +35,16 @@ def test_a_cylinder_is_grasped_across_at_its_diameter() -> None:
 
 
 def test_the_half_of_a_cylinder_that_is_seen_is_grasped_at_its_rims() -> None:
-    found = candidates(shapes.seen(shapes.cylinder(0.035, 0.2)))
-    assert len(found) == 10
-    widths = [candidate.grasp.opening_m for candidate in found]
+    proposals = candidates(shapes.visible_half(shapes.cylinder(0.035, 0.2)))
+    assert len(proposals) == 10
+    widths = [candidate.grasp.opening_m for candidate in proposals]
     assert np.median(widths) == pytest.approx(0.07, abs=0.006)
-    assert all(abs(candidate.grasp.closing @ [1, 0, 0]) > np.cos(np.radians(15)) for candidate in found)
+    assert all(abs(candidate.grasp.closing @ [1, 0, 0]) > np.cos(np.radians(15)) for candidate in proposals)
 
 
 def test_a_box_is_grasped_at_its_two_side_faces() -> None:
-    found = candidates(shapes.box((0.06, 0.2, 0.08)))
-    for candidate in found:
+    proposals = candidates(shapes.box((0.06, 0.2, 0.08)))
+    for candidate in proposals:
         on_left, on_right = candidate.grasp.g1_m - shapes.PLACE_M, candidate.grasp.g2_m - shapes.PLACE_M
         assert on_left[0] == pytest.approx(-0.03, abs=0.004)
         assert on_right[0] == pytest.approx(0.03, abs=0.004)
@@ -58,8 +58,8 @@ def test_the_best_grasp_of_a_sphere_passes_its_middle() -> None:
 
 
 def test_cuts_are_spread_along_the_object_one_in_each_stretch() -> None:
-    found = candidates(shapes.cylinder(0.03, 0.2), count=8, shift=0.4)
-    shifts = np.sort([candidate.shift_m for candidate in found])
+    proposals = candidates(shapes.cylinder(0.03, 0.2), count=8, shift=0.4)
+    shifts = np.sort([candidate.shift_m for candidate in proposals])
     stretch = 0.8 * 0.2 * 0.98 / 8  # the length is between the quantiles of 1 and 99 %
     np.testing.assert_array_equal(np.floor((shifts + 0.4 * 0.2 * 0.98) / stretch + 0.02), np.arange(8))
 
@@ -72,16 +72,16 @@ def test_without_shift_the_one_cut_runs_through_the_centroid() -> None:
 
 
 def test_candidates_come_best_first_and_their_points_are_of_the_cloud() -> None:
-    cloud = shapes.seen(shapes.box((0.06, 0.2, 0.08)))
-    found = candidates(cloud)
-    scores = [candidate.score for candidate in found]
+    cloud = shapes.visible_half(shapes.box((0.06, 0.2, 0.08)))
+    proposals = candidates(cloud)
+    scores = [candidate.score for candidate in proposals]
     assert scores == sorted(scores, reverse=True)
     points = {tuple(point) for point in cloud.points_m.astype(np.float64)}
-    assert {tuple(point) for point in ends(found).reshape(-1, 3)} <= points
+    assert {tuple(point) for point in ends(proposals).reshape(-1, 3)} <= points
 
 
 def test_wrists_are_right_handed_with_the_approach_along_the_view() -> None:
-    for candidate in candidates(shapes.seen(shapes.cylinder(0.035, 0.2))):
+    for candidate in candidates(shapes.visible_half(shapes.cylinder(0.035, 0.2))):
         wrist = candidate.grasp.wrist
         assert wrist is not None
         np.testing.assert_allclose(wrist.T @ wrist, np.eye(3), atol=1e-12)
@@ -96,15 +96,15 @@ def test_candidates_move_with_the_cloud_and_its_camera(seed: int) -> None:
     random = np.random.default_rng(seed)
     turned = Rotation.random(rng=random).as_matrix()
     moved_m = random.uniform(-0.5, 0.5, 3)
-    cloud = shapes.seen(shapes.box((0.05, 0.18, 0.07), points=3000))
+    cloud = shapes.visible_half(shapes.box((0.05, 0.18, 0.07), points=3000))
     elsewhere = Cloud((cloud.points_m @ turned.T + moved_m).astype(np.float32))
-    here = candidates(cloud, count=5)
-    there = candidates(elsewhere, count=5, camera_m=tuple(moved_m))
-    np.testing.assert_allclose([c.score for c in there], [c.score for c in here], atol=1e-3)
-    expected = ends([Candidate(c.grasp.moved(turned, moved_m), 0, 0, 0) for c in here])
-    found = ends(there)
-    off = np.minimum(  # which finger is g1 follows the picture, not the object
-        np.abs(found - expected).max(axis=(1, 2)), np.abs(found[:, ::-1] - expected).max(axis=(1, 2))
+    original = candidates(cloud, count=5)
+    moved_proposals = candidates(elsewhere, count=5, camera_m=tuple(moved_m))
+    np.testing.assert_allclose([c.score for c in moved_proposals], [c.score for c in original], atol=1e-3)
+    expected = ends([Candidate(c.grasp.moved(turned, moved_m), 0, 0, 0) for c in original])
+    moved_ends = ends(moved_proposals)
+    off = np.minimum(  # The finger that is g1 follows the picture, not the object
+        np.abs(moved_ends - expected).max(axis=(1, 2)), np.abs(moved_ends[:, ::-1] - expected).max(axis=(1, 2))
     )
     assert off.max() < 1e-5
 
@@ -112,22 +112,22 @@ def test_candidates_move_with_the_cloud_and_its_camera(seed: int) -> None:
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_order_of_points_does_not_matter(seed: int) -> None:
-    cloud = shapes.seen(shapes.cylinder(0.03, 0.15, points=3000))
+    cloud = shapes.visible_half(shapes.cylinder(0.03, 0.15, points=3000))
     mixed = Cloud(np.random.default_rng(seed).permutation(cloud.points_m))
     np.testing.assert_array_equal(ends(candidates(mixed, count=4)), ends(candidates(cloud, count=4)))
 
 
 def test_a_seed_gives_the_same_candidates_again_and_another_one_others() -> None:
-    cloud = shapes.cylinder(0.03, 0.2, points=MOST + 2000)  # so many that a sample is looked at
-    once, again, other = (ends(candidates(cloud, seed=seed)) for seed in (4, 4, 5))
-    np.testing.assert_array_equal(once, again)
-    assert not np.array_equal(once, other)
+    cloud = shapes.cylinder(0.03, 0.2, points=MOST + 2000)  # More points than are looked at
+    first_ends, repeated_ends, other_ends = (ends(candidates(cloud, seed=seed)) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first_ends, repeated_ends)
+    assert not np.array_equal(first_ends, other_ends)
 
 
 def test_of_a_cloud_of_many_points_those_looked_at_lie_all_over_it() -> None:
-    many = shapes.cylinder(0.03, 0.2, points=3 * MOST)
+    dense = shapes.cylinder(0.03, 0.2, points=3 * MOST)
     along = Cloud(
-        many.points_m[np.argsort(many.points_m[:, 1])]
+        dense.points_m[np.argsort(dense.points_m[:, 1])]
     )  # the first third of the points is a third of the body
     reached = np.ptp(ends(candidates(along))[:, 0, 1])
     assert reached > 0.12
@@ -180,12 +180,12 @@ def test_of_ten_candidates_one_lies_near_most_published_grasps() -> None:
 
     off_m, off_deg = [], []
     for folder in sorted(PUBLISHED.glob("*/*"))[::5]:
-        made = np.array((folder / "best-grasp.txt").read_text().replace(",", " ").split(), float).reshape(2, 3)
-        found = candidates(files.read(folder / "cloud-object.pcd"))
-        away = np.linalg.norm(ends(found) - made, axis=2)  # (candidate, finger)
+        published_m = np.array((folder / "best-grasp.txt").read_text().replace(",", " ").split(), float).reshape(2, 3)
+        proposals = candidates(files.read(folder / "cloud-object.pcd"))
+        away = np.linalg.norm(ends(proposals) - published_m, axis=2)  # (candidate, finger)
         nearest = int(away.sum(axis=1).argmin())
         off_m.append(away[nearest].max())
-        cosine = found[nearest].grasp.closing @ Grasp(made[0], made[1]).closing
+        cosine = proposals[nearest].grasp.closing @ Grasp(published_m[0], published_m[1]).closing
         off_deg.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     assert np.mean(np.array(off_m) < 0.02) > 0.7
     assert np.median(off_deg) < 12

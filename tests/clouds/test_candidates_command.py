@@ -37,9 +37,9 @@ class Model:
 @pytest.fixture
 def bottle(lab: Lab) -> Cloud:
     """A file ``bottle.ply`` with a cloud."""
-    cloud = shapes.seen(shapes.cylinder(0.035, 0.2))
-    held = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points_m.astype(float)))
-    open3d.io.write_point_cloud(Path("bottle.ply"), held)
+    cloud = shapes.visible_half(shapes.cylinder(0.035, 0.2))
+    point_cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points_m.astype(float)))
+    open3d.io.write_point_cloud(Path("bottle.ply"), point_cloud)
     return cloud
 
 
@@ -48,10 +48,10 @@ def rows(text: str) -> list[dict[str, str]]:
 
 
 def test_csv_holds_what_the_function_returns(lab: Lab, bottle: Cloud) -> None:
-    found = candidates(bottle, count=4, seed=2)
-    told = rows(lab.run("candidates bottle.ply --count 4 --seed 2").out)
-    assert [row["rank"] for row in told] == ["1", "2", "3", "4"]
-    for row, candidate in zip(told, found, strict=True):
+    proposals = candidates(bottle, count=4, seed=2)
+    printed = rows(lab.run("candidates bottle.ply --count 4 --seed 2").out)
+    assert [row["rank"] for row in printed] == ["1", "2", "3", "4"]
+    for row, candidate in zip(printed, proposals, strict=True):
         assert float(row["opening_m"]) == pytest.approx(candidate.grasp.opening_m, abs=1e-6)
         assert float(row["g2_y_m"]) == pytest.approx(candidate.grasp.g2_m[1], abs=1e-6)
         assert candidate.grasp.wrist is not None
@@ -69,15 +69,15 @@ def test_limits_and_the_shift_reach_the_search(lab: Lab, bottle: Cloud) -> None:
 def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
     lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[Path] = []
+    loaded_paths: list[Path] = []
 
     def load(path: Path) -> Any:
-        asked.append(path)
+        loaded_paths.append(path)
         return partial(grasp_values, cast(Any, Model()))
 
     monkeypatch.setattr(candidates_command, "_predict_grasp", load)
     value = json.loads(lab.run("candidates bottle.ply --model models/touch --count 3 --json").out)
-    assert asked == [Path("models/touch")]
+    assert loaded_paths == [Path("models/touch")]
     counts = [name for name, unit in value["units"].items() if unit == "count"]
     assert len(counts) == 50
     first = value["candidates"][0]
@@ -109,12 +109,12 @@ def test_files_are_written_whole_and_a_picture_is_drawn(lab: Lab, bottle: Cloud,
 
 
 def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
+    complete = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
     bare = SimpleNamespace(streams=("grasp",))
-    opened = SimpleNamespace(recordings={"bleach-1": held, "bleach-2": bare})
+    opened = SimpleNamespace(recordings={"bleach-1": complete, "bleach-2": bare})
     monkeypatch.setattr("tacpipe.engine.pipeline.open_dataset", lambda path: opened)
-    told = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
-    assert told == rows(lab.run("candidates bottle.ply --count 3").out)
+    printed = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
+    assert printed == rows(lab.run("candidates bottle.ply --count 3").out)
     for words, sentence in (
         ("", "has 2 recordings; pick one with --recording: bleach-1, bleach-2"),
         ("--recording wood-1", "no recording wood-1"),

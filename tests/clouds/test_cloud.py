@@ -36,11 +36,11 @@ def test_a_table_and_its_bytes_give_back_the_cloud(points: np.ndarray, coloured:
 def test_a_table_tells_the_unit_and_component_of_each_column() -> None:
     table = Cloud(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8)).table()
     assert table.column_names == [*POSITION, *COLOUR]
-    told = {
+    metadata = {
         field.name: {key.decode(): value.decode() for key, value in field.metadata.items()} for field in table.schema
     }
-    assert told["y_m"] == {"unit": "m", "quantity": "position", "component": "y"}
-    assert told["green"] == {"unit": "count", "quantity": "colour", "component": "green"}
+    assert metadata["y_m"] == {"unit": "m", "quantity": "position", "component": "y"}
+    assert metadata["green"] == {"unit": "count", "quantity": "colour", "component": "green"}
 
 
 def test_a_table_with_two_colours_alone_is_a_cloud_without_colours() -> None:

@@ -23,41 +23,41 @@ WAYS = [
 WAYS += [("cloud.pcd", {"compressed": True}), ("cloud.pts", {}), ("cloud.xyz", {}), ("cloud.xyzrgb", {})]
 
 
-def write(path: Path, points: np.ndarray, rgb: np.ndarray | None = None, **how: Any) -> Path:
-    made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+def write(path: Path, points: np.ndarray, rgb: np.ndarray | None = None, **options: Any) -> Path:
+    point_cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
     if rgb is not None:
-        made.colors = open3d.utility.Vector3dVector(rgb / 255)
-    assert open3d.io.write_point_cloud(path, made, **how)
+        point_cloud.colors = open3d.utility.Vector3dVector(rgb / 255)
+    assert open3d.io.write_point_cloud(path, point_cloud, **options)
     return path
 
 
-@pytest.mark.parametrize(("name", "how"), WAYS)
-def test_points_and_colours_are_read_as_they_were_written(tmp_path: Path, name: str, how: dict[str, bool]) -> None:
-    found = read(write(tmp_path / name, points_m(), colours(), **how))
+@pytest.mark.parametrize(("name", "options"), WAYS)
+def test_points_and_colours_are_read_as_they_were_written(tmp_path: Path, name: str, options: dict[str, bool]) -> None:
+    cloud = read(write(tmp_path / name, points_m(), colours(), **options))
     np.testing.assert_allclose(
-        found.points_m, points_m(), rtol=0, atol=1e-5 if "write_ascii" in how else 1e-7
-    )  # of six digits
-    assert found.points_m.dtype == np.float32
+        cloud.points_m, points_m(), rtol=0, atol=1e-5 if "write_ascii" in options else 1e-7
+    )  # The text has six digits
+    assert cloud.points_m.dtype == np.float32
     if Path(name).suffix in COLOURED:
-        np.testing.assert_array_equal(np.asarray(found.colours), colours())
+        np.testing.assert_array_equal(np.asarray(cloud.colours), colours())
     else:
-        assert found.colours is None
+        assert cloud.colours is None
 
 
 @pytest.mark.parametrize("name", ["cloud.ply", "cloud.pcd", "CLOUD.PLY"])
 def test_a_cloud_without_colours_has_none(tmp_path: Path, name: str) -> None:
-    written = write(tmp_path / name.lower(), points_m()).rename(tmp_path / name)
-    assert read(written).colours is None
+    path = write(tmp_path / name.lower(), points_m()).rename(tmp_path / name)
+    assert read(path).colours is None
 
 
-@pytest.mark.parametrize(("name", "how"), WAYS)
+@pytest.mark.parametrize(("name", "options"), WAYS)
 @pytest.mark.parametrize("share", [0.1, 0.4, 0.7, 0.98])
 def test_a_file_that_was_cut_off_is_never_read_as_fewer_points(
-    tmp_path: Path, name: str, how: dict[str, bool], share: float, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, name: str, options: dict[str, bool], share: float, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = write(tmp_path / name, points_m(), colours(), **how)
+    path = write(tmp_path / name, points_m(), colours(), **options)
     content = path.read_bytes()
-    lines = path.suffix in (".xyz", ".xyzrgb")  # tell no number of points: seen is the line that was cut
+    lines = path.suffix in (".xyz", ".xyzrgb")  # The file states no number of points: only a cut line is noticed
     cut = content.rfind(b"\n", 0, int(share * len(content))) + 9 if lines else int(share * len(content))
     path.write_bytes(content[:cut])
     with pytest.raises(TacpipeError, match=name):

@@ -26,17 +26,17 @@ def assert_right_handed(axes: np.ndarray) -> None:
 
 @given(SEEDS, st.booleans())
 def test_axes_are_a_rotation_whose_second_is_the_closing_axis(seed: int, wrist: bool) -> None:
-    made = grasp(seed, wrist=wrist)
-    axes = frame.wrist_of(made)
+    random_grasp = grasp(seed, wrist=wrist)
+    axes = frame.wrist_of(random_grasp)
     assert_right_handed(axes)
-    np.testing.assert_allclose(axes[:, 1], made.closing, atol=1e-12)
+    np.testing.assert_allclose(axes[:, 1], random_grasp.closing, atol=1e-12)
 
 
 @given(SEEDS)
 def test_a_wrist_that_closes_along_its_second_axis_is_what_the_axes_are(seed: int) -> None:
-    made = grasp(seed)
-    assert made.wrist is not None
-    np.testing.assert_allclose(frame.wrist_of(made), made.wrist, atol=1e-9)
+    random_grasp = grasp(seed)
+    assert random_grasp.wrist is not None
+    np.testing.assert_allclose(frame.wrist_of(random_grasp), random_grasp.wrist, atol=1e-9)
 
 
 def test_without_a_wrist_the_hand_comes_down_the_line_of_sight() -> None:
@@ -63,21 +63,25 @@ def test_a_grasp_whose_line_of_sight_tells_nothing_still_has_axes(
 
 
 def test_a_wrist_that_approaches_along_the_closing_axis_still_turns_its_axes_with_it() -> None:
-    made = at([0, 0, 0.8], [0.06, 0, 0.8], np.eye(3))
+    side_grasp = at([0, 0, 0.8], [0.06, 0, 0.8], np.eye(3))
     turn = Rotation.from_rotvec([0.3, -1.0, 0.7]).as_matrix()
-    axes = frame.wrist_of(made)
+    axes = frame.wrist_of(side_grasp)
     assert_right_handed(axes)
     np.testing.assert_allclose(axes[:, 0], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(frame.wrist_of(made.moved(turn, np.array([0.1, 0.2, 0.3]))), turn @ axes, atol=1e-9)
+    np.testing.assert_allclose(
+        frame.wrist_of(side_grasp.moved(turn, np.array([0.1, 0.2, 0.3]))), turn @ axes, atol=1e-9
+    )
 
 
 @given(SEEDS)
 def test_points_in_the_axes_of_the_grasp_stay_where_they_are_when_all_is_moved(seed: int) -> None:
     random = np.random.default_rng(seed)
-    made, points = grasp(seed), random.normal(size=(20, 3))
+    random_grasp, points = grasp(seed), random.normal(size=(20, 3))
     turn, shift = Rotation.random(rng=random).as_matrix(), random.normal(size=3)
-    one = frame.local_points(points, made)
-    np.testing.assert_allclose(frame.local_points(points @ turn.T + shift, made.moved(turn, shift)), one, atol=1e-9)
-    fingers = frame.local_points(np.stack([made.g1_m, made.g2_m]), made)
-    half = made.opening_m / 2
+    local_m = frame.local_points(points, random_grasp)
+    np.testing.assert_allclose(
+        frame.local_points(points @ turn.T + shift, random_grasp.moved(turn, shift)), local_m, atol=1e-9
+    )
+    fingers = frame.local_points(np.stack([random_grasp.g1_m, random_grasp.g2_m]), random_grasp)
+    half = random_grasp.opening_m / 2
     np.testing.assert_allclose(fingers, [[0, -half, 0], [0, half, 0]], atol=1e-9)

@@ -40,13 +40,13 @@ def egg(seed: int, points: int = 60) -> tuple[Any, Grasp, np.ndarray]:
     closing /= np.linalg.norm(closing)
     wrist = axes(approach, closing)
     middle = random.uniform(-0.01, 0.01, 3) + AWAY_M
-    made = Grasp(middle - 0.03 * closing, middle + 0.03 * closing, wrist)
-    return surface + AWAY_M, made, random.integers(0, 256, way.shape).astype(np.uint8)
+    grasp = Grasp(middle - 0.03 * closing, middle + 0.03 * closing, wrist)
+    return surface + AWAY_M, grasp, random.integers(0, 256, way.shape).astype(np.uint8)
 
 
 def test_the_features_of_a_box_are_those_computed_by_hand() -> None:
-    found = geometry.features(*on_box())
-    at = 0.08 - 0.03  # from the grasp to the nearer end along y
+    features = geometry.features(*on_box())
+    reach_m = 0.08 - 0.03  # Distance from the grasp to the nearer end along y
     by_hand = {
         "opening_m": 0.06,
         "points": 20000,
@@ -57,7 +57,7 @@ def test_the_features_of_a_box_are_those_computed_by_hand() -> None:
         "low_m_closing": -0.03,
         "high_m_closing": 0.03,
         "low_m_third": -0.08 - 0.03,
-        "high_m_third": at,
+        "high_m_third": reach_m,
         "mean_m_approach": 0,
         "mean_m_closing": 0,
         "mean_m_third": -0.03,
@@ -65,7 +65,7 @@ def test_the_features_of_a_box_are_those_computed_by_hand() -> None:
         "length_m": 0.16,
         "width_m_second": 0.06,
         "width_m_third": 0.04,
-        # the longest axis is third, the next closing; an axis has no sign, so that products are told
+        # the longest axis is third, the next closing; an axis has no sign, so only products are compared
         "first_axis_third_third": 1,
         "first_axis_approach_approach": 0,
         "first_axis_closing_third": 0,
@@ -75,7 +75,7 @@ def test_the_features_of_a_box_are_those_computed_by_hand() -> None:
         "along": 0.03 / 0.16,
         # both contacts lie on flat sides whose middle they are: the pad's radius is smaller than half the height
         "g1_15mm_spread3_m": 0,
-        "g1_15mm_spread2_m": 0.015 / 2,  # of a disk: its radius / 2 (variance of a coordinate r²/4)
+        "g1_15mm_spread2_m": 0.015 / 2,  # The spread of a disk is its radius / 2 (variance of a coordinate r²/4)
         "g1_15mm_spread1_m": 0.015 / 2,
         "g1_15mm_flatness": 0,
         "g1_15mm_offset_m": 0,
@@ -85,17 +85,19 @@ def test_the_features_of_a_box_are_those_computed_by_hand() -> None:
         "g2_15mm_normal_third": 0,
     }
     for name, value in by_hand.items():
-        assert found[name] == pytest.approx(value, abs=0.04 if "axis" in name or "normal" in name else 0.0025), name
+        assert features[name] == pytest.approx(value, abs=0.04 if "axis" in name or "normal" in name else 0.0025), name
     area_m2 = 2 * (0.06 * 0.16 + 0.06 * 0.04 + 0.16 * 0.04)
-    assert found["g1_15mm_share"] == pytest.approx(np.pi * 0.015**2 / area_m2, rel=0.1)
-    assert "g1_colour_r" not in found
+    assert features["g1_15mm_share"] == pytest.approx(np.pi * 0.015**2 / area_m2, rel=0.1)
+    assert "g1_colour_r" not in features
 
 
 def test_the_spread_along_each_principal_axis_is_that_of_the_covariance() -> None:
-    cloud, made = on_box(points=3000)
-    found = geometry.features(cloud, made)
+    cloud, grasp = on_box(points=3000)
+    features = geometry.features(cloud, grasp)
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(cloud.points_m.astype(float).T))[::-1])
-    np.testing.assert_allclose([found[f"spread_m_{name}"] for name in ("first", "second", "third")], spread, rtol=1e-5)
+    np.testing.assert_allclose(
+        [features[f"spread_m_{name}"] for name in ("first", "second", "third")], spread, rtol=1e-5
+    )
 
 
 def test_the_profile_is_the_height_from_finger_to_finger() -> None:
@@ -103,99 +105,101 @@ def test_the_profile_is_the_height_from_finger_to_finger() -> None:
     x = np.linspace(-0.0499, 0.0499, 4000)
     x = x[(x < 0.01) | (x > 0.02)]  # the bin from 0.01 to 0.02 is empty
     roof = np.column_stack([x, np.zeros_like(x), 1 + x / 2])
-    beside = roof + np.array([0, 0.03, 5])  # outside of the slice
-    made = Grasp(np.array([-0.05, 0, 1]), np.array([0.05, 0, 1]), axes(np.array([0.0, 0, 1]), np.array([1.0, 0, 0])))
-    found = geometry.features(Cloud(np.concatenate([roof, beside])), made)
+    outside = roof + np.array([0, 0.03, 5])  # outside of the slice
+    grasp = Grasp(np.array([-0.05, 0, 1]), np.array([0.05, 0, 1]), axes(np.array([0.0, 0, 1]), np.array([1.0, 0, 0])))
+    features = geometry.features(Cloud(np.concatenate([roof, outside])), grasp)
     middles = (np.arange(10) + 0.5) * 0.01 - 0.05
     profile = np.where(np.arange(10) == 6, 0, middles / 2)
-    np.testing.assert_allclose([found[f"profile_m_{index}"] for index in range(10)], profile, atol=5e-5)
+    np.testing.assert_allclose([features[f"profile_m_{index}"] for index in range(10)], profile, atol=5e-5)
 
 
 def test_a_contact_that_nothing_is_seen_of_has_no_shape() -> None:
-    cloud, made = on_box()
+    cloud, grasp = on_box()
     unseen = Cloud(cloud.points_m[cloud.points_m[:, 0] > PLACE_M[0]])
-    found = geometry.features(unseen, made)
-    assert {value for name, value in found.items() if name.startswith("g1_15mm")} == {0.0}
-    assert found["g2_15mm_share"] > 0
+    features = geometry.features(unseen, grasp)
+    assert {value for name, value in features.items() if name.startswith("g1_15mm")} == {0.0}
+    assert features["g2_15mm_share"] > 0
 
 
 def test_colours_by_hand_those_of_contacts_being_the_nearest_points() -> None:
-    cloud, made = on_box(points=2000)
+    cloud, grasp = on_box(points=2000)
     colours = np.zeros((2000, 3), np.uint8)
-    nearest = np.argsort(np.linalg.norm(cloud.points_m - made.g2_m, axis=1))[: geometry.NEAREST]
+    nearest = np.argsort(np.linalg.norm(cloud.points_m - grasp.g2_m, axis=1))[: geometry.NEAREST]
     colours[nearest] = (200, 100, 50)
-    found = geometry.features(Cloud(cloud.points_m, colours), made)
-    assert [found[f"g2_colour_{name}"] for name in "rgb"] == [200, 100, 50]
-    assert [found[f"g1_colour_{name}"] for name in "rgb"] == [0, 0, 0]
-    assert found["colour_mean_r"] == pytest.approx(200 * 50 / 2000)
-    assert found["share_mean_g"] == pytest.approx(100 / 351 * 50 / 2000)
-    assert found["colour_quantile50_b"] == 0
+    features = geometry.features(Cloud(cloud.points_m, colours), grasp)
+    assert [features[f"g2_colour_{name}"] for name in "rgb"] == [200, 100, 50]
+    assert [features[f"g1_colour_{name}"] for name in "rgb"] == [0, 0, 0]
+    assert features["colour_mean_r"] == pytest.approx(200 * 50 / 2000)
+    assert features["share_mean_g"] == pytest.approx(100 / 351 * 50 / 2000)
+    assert features["colour_quantile50_b"] == 0
 
 
 @settings(deadline=None, max_examples=40)
 @given(SEEDS)
 def test_moving_cloud_grasp_and_wrist_together_changes_no_feature(seed: int) -> None:
-    points, made, colours = egg(seed)
+    points, grasp, colours = egg(seed)
     random = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=random).as_matrix(), random.uniform(-1, 1, 3)
-    one = geometry.features(Cloud(points, colours), made)
-    moved = geometry.features(Cloud(points @ turn.T + shift, colours), made.moved(turn, shift))
-    assert one.keys() == moved.keys()
-    for name, value in one.items():
-        assert moved[name] == pytest.approx(value, rel=1e-5, abs=1e-9), name
+    features = geometry.features(Cloud(points, colours), grasp)
+    moved_features = geometry.features(Cloud(points @ turn.T + shift, colours), grasp.moved(turn, shift))
+    assert features.keys() == moved_features.keys()
+    for name, value in features.items():
+        assert moved_features[name] == pytest.approx(value, rel=1e-5, abs=1e-9), name
 
 
 @settings(deadline=None, max_examples=20)
 @given(SEEDS)
 def test_the_order_of_points_changes_no_feature(seed: int) -> None:
-    points, made, colours = egg(seed)
+    points, grasp, colours = egg(seed)
     order = np.random.default_rng(seed).permutation(len(points))
-    one = geometry.features(Cloud(points, colours), made)
-    other = geometry.features(Cloud(points[order], colours[order]), made)
-    for name, value in one.items():
-        assert other[name] == pytest.approx(value, rel=1e-7, abs=1e-12), name
+    features = geometry.features(Cloud(points, colours), grasp)
+    reordered_features = geometry.features(Cloud(points[order], colours[order]), grasp)
+    for name, value in features.items():
+        assert reordered_features[name] == pytest.approx(value, rel=1e-7, abs=1e-12), name
 
 
 def test_swapping_the_fingers_swaps_the_features_of_their_contacts() -> None:
-    points, made, colours = egg(3)
-    one, other = (geometry.features(Cloud(points, colours), each) for each in (made, made.swapped))
-    for name, value in one.items():
+    points, grasp, colours = egg(3)
+    features, swapped_features = (
+        geometry.features(Cloud(points, colours), variant) for variant in (grasp, grasp.swapped)
+    )
+    for name, value in features.items():
         if name.startswith("g1_"):
             sign = -1 if name.endswith(("_closing", "_third")) else 1  # half a turn about the approach
-            assert other[name.replace("g1_", "g2_", 1)] == pytest.approx(sign * value, abs=1e-9), name
+            assert swapped_features[name.replace("g1_", "g2_", 1)] == pytest.approx(sign * value, abs=1e-9), name
 
 
 def test_the_place_tells_both_points_and_two_axes_in_the_frame_of_the_cloud() -> None:
-    _, made = on_box()
-    found = geometry.place(made)
-    assert len(found) == 12
-    assert [found[f"g1_m_{axis}"] for axis in "xyz"] == made.g1_m.tolist()
-    assert [found[f"approach_{axis}"] for axis in "xyz"] == [0, 0, 1]
-    assert [found[f"closing_{axis}"] for axis in "xyz"] == [1, 0, 0]
+    _, grasp = on_box()
+    place = geometry.place(grasp)
+    assert len(place) == 12
+    assert [place[f"g1_m_{axis}"] for axis in "xyz"] == grasp.g1_m.tolist()
+    assert [place[f"approach_{axis}"] for axis in "xyz"] == [0, 0, 1]
+    assert [place[f"closing_{axis}"] for axis in "xyz"] == [1, 0, 0]
 
 
 @pytest.mark.parametrize(("coloured", "placed"), [(True, False), (False, True)])
 def test_a_table_holds_a_row_a_grasp(coloured: bool, placed: bool) -> None:
-    made = [egg(seed) for seed in range(3)]
-    clouds = [Cloud(points, colours) for points, _, colours in made]
-    rows, names = geometry.table(clouds, [grasp for _, grasp, _ in made], coloured=coloured, placed=placed)
+    eggs = [egg(seed) for seed in range(3)]
+    clouds = [Cloud(points, colours) for points, _, colours in eggs]
+    rows, names = geometry.table(clouds, [grasp for _, grasp, _ in eggs], coloured=coloured, placed=placed)
     assert rows.shape == (3, len(names))
     assert ("colour_mean_r" in names, "g1_m_x" in names) == (coloured, placed)
-    known = geometry.features(clouds[1], made[1][1])
-    assert rows[1, names.index("along")] == known["along"]
+    features = geometry.features(clouds[1], eggs[1][1])
+    assert rows[1, names.index("along")] == features["along"]
 
 
 @pytest.mark.parametrize(
     "points",
     [
         np.zeros((3, 3)),  # all in one place
-        np.column_stack([np.linspace(-0.05, 0.05, 9), np.zeros(9), np.zeros(9)]),  # on a line
-        np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3)) * (1, 1, 0),  # in a plane
+        np.column_stack([np.linspace(-0.05, 0.05, 9), np.zeros(9), np.zeros(9)]),  # points on a line
+        np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3)) * (1, 1, 0),  # points in a plane
     ],
 )
 def test_clouds_without_depth_have_finite_features(points: np.ndarray) -> None:
-    made = Grasp(np.array([-0.03, 0, 1]), np.array([0.03, 0, 1]))
+    grasp = Grasp(np.array([-0.03, 0, 1]), np.array([0.03, 0, 1]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = geometry.features(Cloud((points + np.array([0, 0, 1])).astype(np.float32)), made)
-    assert np.isfinite(list(found.values())).all()
+        features = geometry.features(Cloud((points + np.array([0, 0, 1])).astype(np.float32)), grasp)
+    assert np.isfinite(list(features.values())).all()

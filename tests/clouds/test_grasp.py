@@ -24,52 +24,52 @@ def grasp(seed: int, *, wrist: bool = True) -> Grasp:
     return Grasp(g1, g2, np.column_stack([approach, closing, np.cross(approach, closing)]) if wrist else None)
 
 
-def assert_same(one: Grasp, other: Grasp, atol: float = 1e-12) -> None:
-    np.testing.assert_allclose(one.g1_m, other.g1_m, atol=atol)
-    np.testing.assert_allclose(one.g2_m, other.g2_m, atol=atol)
-    assert (one.wrist is None) == (other.wrist is None)
-    if one.wrist is not None and other.wrist is not None:
-        np.testing.assert_allclose(one.wrist, other.wrist, atol=atol)
+def assert_same(actual: Grasp, expected: Grasp, atol: float = 1e-12) -> None:
+    np.testing.assert_allclose(actual.g1_m, expected.g1_m, atol=atol)
+    np.testing.assert_allclose(actual.g2_m, expected.g2_m, atol=atol)
+    assert (actual.wrist is None) == (expected.wrist is None)
+    if actual.wrist is not None and expected.wrist is not None:
+        np.testing.assert_allclose(actual.wrist, expected.wrist, atol=atol)
 
 
 @settings(deadline=None)  # the first table waits for pyarrow
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_a_table_and_its_bytes_give_back_the_grasp(seed: int, wrist: bool) -> None:
-    made = grasp(seed, wrist=wrist)
-    table = from_parquet(to_parquet(made.table(17)))
+    original = grasp(seed, wrist=wrist)
+    table = from_parquet(to_parquet(original.table(17)))
     assert table.column_names == ["t_ns", *POINTS, *(WRIST if wrist else ())]
     assert table["t_ns"].to_pylist() == [17]
-    assert_same(Grasp.of(table), made, atol=0)
+    assert_same(Grasp.of(table), original, atol=0)
 
 
 def test_a_table_holds_the_wrist_axis_by_axis() -> None:
-    made = grasp(3)
-    assert made.wrist is not None
-    row = made.table(0).to_pylist()[0]
-    assert [row["wrist_x_x"], row["wrist_x_y"], row["wrist_x_z"]] == made.wrist[:, 0].tolist()
-    assert [row["wrist_y_x"], row["wrist_y_y"], row["wrist_y_z"]] == made.wrist[:, 1].tolist()
-    assert row["g2_z_m"] == made.g2_m[2]
+    original = grasp(3)
+    assert original.wrist is not None
+    row = original.table(0).to_pylist()[0]
+    assert [row["wrist_x_x"], row["wrist_x_y"], row["wrist_x_z"]] == original.wrist[:, 0].tolist()
+    assert [row["wrist_y_x"], row["wrist_y_y"], row["wrist_y_z"]] == original.wrist[:, 1].tolist()
+    assert row["g2_z_m"] == original.g2_m[2]
 
 
 def test_opening_middle_and_closing_of_a_grasp_computed_by_hand() -> None:
-    made = Grasp(np.array([0.0, 0.0, 1.0]), np.array([0.03, 0.04, 1.0]))
-    assert made.opening_m == pytest.approx(0.05)
-    np.testing.assert_allclose(made.middle_m, [0.015, 0.02, 1.0])
-    np.testing.assert_allclose(made.closing, [0.6, 0.8, 0.0])
+    slanted = Grasp(np.array([0.0, 0.0, 1.0]), np.array([0.03, 0.04, 1.0]))
+    assert slanted.opening_m == pytest.approx(0.05)
+    np.testing.assert_allclose(slanted.middle_m, [0.015, 0.02, 1.0])
+    np.testing.assert_allclose(slanted.closing, [0.6, 0.8, 0.0])
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_swapping_twice_changes_nothing_and_once_turns_the_wrist_half_round_its_approach(
     seed: int, wrist: bool
 ) -> None:
-    made = grasp(seed, wrist=wrist)
-    swapped = made.swapped
-    assert_same(swapped.swapped, made, atol=0)
-    np.testing.assert_array_equal(swapped.g1_m, made.g2_m)
-    np.testing.assert_allclose(swapped.closing, -made.closing, atol=1e-15)
-    if made.wrist is not None and swapped.wrist is not None:
-        half = Rotation.from_rotvec(np.pi * made.wrist[:, 0]).as_matrix()
-        np.testing.assert_allclose(swapped.wrist, half @ made.wrist, atol=1e-12)
+    original = grasp(seed, wrist=wrist)
+    swapped = original.swapped
+    assert_same(swapped.swapped, original, atol=0)
+    np.testing.assert_array_equal(swapped.g1_m, original.g2_m)
+    np.testing.assert_allclose(swapped.closing, -original.closing, atol=1e-15)
+    if original.wrist is not None and swapped.wrist is not None:
+        half = Rotation.from_rotvec(np.pi * original.wrist[:, 0]).as_matrix()
+        np.testing.assert_allclose(swapped.wrist, half @ original.wrist, atol=1e-12)
         np.testing.assert_allclose(swapped.wrist[:, 1], swapped.closing, atol=1e-12)
 
 
@@ -78,27 +78,29 @@ def test_moving_there_and_on_is_moving_once_and_back_is_home(seed: int) -> None:
     random = np.random.default_rng(seed)
     first, second = Rotation.random(2, rng=random).as_matrix()
     near, far = random.normal(size=(2, 3))
-    made = grasp(seed)
-    assert_same(made.moved(first, near).moved(second, far), made.moved(second @ first, second @ near + far), atol=1e-10)
-    assert_same(made.moved(first, near).moved(first.T, -first.T @ near), made, atol=1e-10)
+    original = grasp(seed)
+    assert_same(
+        original.moved(first, near).moved(second, far), original.moved(second @ first, second @ near + far), atol=1e-10
+    )
+    assert_same(original.moved(first, near).moved(first.T, -first.T @ near), original, atol=1e-10)
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_moving_keeps_the_opening_and_turns_the_closing_axis_with_the_wrist(seed: int) -> None:
     random = np.random.default_rng(seed)
-    made = grasp(seed)
-    moved = made.moved(Rotation.random(rng=random).as_matrix(), random.normal(size=3))
-    assert moved.opening_m == pytest.approx(made.opening_m)
+    original = grasp(seed)
+    moved = original.moved(Rotation.random(rng=random).as_matrix(), random.normal(size=3))
+    assert moved.opening_m == pytest.approx(original.opening_m)
     assert moved.wrist is not None
     np.testing.assert_allclose(moved.wrist[:, 1], moved.closing, atol=1e-9)
-    assert_same(moved.swapped, made.swapped.moved(*_motion(made, moved)), atol=1e-8)
+    assert_same(moved.swapped, original.swapped.moved(*_motion(original, moved)), atol=1e-8)
 
 
-def _motion(made: Grasp, moved: Grasp) -> tuple[np.ndarray, np.ndarray]:
+def _motion(original: Grasp, moved: Grasp) -> tuple[np.ndarray, np.ndarray]:
     """The motion that brought a grasp from one place to another."""
-    assert made.wrist is not None and moved.wrist is not None
-    turned = moved.wrist @ made.wrist.T
-    return turned, moved.g1_m - turned @ made.g1_m
+    assert original.wrist is not None and moved.wrist is not None
+    turned = moved.wrist @ original.wrist.T
+    return turned, moved.g1_m - turned @ original.g1_m
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,6 @@ def test_what_no_hand_can_do_is_refused(
 
 @pytest.mark.parametrize("rows", [0, 2])
 def test_a_table_of_no_or_several_rows_is_no_grasp(rows: int) -> None:
-    one = grasp(0).table(0)
+    table = grasp(0).table(0)
     with pytest.raises(TacpipeError, match=rf"{rows} rows"):
-        Grasp.of(pa.concat_tables([one] * rows) if rows else one.slice(0, 0))
+        Grasp.of(pa.concat_tables([table] * rows) if rows else table.slice(0, 0))

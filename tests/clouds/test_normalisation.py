@@ -24,22 +24,22 @@ def blob(seed: int = 0, count: int = 200) -> Cloud:
 
 
 def turned(seed: int) -> np.ndarray:
-    found: np.ndarray = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    return found
+    matrix: np.ndarray = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return matrix
 
 
 def normalised(method: str, cloud: Cloud, rotation: np.ndarray = STILL, wrist: np.ndarray | None = None) -> np.ndarray:
     points = cloud.points_m.astype(float) @ rotation.T
-    found: np.ndarray = normalisation.normalised(method, points, Extent.of(cloud), rotation, wrist)
-    return found
+    scaled: np.ndarray = normalisation.normalised(method, points, Extent.of(cloud), rotation, wrist)
+    return scaled
 
 
 @settings(deadline=None, max_examples=30)
 @given(SEEDS, st.booleans())
 def test_in_the_unit_sphere_the_centroid_is_0_and_the_largest_radius_1(seed: int, turn: bool) -> None:
-    found = normalised("sphere", blob(seed), turned(seed) if turn else STILL)
-    np.testing.assert_allclose(found.mean(axis=0), 0, atol=1e-9)
-    assert np.linalg.norm(found, axis=1).max() == pytest.approx(1, abs=1e-12)
+    scaled = normalised("sphere", blob(seed), turned(seed) if turn else STILL)
+    np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-9)
+    assert np.linalg.norm(scaled, axis=1).max() == pytest.approx(1, abs=1e-12)
 
 
 @settings(deadline=None, max_examples=30)
@@ -47,12 +47,12 @@ def test_in_the_unit_sphere_the_centroid_is_0_and_the_largest_radius_1(seed: int
 def test_minmax_fills_minus_1_to_1_along_each_axis_also_after_a_turn(seed: int, turn: bool) -> None:
     rotation = turned(seed) if turn else STILL
     cloud = blob(seed)
-    found = normalised("minmax", cloud, rotation)
-    np.testing.assert_allclose(found.min(axis=0), -1, atol=1e-9)
-    np.testing.assert_allclose(found.max(axis=0), 1, atol=1e-9)
-    points = cloud.points_m.astype(float) @ rotation.T  # of all points, not of the hull's corners
+    scaled = normalised("minmax", cloud, rotation)
+    np.testing.assert_allclose(scaled.min(axis=0), -1, atol=1e-9)
+    np.testing.assert_allclose(scaled.max(axis=0), 1, atol=1e-9)
+    points = cloud.points_m.astype(float) @ rotation.T  # All points count, not only the hull's corners
     low, high = points.min(axis=0), points.max(axis=0)
-    np.testing.assert_allclose(found, 2 * (points - low) / (high - low) - 1, atol=1e-9)
+    np.testing.assert_allclose(scaled, 2 * (points - low) / (high - low) - 1, atol=1e-9)
 
 
 def test_the_corners_are_few_and_the_centroid_is_that_of_all_points() -> None:
@@ -75,10 +75,10 @@ def test_a_turn_keeps_distances_before_minmax_and_loses_them_in_it() -> None:
 
 def test_in_the_wrists_axes_a_turn_of_all_is_not_seen_and_distances_stay() -> None:
     cloud, wrist, rotation = blob(), turned(1), turned(2)
-    found = normalised("wrist", cloud, wrist=wrist)
-    np.testing.assert_allclose(found, (wrist.T @ cloud.points_m.astype(float).T).T, atol=1e-12)
-    np.testing.assert_allclose(normalised("wrist", cloud, rotation, rotation @ wrist), found, atol=1e-9)
-    np.testing.assert_allclose(pdist(found), pdist(cloud.points_m.astype(float)), rtol=1e-9)
+    local_points = normalised("wrist", cloud, wrist=wrist)
+    np.testing.assert_allclose(local_points, (wrist.T @ cloud.points_m.astype(float).T).T, atol=1e-12)
+    np.testing.assert_allclose(normalised("wrist", cloud, rotation, rotation @ wrist), local_points, atol=1e-9)
+    np.testing.assert_allclose(pdist(local_points), pdist(cloud.points_m.astype(float)), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -92,11 +92,11 @@ def test_in_the_wrists_axes_a_turn_of_all_is_not_seen_and_distances_stay() -> No
 )
 def test_flat_clouds_are_scaled_along_what_they_have(points: np.ndarray) -> None:
     cloud = Cloud(points.astype(np.float32))
-    found = normalised("minmax", cloud)
+    scaled = normalised("minmax", cloud)
     flat = np.ptp(cloud.points_m, axis=0) == 0
-    assert (found[:, flat] == -1).all()
-    np.testing.assert_allclose(found[:, ~flat].max(axis=0), 1, atol=1e-12)
-    np.testing.assert_allclose(found[:, ~flat].min(axis=0), -1, atol=1e-12)
+    assert (scaled[:, flat] == -1).all()
+    np.testing.assert_allclose(scaled[:, ~flat].max(axis=0), 1, atol=1e-12)
+    np.testing.assert_allclose(scaled[:, ~flat].min(axis=0), -1, atol=1e-12)
     assert np.linalg.norm(normalised("sphere", cloud), axis=1).max() <= 1 + 1e-9
 
 
@@ -115,11 +115,11 @@ def test_colours_are_scaled_by_their_own_extremes_or_by_black_and_white() -> Non
 @settings(max_examples=30)
 @given(SEEDS, st.sampled_from([0.0, 45.0, 90.0, 180.0]))
 def test_random_turns_are_rotations_about_x_then_y_then_z_within_their_angles(seed: int, largest_deg: float) -> None:
-    found = normalisation.random_rotation(np.random.default_rng(seed), largest_deg)
-    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(found) == pytest.approx(1)
+    rotation = normalisation.random_rotation(np.random.default_rng(seed), largest_deg)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
     x, y, z = np.radians(np.random.default_rng(seed).uniform(-largest_deg, largest_deg, 3))
     about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
     about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
     about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
-    np.testing.assert_allclose(found, about_z @ about_y @ about_x, atol=1e-12)
+    np.testing.assert_allclose(rotation, about_z @ about_y @ about_x, atol=1e-12)

@@ -10,11 +10,11 @@ from tests.clouds import shapes
 
 def test_normals_of_a_sphere_point_along_its_radius_and_towards_the_camera() -> None:
     cloud = shapes.sphere(0.05)
-    found = normals(cloud, 0.008)
+    unit_normals = normals(cloud, 0.008)
     radial = (cloud.points_m - shapes.PLACE_M) / 0.05
-    towards = -(cloud.points_m * found).sum(axis=1)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-9)
-    assert np.median(np.abs((found * radial).sum(axis=1))) > 0.999
+    towards = -(cloud.points_m * unit_normals).sum(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(unit_normals, axis=1), 1, atol=1e-9)
+    assert np.median(np.abs((unit_normals * radial).sum(axis=1))) > 0.999
     assert (towards >= 0).all()
 
 

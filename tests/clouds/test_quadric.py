@@ -25,14 +25,14 @@ def test_an_ellipsoids_normals_are_found_also_on_the_side_that_was_not_seen(
     rng = np.random.default_rng(seed)
     radii_m = np.array(radii_mm) / 1000
     points = on_ellipsoid(rng, radii_m)
-    seen = points[points[:, 2] > 0]  # from above
+    visible = points[points[:, 2] > 0]  # Seen from above
     turn, shift_m = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
-    misfit_m, found = geometry.fitted(turn.apply(seen) + shift_m)
+    misfit_m, surface = geometry.fitted(turn.apply(visible) + shift_m)
     assert misfit_m < 1e-6
     hidden = points[points[:, 2] < 0][0]
     truth = turn.apply(hidden / radii_m**2)
     truth /= np.linalg.norm(truth)
-    assert abs(found.normal(turn.apply(hidden) + shift_m) @ truth) == pytest.approx(1, abs=1e-4)
+    assert abs(surface.normal(turn.apply(hidden) + shift_m) @ truth) == pytest.approx(1, abs=1e-4)
 
 
 def test_the_misfit_is_the_noise_of_the_points() -> None:
@@ -45,5 +45,5 @@ def test_the_misfit_is_the_noise_of_the_points() -> None:
 def test_points_of_a_plane_face_along_its_normal() -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.05, 0.05, (RNG_POINTS, 2)), rng.normal(0, 1e-5, RNG_POINTS)])
-    _, found = geometry.fitted(points)
-    assert abs(found.normal(points[0])[2]) == pytest.approx(1, abs=1e-2)
+    _, surface = geometry.fitted(points)
+    assert abs(surface.normal(points[0])[2]) == pytest.approx(1, abs=1e-2)

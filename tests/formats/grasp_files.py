@@ -28,7 +28,7 @@ def counts(seed: int = 0) -> list[int]:
     return [int(value) for value in np.random.default_rng(seed).integers(0, 4096, 58)]
 
 
-def header(count: int, data: str = "binary", **other: str) -> str:
+def header(count: int, data: str = "binary", **replaced: str) -> str:
     """Return the header of the published clouds, with other values where they are given."""
     lines = {
         "VERSION": "0.7",
@@ -41,9 +41,9 @@ def header(count: int, data: str = "binary", **other: str) -> str:
         "VIEWPOINT": "0 0 0 1 0 0 0",
         "POINTS": str(count),
         "DATA": data,
-    } | other
-    told = "".join(f"{name} {value}\n" for name, value in lines.items() if value)
-    return "# .PCD v0.7 - Point Cloud Data file format\n" + told
+    } | replaced
+    text = "".join(f"{name} {value}\n" for name, value in lines.items() if value)
+    return "# .PCD v0.7 - Point Cloud Data file format\n" + text
 
 
 def packed(points: np.ndarray, rgb: np.ndarray) -> bytes:

@@ -38,7 +38,7 @@ def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
     }
 
 
-def given(text: str) -> Params:
+def layout_params(text: str) -> Params:
     return Params(json.dumps(tomllib.loads(text)))
 
 
@@ -56,7 +56,7 @@ def test_without_a_layout_streams_are_as_their_file_declares_them(tmp_path: Path
 
 def test_a_rule_replaces_what_it_states_and_nothing_else(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "a.fake")
-    params = given('[streams.pad]\nsource = "/skin"\ncolumns = [{ match = "t{taxel}", unit = "N" }]')
+    params = layout_params('[streams.pad]\nsource = "/skin"\ncolumns = [{ match = "t{taxel}", unit = "N" }]')
     (result,) = read(tmp_path, params).values()
     field = result.streams["pad"].schema.field("t2")
     assert field.type == pa.float32()
@@ -94,7 +94,7 @@ def test_episodes_inside_a_file_are_recordings(tmp_path: Path) -> None:
         "all-demo_0": 2,
         "all-demo_1": 1,
     }
-    by_name = given('[recordings]\nname = "{recording}-of-{file}"')
+    by_name = layout_params('[recordings]\nname = "{recording}-of-{file}"')
     assert sorted(read(tmp_path, by_name)) == ["demo_0-of-all", "demo_1-of-all"]
 
 
@@ -110,8 +110,8 @@ def test_a_stream_that_is_not_there_is_an_error_with_the_reason_unless_it_is_opt
     for source, by_name in (("/odd", "encoding is foo"), ("/no", "it has /skin")):
         text = f'[streams.s]\nsource = "{source}"\n[streams.skin]\nsource = "/skin"\n'
         with pytest.raises(TacpipeError, match=by_name):
-            read(tmp_path, given(text))
-    optional = given('[streams.s]\nsource = "/no"\noptional = true\n[streams.skin]\nsource = "/skin"')
+            read(tmp_path, layout_params(text))
+    optional = layout_params('[streams.s]\nsource = "/no"\noptional = true\n[streams.skin]\nsource = "/skin"')
     assert list(read(tmp_path, optional)["a"].streams) == ["skin"]
 
 
@@ -119,9 +119,9 @@ def test_a_guess_given_back_reads_the_same(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "a.fake")
     guessed = COMMAND.guess(tmp_path)
     (plain,) = read(tmp_path).values()
-    (again,) = read(tmp_path, given(guessed)).values()
-    assert again.streams["skin"].schema.equals(plain.streams["skin"].schema, check_metadata=True)
-    assert again.streams["skin"].drop("t1").equals(plain.streams["skin"].drop("t1"))
+    (reread,) = read(tmp_path, layout_params(guessed)).values()
+    assert reread.streams["skin"].schema.equals(plain.streams["skin"].schema, check_metadata=True)
+    assert reread.streams["skin"].drop("t1").equals(plain.streams["skin"].drop("t1"))
 
 
 def test_a_dry_run_describes_streams_and_what_is_left_out(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_folder_with_a_mark_is_one_container_whose_files_all_count(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "message"),
     [
         ('[streams.s]\nsource = ""', "source"),
         ('[streams.s]\nsource = "/a"\nrecording = "x"', "recording"),
@@ -159,9 +159,9 @@ def test_a_folder_with_a_mark_is_one_container_whose_files_all_count(tmp_path: P
         ('[streams.s]\nsource = "/a"\nformat = "csv"', "source"),
     ],
 )
-def test_a_wrong_layout_of_a_container_is_one_sentence(text: str, named: str) -> None:
-    with pytest.raises(UsageError, match=named):
-        COMMAND.parsed(given(text))
+def test_a_wrong_layout_of_a_container_is_one_sentence(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        COMMAND.parsed(layout_params(text))
 
 
 @pytest.mark.parametrize("name", ["", "a.yaml", "gone"])

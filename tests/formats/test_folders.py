@@ -83,7 +83,7 @@ def test_long_names_that_begin_alike_stay_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("folders", "named"),
+    ("folders", "clash"),
     [
         (["data_sample_cup 1", "data_sample_cup-1"], "cup-1"),
         (["x/data_sample_1", "y/data_sample_1", "x-y/data_sample_1", "x/y/data_sample_1"], "x-y-1"),
@@ -93,9 +93,9 @@ def test_long_names_that_begin_alike_stay_apart(tmp_path: Path) -> None:
     ],
 )
 def test_two_folders_of_one_name_are_refused_by_both_their_paths(
-    tmp_path: Path, folders: list[str], named: str
+    tmp_path: Path, folders: list[str], clash: str
 ) -> None:
-    with pytest.raises(UsageError, match=f"{re.escape(str(tmp_path))}.* and .*would both be named {named}") as refused:
+    with pytest.raises(UsageError, match=f"{re.escape(str(tmp_path))}.* and .*would both be named {clash}") as refused:
         make(tmp_path, *folders)
     assert sum(str(tmp_path / folder) in str(refused.value) for folder in folders) == 2
 
@@ -154,10 +154,10 @@ def refused_by_the_system(monkeypatch: pytest.MonkeyPatch, call: str, end: str, 
     """Have a call of the system fail on paths that end so, as a disk, a server or a limit has it fail."""
     real = getattr(os, call)
 
-    def failing(path: object, *more: Any, **named: Any) -> Any:
+    def failing(path: object, *args: Any, **options: Any) -> Any:
         if str(path).endswith(end):
             raise OSError(number, os.strerror(number), path)
-        return real(path, *more, **named)
+        return real(path, *args, **options)
 
     monkeypatch.setattr(os, call, failing)
 
@@ -184,9 +184,9 @@ def test_a_walk_finds_what_os_walk_finds_and_circles_end(tmp_path: Path) -> None
     (tmp_path / "self").symlink_to(tmp_path / "self")
     items = {place: (sorted(folders), sorted(names)) for place, folders, names in files.walk(tmp_path, links=False)}
     for place, (folders, names) in items.items():
-        there = sorted(path.name for path in Path(place).iterdir())
-        links = [name for name in there if Path(place, name).is_symlink()]
-        assert sorted([*folders, *names]) == there
+        entries = sorted(path.name for path in Path(place).iterdir())
+        links = [name for name in entries if Path(place, name).is_symlink()]
+        assert sorted([*folders, *names]) == entries
         assert not set(links) & set(folders)
     assert set(items) == {place for place, _, _ in os.walk(tmp_path)}
     assert {place for place, _, _ in files.walk(tmp_path)} == set(items)
@@ -275,10 +275,10 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
 
     full = regular.content
 
-    def content(path: Path | str, *given: Any, **named: Any) -> bytes:
+    def content(path: Path | str, *args: Any, **options: Any) -> bytes:
         if str(path).endswith(file) and hashed:
             raise OSError(number, os.strerror(number), str(path))
-        return full(path, *given, **named)
+        return full(path, *args, **options)
 
     monkeypatch.setattr(computing, "compute", counted)
     monkeypatch.setattr(regular, "opened", opened)

@@ -22,7 +22,7 @@ CLOUDS = st.integers(1, 20).flatmap(
 )
 
 
-def written(path: Path, content: bytes | str) -> Path:
+def write(path: Path, content: bytes | str) -> Path:
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
@@ -49,7 +49,7 @@ def test_the_published_layout_is_read_as_open3d_reads_it(
 ) -> None:
     points, rgb = cloud
     path = tmp_path_factory.mktemp("cloud") / "cloud.pcd"
-    written(path, header(len(points)).encode() + packed(points, rgb) + bytes(3916))
+    write(path, header(len(points)).encode() + packed(points, rgb) + bytes(3916))
     result, theirs = pcd.read(path), open3d.io.read_point_cloud(path)
     np.testing.assert_array_equal(result.points_m, np.asarray(theirs.points).astype(np.float32))
     np.testing.assert_array_equal(np.asarray(result.colours), np.rint(np.asarray(theirs.colors) * 255))
@@ -64,7 +64,7 @@ def test_fields_stand_in_any_order_and_further_ones_are_skipped(tmp_path: Path) 
         points[axis] = points_m()[:, place]
     points["rgb"], points["n"], points["_"] = 0xAB_12_34_56, np.nan, 7  # the highest byte is no colour
     head = header(50, FIELDS="n rgb z _ y x", SIZE="4 4 8 1 8 8", TYPE="F U F U F F", COUNT="3 1 1 2 1 1", VERSION=".7")
-    result = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
+    result = pcd.read(write(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
     np.testing.assert_array_equal(result.points_m, points_m())
     assert np.asarray(result.colours).tolist() == [[0x12, 0x34, 0x56]] * 50
 
@@ -73,14 +73,14 @@ def test_lines_of_text_are_points_and_colours_are_the_bits_of_their_float(tmp_pa
     bits = np.array([0x00FF8001, 0x0000007F], np.uint32).view(np.float32)
     rows = [f"{2 * row}.5 -1e-2 3 {float(value):.9g} 4 5" for row, value in enumerate(bits)]
     head = header(2, "ascii", FIELDS="x y z rgb w", SIZE="4 4 4 4 4", TYPE="F F F F F", COUNT="1 1 1 1 2")
-    result = pcd.read(written(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
+    result = pcd.read(write(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
     np.testing.assert_allclose(result.points_m, [(0.5, -0.01, 3), (2.5, -0.01, 3)])
     assert np.asarray(result.colours).tolist() == [[255, 128, 1], [0, 0, 127]]
 
 
 def test_a_cloud_without_rgb_has_no_colours_and_count_may_be_left_out(tmp_path: Path) -> None:
     head = header(50, FIELDS="x y z", SIZE="4 4 4", TYPE="F F F", COUNT="")
-    result = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
+    result = pcd.read(write(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
     assert result.colours is None
     np.testing.assert_array_equal(result.points_m, points_m())
 
@@ -125,7 +125,7 @@ LINE = "1 2 3 0\n"
     ],
 )
 def test_what_is_no_cloud_or_not_whole_is_refused_with_the_file(tmp_path: Path, content: bytes, value: str) -> None:
-    path = written(tmp_path / "cloud.pcd", content)
+    path = write(tmp_path / "cloud.pcd", content)
     with pytest.raises(TacpipeError, match=rf"cloud\.pcd.*{value}"):
         pcd.read(path)
 
@@ -133,7 +133,7 @@ def test_what_is_no_cloud_or_not_whole_is_refused_with_the_file(tmp_path: Path, 
 def test_points_that_are_not_finite_are_counted_and_the_first_is_named(tmp_path: Path) -> None:
     points = points_m()
     points[[7, 31], [0, 2]] = np.nan, np.inf
-    path = written(tmp_path / "cloud.pcd", header(50).encode() + packed(points, colours()))
+    path = write(tmp_path / "cloud.pcd", header(50).encode() + packed(points, colours()))
     with pytest.raises(TacpipeError, match=r"2 of 50 points.*point 7"):
         pcd.read(path)
 
@@ -151,7 +151,7 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(
     content = bytearray(header(50).encode() + WHOLE)
     for place in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=8)):
         content[place] = data.draw(st.integers(0, 255))
-    path = written(tmp_path_factory.mktemp("cloud") / "cloud.pcd", bytes(content[: data.draw(st.integers(0, 1100))]))
+    path = write(tmp_path_factory.mktemp("cloud") / "cloud.pcd", bytes(content[: data.draw(st.integers(0, 1100))]))
     try:
         assert len(pcd.read(path)) > 0
     except TacpipeError as error:

@@ -108,14 +108,14 @@ def test_a_reading_that_an_earlier_grasp_has_too_is_marked_and_kept(tmp_path: Pa
 
 def test_what_a_grasp_is_named_by_is_in_its_files_and_other_grasps_are_not(tmp_path: Path) -> None:
     local = write_grasp(tmp_path)
-    alone = discover(Params(), tmp_path)["bleach-1561629162"]
-    assert alone == {
+    first_sources = discover(Params(), tmp_path)["bleach-1561629162"]
+    assert first_sources == {
         f"bleach/1561629162/{name}": local / name for name in ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
     }
     write_grasp(tmp_path, after_s=9, seed=1)
     twin = write_grasp(tmp_path, "wood", after_s=-9, seed=2, reading=1)
     sources = discover(Params(), tmp_path)
-    assert sources["bleach-1561629162"] == alone
+    assert sources["bleach-1561629162"] == first_sources
     assert sources["bleach-1561629171"]["duplicate_of=wood-1561629153"] == twin / "tactile.tac"
 
 

@@ -63,8 +63,8 @@ def answer(_: Any, client: Any) -> bool:
     if request == GET_SIZE:
         client.get_arg().resolve(0, 4).update(0, len(DESCRIPTOR).to_bytes(4, "little"))
     elif request == GET_DESCRIPTOR:
-        told = client.get_arg().resolve(0, 4 + 4096)
-        told.update(4, DESCRIPTOR)
+        argument = client.get_arg().resolve(0, 4 + 4096)
+        argument.update(4, DESCRIPTOR)
     else:
         return False
     client.complete(0, 0)

@@ -17,35 +17,35 @@ from tacpipe.sensors.rawhid import RawHid
 
 
 def main(count: int, *, until_lost: bool) -> None:
-    """Print ``open`` once the device is open, how many reports came whenever some did, and then what came."""
-    there = [str(port) for port in ports.hid_ports()]
+    """Print ``open`` once the device is open, the number of reports after each read, and a summary at the end."""
+    port_names = [str(port) for port in ports.hid_ports()]
     sensor = RawHid()
     link = open_link(parse("hid:16c0:0486"), sensor, "board")
     link.write(bytes(range(64)))
     print("open", flush=True)
-    found: list[tuple[int, bytes]] = []
+    reports: list[tuple[int, bytes]] = []
     lost = ""
-    begun, busy = time.monotonic(), time.process_time()
-    while len(found) < count and time.monotonic() - begun < 600:
-        found += link.read(0.5)
-        print(f"came {len(found)}", flush=True)
+    start_s, busy = time.monotonic(), time.process_time()
+    while len(reports) < count and time.monotonic() - start_s < 600:
+        reports += link.read(0.5)
+        print(f"came {len(reports)}", flush=True)
     busy = time.process_time() - busy
     waited = link.read(0.05)
     try:
-        while until_lost and time.monotonic() - begun < 60:
+        while until_lost and time.monotonic() - start_s < 60:
             print("waiting", flush=True)
             link.read(2)
     except LinkLostError as error:
         lost = str(error)
     link.close()
     link.close()
-    samples = [sensor.decode(run.frames) for run in sensor.framer().feed(Chunks.of(found))[0]]
+    samples = [sensor.decode(run.frames) for run in sensor.framer().feed(Chunks.of(reports))[0]]
     seq = [int(value) for sample in samples for value in (sample.seq if sample.seq is not None else [])]
     first = [int(value) for sample in samples for value in sample.values[0][:, 0]]
-    stamps = [t_ns for t_ns, _ in found]
+    stamps = [t_ns for t_ns, _ in reports]
     span_s = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
-    told = {
-        "ports": there,
+    summary = {
+        "ports": port_names,
         "seq": seq,
         "first": first,
         "late": len(waited),
@@ -53,7 +53,7 @@ def main(count: int, *, until_lost: bool) -> None:
         "monotone": stamps == sorted(stamps),
         "busy_share": busy / max(1e-9, span_s),
     }
-    print(json.dumps(told))
+    print(json.dumps(summary))
 
 
 if __name__ == "__main__":

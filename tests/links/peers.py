@@ -24,7 +24,7 @@ from tacpipe.links.opening import open_link
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Sensor
 
-SOON_S = 300.0  # that anything may take; nothing waits for so long unless it fails
+SOON_S = 300.0  # The longest wait for anything; only a failure waits so long
 
 
 @dataclass
@@ -39,13 +39,13 @@ class Peer:
     send_raw: Callable[[bytes], None] | None = None  # write bytes to the line as they are
     stack: ExitStack = field(default_factory=ExitStack)
 
-    def came(self, count: int) -> list[tuple[int, bytes]]:
+    def receive(self, count: int) -> list[tuple[int, bytes]]:
         """Read until ``count`` bytes came."""
-        found: list[tuple[int, bytes]] = []
+        received: list[tuple[int, bytes]] = []
         until = time.monotonic() + SOON_S
-        while sum(len(data) for _, data in found) < count and time.monotonic() < until:
-            found += self.link.read(0.1)
-        return found
+        while sum(len(data) for _, data in received) < count and time.monotonic() < until:
+            received += self.link.read(0.1)
+        return received
 
 
 class Quiet(Sensor):
@@ -61,7 +61,7 @@ class Listened(Quiet):
     listens = True
 
 
-def made(address: str, sensor: Sensor | None = None) -> Link:
+def open_address(address: str, sensor: Sensor | None = None) -> Link:
     """Return the open link of an address."""
     return open_link(parse(address), sensor or OptoForce(), "probe")
 
@@ -71,13 +71,13 @@ def serial() -> Iterator[Peer]:
     """A serial port: a pseudo-terminal."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    link = made(f"serial:{os.ttyname(slave)}")
+    link = open_address(f"serial:{os.ttyname(slave)}")
     os.close(slave)
     ends = ExitStack()
     ends.callback(os.close, master)
     with ends:
         yield Peer(
-            link, lambda data: _whole(master, data), lambda count: _read(master, count), ends.close, packets=False
+            link, lambda data: _write_all(master, data), lambda count: _read(master, count), ends.close, packets=False
         )
         link.close()
 
@@ -86,41 +86,41 @@ def serial() -> Iterator[Peer]:
 def tcp() -> Iterator[Peer]:
     """A TCP server."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        link = made(f"tcp:127.0.0.1:{server.getsockname()[1]}")
-        other, _ = server.accept()
-    with other:
-        yield Peer(link, other.sendall, lambda count: _exactly(other, count), other.close, packets=False)
+        link = open_address(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        connection, _ = server.accept()
+    with connection:
+        yield Peer(link, connection.sendall, lambda count: _exactly(connection, count), connection.close, packets=False)
     link.close()
 
 
 @contextmanager
 def udp_talking() -> Iterator[Peer]:
     """A device that answers whoever spoke to it; when it is gone, its port refuses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.settimeout(SOON_S)
-        other.bind(("127.0.0.1", 0))
-        link = made(f"udp:127.0.0.1:{other.getsockname()[1]}")
-        there = ("127.0.0.1", link.local["port"])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.settimeout(SOON_S)
+        device.bind(("127.0.0.1", 0))
+        link = open_address(f"udp:127.0.0.1:{device.getsockname()[1]}")
+        address = ("127.0.0.1", link.local["port"])
 
         def leave() -> None:
-            other.close()
-            link.write(b"are you there?")  # which the kernel answers with a refusal
+            device.close()
+            link.write(b"are you there?")  # The kernel answers with a refusal
 
-        yield Peer(link, lambda data: _sent(other, data, there), other.recv, leave)
+        yield Peer(link, lambda data: _send_to(device, data, address), device.recv, leave)
     link.close()
 
 
 @contextmanager
-def both() -> Iterator[Peer]:
+def tcp_and_udp() -> Iterator[Peer]:
     """A device with a control connection whose data come by UDP."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as data:
-        link = made(f"tcp+udp:127.0.0.1:{server.getsockname()[1]}")
+        link = open_address(f"tcp+udp:127.0.0.1:{server.getsockname()[1]}")
         control, _ = server.accept()
-        there = ("127.0.0.1", link.local["port"])
+        address = ("127.0.0.1", link.local["port"])
         with control:
             yield Peer(
                 link,
-                lambda sent: _sent(data, sent, there),
+                lambda sent: _send_to(data, sent, address),
                 lambda count: _exactly(control, count),
                 control.close,
             )
@@ -142,9 +142,11 @@ def websocket() -> Iterator[Peer]:
     with serve(hold, "127.0.0.1", 0) as server:
         runs = threading.Thread(target=server.serve_forever)
         runs.start()
-        link = made(f"ws:127.0.0.1:{server.socket.getsockname()[1]}")
-        other = opened.get(timeout=SOON_S)
-        yield Peer(link, lambda data: other.send(data), lambda count: _bytes(other.recv(SOON_S)), other.close)
+        link = open_address(f"ws:127.0.0.1:{server.socket.getsockname()[1]}")
+        connection = opened.get(timeout=SOON_S)
+        yield Peer(
+            link, lambda data: connection.send(data), lambda count: _bytes(connection.recv(SOON_S)), connection.close
+        )
         link.close()
         over.set()
         server.shutdown()
@@ -157,7 +159,7 @@ def can_virtual() -> Iterator[Peer]:
     import can
 
     channel = uuid.uuid4().hex
-    link = made(f"can:virtual:{channel}")
+    link = open_address(f"can:virtual:{channel}")
     with can.Bus(interface="virtual", channel=channel) as bus:
 
         def send(data: bytes) -> None:
@@ -182,7 +184,7 @@ def can_slcan(monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
     tty.setraw(slave)
     clock = SimpleNamespace(sleep=lambda _: None, time=time.time, perf_counter=time.perf_counter)
     monkeypatch.setattr(slcan, "time", clock)  # adapters may take two seconds to boot, this one does not
-    link = made(f"can:slcan:{os.ttyname(slave)}@1000000", Quiet())
+    link = open_address(f"can:slcan:{os.ttyname(slave)}@1000000", Quiet())
     os.close(slave)
     ends = ExitStack()
     ends.callback(os.close, master)
@@ -190,11 +192,11 @@ def can_slcan(monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
     def send(data: bytes) -> None:
         for message in unpack_frames(data):
             payload = bytes(message.data).hex().upper()
-            _whole(master, f"t{message.arbitration_id:03X}{len(message.data)}{payload}\r".encode())
+            _write_all(master, f"t{message.arbitration_id:03X}{len(message.data)}{payload}\r".encode())
 
     with ends:
         yield Peer(
-            link, send, lambda count: _slcan_frame(master), ends.close, send_raw=lambda data: _whole(master, data)
+            link, send, lambda count: _slcan_frame(master), ends.close, send_raw=lambda data: _write_all(master, data)
         )
         link.close()
 
@@ -203,7 +205,7 @@ def can_slcan(monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
 def folder(path: Path) -> Iterator[Peer]:
     """A watched folder."""
     path.mkdir()
-    link = made(f"folder:{path}", Quiet())
+    link = open_address(f"folder:{path}", Quiet())
     numbers = iter(range(1000))
 
     def send(data: bytes) -> None:
@@ -220,28 +222,28 @@ def folder(path: Path) -> Iterator[Peer]:
     link.close()
 
 
-def _whole(fileno: int, data: bytes) -> None:
+def _write_all(fileno: int, data: bytes) -> None:
     while data:
         data = data[os.write(fileno, data) :]
 
 
 def _read(fileno: int, count: int) -> bytes:
-    found = b""
-    while len(found) < count:
-        found += os.read(fileno, count - len(found))
-    return found
+    received = b""
+    while len(received) < count:
+        received += os.read(fileno, count - len(received))
+    return received
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes:
     connection.settimeout(SOON_S)
-    found = b""
-    while len(found) < count:
-        found += connection.recv(count - len(found))
-    return found
+    received = b""
+    while len(received) < count:
+        received += connection.recv(count - len(received))
+    return received
 
 
-def _sent(port: socket.socket, data: bytes, there: tuple[str, int]) -> None:
-    port.sendto(data, there)
+def _send_to(port: socket.socket, data: bytes, address: tuple[str, int]) -> None:
+    port.sendto(data, address)
 
 
 def _bytes(message: str | bytes) -> bytes:

@@ -11,7 +11,7 @@ import pytest
 from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.link import LinkLostError
-from tests.links.peers import Quiet, made
+from tests.links.peers import Quiet, open_address
 
 open3d = pytest.importorskip("open3d", reason="open3d is not installed")
 
@@ -20,7 +20,7 @@ COLOURS = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
 
 
 class RealSense:
-    """What Open3D's sensor does, with images of the test."""
+    """A stand-in for Open3D's sensor, with images of the test."""
 
     images: ClassVar[list[Any]] = []
 
@@ -59,14 +59,14 @@ def connected(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("connected")
 @pytest.mark.parametrize("place", ["1", "831612071111"])
 def test_an_image_carries_depth_colours_and_how_its_rays_run(place: str) -> None:
-    link = made(f"camera:{place}", Quiet())
+    link = open_address(f"camera:{place}", Quiet())
     ((_, content),) = link.read(1)
-    found = DepthFrame.of_bytes(content)
+    frame = DepthFrame.of_bytes(content)
 
-    assert found.depth.tolist() == DEPTH.tolist()
-    assert found.colours is not None and found.colours.tolist() == COLOURS.tolist()
-    assert (found.focal, found.centre) == ((600, 610), (2, 1.5))
-    assert found.unit_m == pytest.approx(0.001)
+    assert frame.depth.tolist() == DEPTH.tolist()
+    assert frame.colours is not None and frame.colours.tolist() == COLOURS.tolist()
+    assert (frame.focal, frame.centre) == ((600, 610), (2, 1.5))
+    assert frame.unit_m == pytest.approx(0.001)
     assert link.read(0.01) == []
     link.close()
 
@@ -74,7 +74,7 @@ def test_an_image_carries_depth_colours_and_how_its_rays_run(place: str) -> None
 @pytest.mark.usefixtures("connected")
 def test_a_camera_that_is_unplugged_is_lost() -> None:
     RealSense.images = [RuntimeError("device disconnected")]
-    link = made("camera:0", Quiet())
+    link = open_address("camera:0", Quiet())
     with pytest.raises(LinkLostError):
         link.read(1)
     link.close()
@@ -82,12 +82,12 @@ def test_a_camera_that_is_unplugged_is_lost() -> None:
 
 @pytest.mark.usefixtures("connected")
 def test_a_camera_that_is_gone_can_still_be_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = made("camera:0", Quiet())
+    link = open_address("camera:0", Quiet())
 
-    def gone(camera: RealSense) -> None:
+    def fail_to_stop(camera: RealSense) -> None:
         raise RuntimeError("device disconnected")
 
-    monkeypatch.setattr(RealSense, "stop_capture", gone)
+    monkeypatch.setattr(RealSense, "stop_capture", fail_to_stop)
     link.close()
     with pytest.raises(LinkLostError):
         link.read(0)
@@ -96,13 +96,13 @@ def test_a_camera_that_is_gone_can_still_be_closed(monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("connected")
 def test_a_camera_that_is_not_there_lists_those_that_are() -> None:
     with pytest.raises(DeviceError, match=r"camera 2.*831612070000, 831612071111"):
-        made("camera:2", Quiet())
+        open_address("camera:2", Quiet())
     with pytest.raises(UsageError, match="camera:front"):
-        made("camera:front", Quiet())
+        open_address("camera:front", Quiet())
 
 
 def test_without_any_camera_the_sentence_says_to_plug_one_in() -> None:
     if open3d.t.io.RealSenseSensor.enumerate_devices():
         pytest.skip("a RealSense is connected")
     with pytest.raises(DeviceError, match="camera 0"):
-        made("camera:0", Quiet())
+        open_address("camera:0", Quiet())

@@ -24,7 +24,7 @@ from tacpipe.links.opening import run_dialogue
 from tacpipe.recording import rig
 from tacpipe.sensors.sensor import Ask, Dialogue
 from tests.links import peers
-from tests.links.peers import SOON_S, Quiet, made
+from tests.links.peers import SOON_S, Quiet, open_address
 from tests.sensors.made import pieces, samples
 
 Talk = Callable[[bytes, list[bytes]], None]
@@ -36,19 +36,19 @@ def device() -> Iterator[tuple[Link, Talk]]:
     """A link, and a way to have the device say something after it heard something."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    link = made(f"serial:{os.ttyname(slave)}", Quiet())
+    link = open_address(f"serial:{os.ttyname(slave)}", Quiet())
     exchanges: queue.Queue[tuple[bytes, list[bytes]]] = queue.Queue()
-    ended = threading.Event()
+    stopped = threading.Event()
 
     def hears(after: bytes) -> bool:
         heard = b""
-        while not heard.endswith(after) and not ended.is_set():
+        while not heard.endswith(after) and not stopped.is_set():
             if select.select([master], [], [], 0.05)[0]:
                 heard += os.read(master, 100)
-        return not ended.is_set()
+        return not stopped.is_set()
 
     def run() -> None:  # one thread, for two would take what the other awaits
-        while not ended.is_set():
+        while not stopped.is_set():
             with contextlib.suppress(queue.Empty):
                 after, replies = exchanges.get(timeout=0.05)
                 for reply in replies if hears(after) else []:
@@ -60,7 +60,7 @@ def device() -> Iterator[tuple[Link, Talk]]:
     thread = threading.Thread(target=run)
     thread.start()
     yield link, talk
-    ended.set()
+    stopped.set()
     thread.join()
     link.close()
     os.close(slave)
@@ -72,18 +72,18 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Await a reply that is to come for as long as a busy computer may take; limits of their own are kept."""
     reply = dialogue_of._reply
 
-    def longer(link: Link, ask: Ask, *more: Any) -> Any:
-        return reply(link, replace(ask, timeout_s=SOON_S) if ask.timeout_s >= LEAST_S else ask, *more)
+    def longer(link: Link, ask: Ask, *args: Any) -> Any:
+        return reply(link, replace(ask, timeout_s=SOON_S) if ask.timeout_s >= LEAST_S else ask, *args)
 
     monkeypatch.setattr(dialogue_of, "_reply", longer)
 
 
-def until_all_came(link: Link, kept: Arrived, count: int) -> Arrived:
-    """Return what was kept and what comes after it, until these are ``count`` bytes."""
-    found, until = list(kept), time.monotonic() + SOON_S
-    while sum(len(data) for _, data in found) < count and time.monotonic() < until:
-        found += link.read(0.1)
-    return found
+def until_all_came(link: Link, retained: Arrived, count: int) -> Arrived:
+    """Return the retained packets and those that follow, ``count`` bytes in all."""
+    packets, until = list(retained), time.monotonic() + SOON_S
+    while sum(len(data) for _, data in packets) < count and time.monotonic() < until:
+        packets += link.read(0.1)
+    return packets
 
 
 def ends_with_newline(data: bytes) -> int:
@@ -101,11 +101,11 @@ def test_replies_reach_the_sensor_and_the_stream_behind_them_is_kept(device: tup
 
     talk(b"version?", [b"1.2\nserial 7\nfra", b"me"])
     talk(b"start", [b"frame2"])
-    kept = run_dialogue(link, dialogue(), "probe")
+    retained = run_dialogue(link, dialogue(), "probe")
 
     assert heard == [b"1.2\n", b"serial 7\n"]
-    assert b"".join(data for _, data in until_all_came(link, kept, 11)) == b"frameframe2"
-    assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
+    assert b"".join(data for _, data in until_all_came(link, retained, 11)) == b"frameframe2"
+    assert [t_ns for t_ns, _ in retained] == sorted(t_ns for t_ns, _ in retained)
 
 
 def marked(data: bytes) -> int | tuple[int, int]:
@@ -127,20 +127,20 @@ def test_samples_before_and_after_a_reply_among_them_are_kept_with_their_arrival
     read = link.read
 
     def noted(timeout_s: float) -> list[tuple[int, bytes]]:
-        came = read(timeout_s)
-        arrived.extend(came)
-        return came
+        packets = read(timeout_s)
+        arrived.extend(packets)
+        return packets
 
     link.read = noted  # type: ignore[method-assign]
     talk(b"tare", [b"sample1 sam", b"ple2 <do", b"ne>sample3 <ok>sample4 ", b"sample5 "])
-    wanted = b"sample1 sample2 sample3 sample4 sample5 "
-    kept = until_all_came(link, run_dialogue(link, dialogue(), "probe"), len(wanted))
+    expected = b"sample1 sample2 sample3 sample4 sample5 "
+    retained = until_all_came(link, run_dialogue(link, dialogue(), "probe"), len(expected))
 
     assert heard == [b"<done>", b"<ok>", b""]
-    assert b"".join(data for _, data in kept) == wanted
+    assert b"".join(data for _, data in retained) == expected
     stamps = {t_ns for t_ns, _ in arrived}
-    assert {t_ns for t_ns, _ in kept[:2]} <= stamps and kept[0][0] == arrived[0][0]
-    assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
+    assert {t_ns for t_ns, _ in retained[:2]} <= stamps and retained[0][0] == arrived[0][0]
+    assert [t_ns for t_ns, _ in retained] == sorted(t_ns for t_ns, _ in retained)
 
 
 @pytest.mark.parametrize("kind", ["paxini", "weiss-wts", "tfmini"])
@@ -152,11 +152,11 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
     sent = iter(pieces(sensor, sensor.encode(samples(kind, sensor, 40, seed=4))))
     end = sensor.device()
     end.streaming = True  # an earlier session left it so
-    written: list[bytes] = []
+    streamed_frames: list[bytes] = []
 
     def streamed() -> list[bytes]:
         frames = [next(sent) for _ in range(3 * end.streaming)]
-        written.extend(frames)
+        streamed_frames.extend(frames)
         return frames
 
     def dialogue() -> Dialogue:
@@ -170,11 +170,11 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
                     talk(ask.send, [b"".join([*before, *(replies if ask.until is not None else []), *streamed()])])
                     reply = yield ask
 
-    kept = run_dialogue(link, dialogue(), "probe")
-    kept = until_all_came(link, kept, len(b"".join(written)))
+    retained = run_dialogue(link, dialogue(), "probe")
+    retained = until_all_came(link, retained, len(b"".join(streamed_frames)))
 
-    assert len(written) > 5
-    assert b"".join(data for _, data in kept) == b"".join(written)
+    assert len(streamed_frames) > 5
+    assert b"".join(data for _, data in retained) == b"".join(streamed_frames)
 
 
 def test_packets_before_and_after_a_reply_are_no_replies() -> None:
@@ -183,18 +183,18 @@ def test_packets_before_and_after_a_reply_are_no_replies() -> None:
             peer.send(text)
 
         def dialogue() -> Dialogue:
-            told = yield Ask(b"hello", lambda data: len(data) if data.startswith(b"reply") else 0)
-            assert told == b"reply 1"
+            reply = yield Ask(b"hello", lambda data: len(data) if data.startswith(b"reply") else 0)
+            assert reply == b"reply 1"
 
-        kept = run_dialogue(peer.link, dialogue(), "probe")
-        if len(kept) < 2:  # what is behind the reply may come late
-            kept += peer.came(6)
+        packets = run_dialogue(peer.link, dialogue(), "probe")
+        if len(packets) < 2:  # Data behind the reply may come late
+            packets += peer.receive(6)
 
-    assert [data for _, data in kept] == [b"data 1", b"data 2"]
+    assert [data for _, data in packets] == [b"data 1", b"data 2"]
 
 
 def test_a_control_connection_carries_the_dialogue_and_data_wait() -> None:
-    with peers.both() as peer:
+    with peers.tcp_and_udp() as peer:
         control = peer
 
         def dialogue() -> Dialogue:
@@ -203,7 +203,7 @@ def test_a_control_connection_carries_the_dialogue_and_data_wait() -> None:
             assert control.heard(7) == b"connect"
 
         assert run_dialogue(peer.link, dialogue(), "probe") == []
-        assert peer.came(8)[0][1] == b"datagram"
+        assert peer.receive(8)[0][1] == b"datagram"
 
 
 def test_silence_is_told_with_what_was_awaited(device: tuple[Link, Talk]) -> None:
@@ -230,14 +230,14 @@ class Waiting:
     """A link at whose other end a reply waits to be read."""
 
     def __init__(self) -> None:
-        self.there: Arrived = [(1, b"1.2\n")]
+        self.pending: Arrived = [(1, b"1.2\n")]
 
     def write(self, data: bytes) -> None:
         pass
 
     def read(self, timeout_s: float) -> Arrived:
-        came, self.there = self.there, []
-        return came
+        packets, self.pending = self.pending, []
+        return packets
 
 
 def test_a_reply_that_waited_while_this_process_was_held_up_is_read(monkeypatch: pytest.MonkeyPatch) -> None:

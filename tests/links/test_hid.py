@@ -25,8 +25,8 @@ def why_not() -> str:
     if shutil.which("umockdev-wrapper") is None:
         return "umockdev is not installed"
     code = "import gi; gi.require_version('UMockdev', '1.0'); from gi.repository import UMockdev"
-    done = subprocess.run([SYSTEM_PYTHON, "-c", code], capture_output=True, check=False)
-    return "" if done.returncode == 0 else "gir1.2-umockdev-1.0 or python3-gi is not installed"
+    process = subprocess.run([SYSTEM_PYTHON, "-c", code], capture_output=True, check=False)
+    return "" if process.returncode == 0 else "gir1.2-umockdev-1.0 or python3-gi is not installed"
 
 
 AT_ONCE = 50  # reports: no more than the queue holds, however late they are fetched
@@ -69,9 +69,9 @@ def talk(count: int, rate_hz: int, *, unplug: bool = False) -> tuple[dict[str, A
             order("heard")
             heard = bytes.fromhex(board.stdout.readline())
             for start in range(0, count, AT_ONCE):
-                more = min(AT_ONCE, count - start)
-                order(f"send {more} {rate_hz}")
-                while client.stdout.readline() != f"came {start + more}\n":
+                batch_size = min(AT_ONCE, count - start)
+                order(f"send {batch_size} {rate_hz}")
+                while client.stdout.readline() != f"came {start + batch_size}\n":
                     assert client.poll() is None
             line = client.stdout.readline()
             order("unplug")
@@ -85,22 +85,22 @@ def talk(count: int, rate_hz: int, *, unplug: bool = False) -> tuple[dict[str, A
 @mocked
 @pytest.mark.rig
 def test_every_report_comes_and_what_is_written_arrives() -> None:
-    found, heard = talk(1500, 1000)
+    summary, heard = talk(1500, 1000)
 
-    assert found["seq"] == list(range(1500))
-    assert found["first"] == [7 * number % 4096 for number in range(1500)]
-    assert found["monotone"] and found["late"] == 0
+    assert summary["seq"] == list(range(1500))
+    assert summary["first"] == [7 * number % 4096 for number in range(1500)]
+    assert summary["monotone"] and summary["late"] == 0
     assert heard == b"\0" + bytes(range(64))  # the number of a report that has none leads
-    assert found["ports"] == ["hid:/dev/hidraw0 (16c0:0486, Teensyduino RawHID interface 0 usage page ffab)"]
+    assert summary["ports"] == ["hid:/dev/hidraw0 (16c0:0486, Teensyduino RawHID interface 0 usage page ffab)"]
 
 
 @mocked
 @pytest.mark.rig
 def test_a_board_that_is_unplugged_is_lost() -> None:
-    found, _ = talk(20, 500, unplug=True)
+    summary, _ = talk(20, 500, unplug=True)
 
-    assert found["seq"] == list(range(20))
-    assert found["lost"].startswith("Stream board (hid:16c0:0486) is lost: it was unplugged")
+    assert summary["seq"] == list(range(20))
+    assert summary["lost"].startswith("Stream board (hid:16c0:0486) is lost: it was unplugged")
 
 
 def interface(number: int, page: int, serial: str = "1", path: str = "") -> dict[str, Any]:
@@ -152,8 +152,8 @@ def test_two_devices_of_one_kind_must_be_told_apart() -> None:
 
 
 def test_a_missing_device_lists_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = ports.Port("hid:/dev/hidraw3", "256f:c635", "SpaceMouse interface 0 usage page 0001")
-    monkeypatch.setattr(ports, "hid_ports", lambda: [there])
+    port = ports.Port("hid:/dev/hidraw3", "256f:c635", "SpaceMouse interface 0 usage page 0001")
+    monkeypatch.setattr(ports, "hid_ports", lambda: [port])
 
     with pytest.raises(DeviceError, match=r"HID.*16c0:0486; there is hid:/dev/hidraw3 \(256f:c635"):
         hid.choose_interface("16c0:0486", [], None, "probe")
@@ -178,10 +178,10 @@ def test_a_device_without_the_right_to_it_tells_the_rule_to_write(
 
 
 def test_another_package_in_the_place_of_hidapi_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = type(sys)("hidraw")
-    other.Device = object  # type: ignore[attr-defined]  # as the package hid has it
-    monkeypatch.setitem(sys.modules, "hidraw", other)
-    monkeypatch.setitem(sys.modules, "hid", other)
+    module = type(sys)("hidraw")
+    module.Device = object  # type: ignore[attr-defined]  # The package hid has this class
+    monkeypatch.setitem(sys.modules, "hidraw", module)
+    monkeypatch.setitem(sys.modules, "hid", module)
 
     with pytest.raises(DeviceError, match="`pip uninstall hid`, then `pip install --force-reinstall hidapi`"):
         ports.hid_module()

@@ -28,7 +28,7 @@ KINDS: dict[str, Callable[[], AbstractContextManager[Peer]]] = {
     "serial": peers.serial,
     "tcp": peers.tcp,
     "udp": peers.udp_talking,
-    "tcp+udp": peers.both,
+    "tcp+udp": peers.tcp_and_udp,
     "ws": peers.websocket,
     "virtual": peers.can_virtual,
 }
@@ -47,35 +47,35 @@ def peer(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
         manager = peers.can_slcan(monkeypatch)
     else:
         manager = KINDS[kind]()
-    with manager as made:
+    with manager as connected:
         if kind == "udp":  # a device that answers must have been spoken to
-            made.link.write(b"hello")
-            assert made.heard(5) == b"hello"
-        yield made
+            connected.link.write(b"hello")
+            assert connected.heard(5) == b"hello"
+        yield connected
 
 
 @pytest.mark.parametrize("peer", EVERY, indirect=True)
 def test_all_bytes_come_in_order_with_stamps_that_never_go_back(peer: Peer) -> None:
-    begun = time.monotonic_ns()
+    start_ns = time.monotonic_ns()
     for frame in FRAMES:
         peer.send(frame)
 
-    found = peer.came(sum(map(len, FRAMES)))
+    packets = peer.receive(sum(map(len, FRAMES)))
 
-    stamps = [t_ns for t_ns, _ in found]
-    assert b"".join(data for _, data in found) == b"".join(FRAMES)
+    stamps = [t_ns for t_ns, _ in packets]
+    assert b"".join(data for _, data in packets) == b"".join(FRAMES)
     if peer.packets:
-        assert [data for _, data in found] == FRAMES
+        assert [data for _, data in packets] == FRAMES
     assert stamps == sorted(stamps)
-    tick = 10_000_000  # of the clock that stamps files
-    assert begun - tick <= stamps[0] and stamps[-1] <= time.monotonic_ns()
+    tick = 10_000_000  # Resolution of the clock that stamps files
+    assert start_ns - tick <= stamps[0] and stamps[-1] <= time.monotonic_ns()
 
 
 @pytest.mark.parametrize("peer", EVERY, indirect=True)
 def test_while_nothing_comes_nothing_is_read(peer: Peer) -> None:
     assert peer.link.read(0.01) == []
     peer.send(FRAMES[7])
-    assert b"".join(data for _, data in peer.came(len(FRAMES[7]))) == FRAMES[7]
+    assert b"".join(data for _, data in peer.receive(len(FRAMES[7]))) == FRAMES[7]
     assert peer.link.read(0) == []
     assert peer.link.overruns == 0
 
@@ -90,7 +90,7 @@ def test_what_is_written_arrives(peer: Peer) -> None:
 @pytest.mark.parametrize("peer", [kind for kind in EVERY if kind != "virtual"], indirect=True)
 def test_a_device_that_went_away_is_lost_and_the_error_names_the_stream(peer: Peer) -> None:
     peer.send(FRAMES[0])
-    peer.came(len(FRAMES[0]))
+    peer.receive(len(FRAMES[0]))
     peer.leave()
 
     with pytest.raises(LinkLostError, match=r"probe \(.+\)"):
@@ -115,10 +115,10 @@ def test_an_adapter_that_is_gone_can_still_be_closed(error: Exception, monkeypat
         bus = cast("CanLink", peer.link).bus
         port = bus.serialPortOrig  # type: ignore[attr-defined]  # of slcan alone
 
-        def gone() -> None:
+        def fail() -> None:
             raise error
 
-        monkeypatch.setattr(bus, "shutdown", gone)
+        monkeypatch.setattr(bus, "shutdown", fail)
         peer.link.close()
 
         assert not port.is_open
@@ -152,7 +152,7 @@ def test_a_damaged_line_of_an_slcan_adapter_costs_the_bytes_of_that_line_only(
         peer.send_raw(line)
         peer.send(FRAMES[1])
         size = len(line) - (len(line) % 13 == 0)
-        entries = peer.came(2 * 13 + size)
+        entries = peer.receive(2 * 13 + size)
 
     assert [data for _, data in entries] == [FRAMES[0], line[:size], FRAMES[1]]
     stamps = [t_ns for t_ns, _ in entries]
@@ -171,7 +171,7 @@ def test_replies_and_time_stamps_of_an_slcan_adapter_are_not_damage(
         peer.send_raw(reply)
         peer.send(FRAMES[1])
         count = 2 if reply.startswith(b"t") else 1
-        assert {len(data) for _, data in peer.came(13 * count)} == {13}
+        assert {len(data) for _, data in peer.receive(13 * count)} == {13}
 
 
 @pytest.mark.parametrize("data", [b"text", b"\xff\x00"])

@@ -29,7 +29,7 @@ from tacpipe.recording.station import Station
 from tacpipe.sensors import lsl
 from tacpipe.sensors.framing import Chunks
 
-SOON_S = 120.0  # that anything may take; nothing waits for so long unless it fails
+SOON_S = 120.0  # The longest wait for anything; only a failure waits so long
 OUTLET = Path(__file__).with_name("lsl_outlet.py")
 CONFIG = (
     "[log]\nlevel = -3\n[lab]\nKnownPeers = {{127.0.0.1}}\nSessionID = {session}\n[multicast]\nResolveScope = machine\n"
@@ -42,7 +42,7 @@ FORCE = {
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep these streams within this computer, and apart from those of other tests: liblsl reads this once a process."""
     path = tmp_path_factory.mktemp("lsl") / "lsl_api.cfg"
     path.write_text(CONFIG.format(session=uuid.uuid4()))
@@ -63,7 +63,7 @@ def outlet(kind: str, name: str, first: int = 0) -> Iterator[subprocess.Popen[st
             process.kill()
 
 
-def ended(process: subprocess.Popen[str]) -> int:
+def stop_outlet(process: subprocess.Popen[str]) -> int:
     """Have an outlet end, and return how many samples it sent."""
     assert process.stdin is not None and process.stdout is not None
     process.stdin.write("\n")
@@ -71,23 +71,23 @@ def ended(process: subprocess.Popen[str]) -> int:
     return int(process.stdout.readline())
 
 
-def made(options: dict[str, Any] | None = None) -> lsl.Lsl:
+def build_lsl(options: dict[str, Any] | None = None) -> lsl.Lsl:
     sensor = rig.build_sensor("lsl", options or {}, "test")
     assert isinstance(sensor, lsl.Lsl)
     return sensor
 
 
 def opened(place: str, options: dict[str, Any] | None = None) -> Link:
-    return open_link(parse(f"lsl:{place}"), made(options), "wrist")
+    return open_link(parse(f"lsl:{place}"), build_lsl(options), "wrist")
 
 
-def came(link: Link, until: Any) -> list[tuple[int, bytes]]:
+def read_until(link: Link, until: Any) -> list[tuple[int, bytes]]:
     """Read until ``until`` says so of all that came."""
-    found: list[tuple[int, bytes]] = []
+    packets: list[tuple[int, bytes]] = []
     stop = time.monotonic() + SOON_S
-    while not until(found) and time.monotonic() < stop:
-        found += link.read(0.1)
-    return found
+    while not until(packets) and time.monotonic() < stop:
+        packets += link.read(0.1)
+    return packets
 
 
 def unique() -> str:
@@ -100,23 +100,23 @@ def test_every_sample_that_was_sent_comes_with_its_stamp_and_the_correction_of_l
     with outlet("force", name) as process:
         began_ns = time.monotonic_ns()
         with closing(opened(name, FORCE)) as link:
-            packets = came(link, lambda found: _corrected(found) and len(found) > 100)
-            sent = ended(process)
+            packets = read_until(link, lambda received: _corrected(received) and len(received) > 100)
+            sent = stop_outlet(process)
             with pytest.raises(LinkLostError, match="wrist"):
                 while True:
                     packets += link.read(0.1)
-    samples = Reading(made(FORCE)).feed(Chunks.of(packets))
+    samples = Reading(build_lsl(FORCE)).feed(Chunks.of(packets))
     forces, corrections = samples.values
     assert forces.tolist() == [[row, 2 * row, 3 * row] for row in range(sent)]
     assert samples.t_device_ns is not None and (np.diff(samples.t_device_ns) > 0).all()
-    # On one computer LSL's clock is the monotonic one, and what it measures is nearly nothing.
+    # LSL's clock is the monotonic one on this computer, so the correction is nearly zero.
     assert began_ns < samples.t_device_ns[0] and (samples.t_device_ns <= samples.t_ns).all()
-    known = corrections[np.isfinite(corrections)]
-    assert len(known) and np.abs(known).max() < 0.05
+    finite = corrections[np.isfinite(corrections)]
+    assert len(finite) and np.abs(finite).max() < 0.05
 
 
-def _corrected(found: list[tuple[int, bytes]]) -> bool:
-    heads = [lsl.HEAD.unpack_from(data) for _, data in found if data[:1] == lsl.NUMBERS]
+def _corrected(packets: list[tuple[int, bytes]]) -> bool:
+    heads = [lsl.HEAD.unpack_from(data) for _, data in packets if data[:1] == lsl.NUMBERS]
     return any(math.isfinite(correction) for _, correction, _ in heads)
 
 
@@ -124,9 +124,9 @@ def _corrected(found: list[tuple[int, bytes]]) -> bool:
 def test_markers_are_events_as_text() -> None:
     name = unique()
     with outlet("markers", name), closing(opened(f"?type=Markers&name={name}")) as link:
-        packets = came(link, lambda found: len(found) > 5)
+        packets = read_until(link, lambda received: len(received) > 5)
     (options,) = lsl.options(Chunks.of(packets))
-    sensor = made(options)
+    sensor = build_lsl(options)
     (texts, _) = Reading(sensor).feed(Chunks.of(packets)).values
     assert texts[:, 0].tolist() == [f"trial {row} ✓" for row in range(len(texts))] and len(texts)
     assert next((field.name, field.type) for field in sensor.fields()) == ("event", pa.string())
@@ -137,9 +137,9 @@ def test_a_rig_without_channels_takes_those_that_the_outlet_describes() -> None:
     name = unique()
     text = f'[[stream]]\nname = "wrist"\nsensor = "lsl"\ntransport = "lsl:?source_id={name}-1"\n'
     with outlet("force", name):
-        found = recorder.complete_rig(rig.parse(text))
-    assert found.streams["wrist"].sensor == made(FORCE)
-    assert rig.parse(found.text).streams["wrist"].sensor == made(FORCE)
+        completed = recorder.complete_rig(rig.parse(text))
+    assert completed.streams["wrist"].sensor == build_lsl(FORCE)
+    assert rig.parse(completed.text).streams["wrist"].sensor == build_lsl(FORCE)
 
 
 @pytest.mark.rig
@@ -150,13 +150,13 @@ def test_an_outlet_that_ended_is_opened_anew_when_it_is_back() -> None:
         station = Station(recorder.complete_rig(rig.parse(text)).streams["wrist"])
         station.start()
         blocks: list[Any] = []
-        _taken(station, blocks, lambda: _samples(blocks) > 20)
-        ended(process)
-    _taken(station, blocks, lambda: any(isinstance(one, Note) and one.what == "lost" for one in blocks))
+        _collect_until(station, blocks, lambda: _samples(blocks) > 20)
+        stop_outlet(process)
+    _collect_until(station, blocks, lambda: any(isinstance(block, Note) and block.what == "lost" for block in blocks))
     with outlet("force", name, first=1_000_000):
-        _taken(station, blocks, lambda: any(_values(blocks) >= 1_000_000))
+        _collect_until(station, blocks, lambda: any(_values(blocks) >= 1_000_000))
     station.stop()
-    assert [one.what for one in blocks if isinstance(one, Note) and one.what in ("opened", "lost")][:3] == [
+    assert [block.what for block in blocks if isinstance(block, Note) and block.what in ("opened", "lost")][:3] == [
         "opened",
         "lost",
         "opened",
@@ -165,7 +165,7 @@ def test_an_outlet_that_ended_is_opened_anew_when_it_is_back() -> None:
     assert (steps == 1).sum() == len(steps) - 1  # all that was sent while a link was open, and one step between the two
 
 
-def _taken(station: Station, blocks: list[Any], until: Any) -> None:
+def _collect_until(station: Station, blocks: list[Any], until: Any) -> None:
     stop = time.monotonic() + SOON_S
     while not until() and time.monotonic() < stop:
         blocks += station.take()
@@ -174,9 +174,9 @@ def _taken(station: Station, blocks: list[Any], until: Any) -> None:
 
 
 def _values(blocks: list[Any]) -> Any:
-    chunks = Chunks.joined([one for one in blocks if isinstance(one, Chunks)])
+    chunks = Chunks.joined([block for block in blocks if isinstance(block, Chunks)])
     return (
-        made(FORCE).decode(made(FORCE).framer().feed(chunks)[0][0].frames).values[0][:, 0]
+        build_lsl(FORCE).decode(build_lsl(FORCE).framer().feed(chunks)[0][0].frames).values[0][:, 0]
         if len(chunks.size) > 1
         else np.zeros(0)
     )
@@ -199,7 +199,7 @@ def test_an_outlet_that_is_not_there_and_one_that_is_there_twice_are_named() -> 
     with outlet("force", name), outlet("counts", name):
         with pytest.raises(DeviceError, match=r"2 outlets"):
             opened(name)
-        with pytest.raises(DeviceError, match=name):  # among those that there are
+        with pytest.raises(DeviceError, match=name):  # The message lists the existing outlets
             opened("nothing")
 
 
@@ -218,14 +218,14 @@ def test_a_description_among_packets_is_recognised_with_its_options() -> None:
     )
     packets = [lsl.packet(np.full((1, 3), row, dtype=np.float32), np.array([row / 200]), math.nan) for row in range(50)]
     data = Chunks.of(
-        [(0, lsl.DESCRIPTION + text.encode()), *((row * 5_000_000, one) for row, one in enumerate(packets))]
+        [(0, lsl.DESCRIPTION + text.encode()), *((row * 5_000_000, packet) for row, packet in enumerate(packets))]
     )
-    (found,) = recognise(data, "lsl")
-    assert (found.name, dict(found.candidate.options)) == ("lsl", FORCE)
+    (finding,) = recognise(data, "lsl")
+    assert (finding.name, dict(finding.candidate.options)) == ("lsl", FORCE)
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "message"),
     [
         (("float32", "float33"), "float33"),
         ((">3<", ">three<"), "three"),
@@ -234,9 +234,9 @@ def test_a_description_among_packets_is_recognised_with_its_options() -> None:
         (("</info>", ""), "XML"),
     ],
 )
-def test_a_description_that_is_none_is_refused_with_what_is_wrong(change: tuple[str, str], named: str) -> None:
+def test_a_description_that_is_none_is_refused_with_what_is_wrong(change: tuple[str, str], message: str) -> None:
     entries = {"channel_count": "3", "channel_format": "float32", "nominal_srate": "200"}
     text = "<info>" + "".join(f"<{key}>{value}</{key}>" for key, value in entries.items()) + "</info>"
-    assert [one.name for one in descriptions.parse(text).channels] == ["value01", "value02", "value03"]
-    with pytest.raises(TacpipeError, match=named):
+    assert [channel.name for channel in descriptions.parse(text).channels] == ["value01", "value02", "value03"]
+    with pytest.raises(TacpipeError, match=message):
         descriptions.parse(text.replace(*change))

@@ -52,7 +52,7 @@ def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[byte
     master, slave = pty.openpty()
     tty.setraw(slave)
     over = threading.Event()
-    wanted = getattr(termios, f"B{sensor.baud}")
+    port_speed = getattr(termios, f"B{sensor.baud}")
     heard: list[bytes] = []
 
     def run() -> None:
@@ -63,7 +63,7 @@ def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[byte
                 for reply in device.hear(heard[-1]):
                     os.write(master, reply)
             if device.streaming and select.select([], [master], [], 0)[1]:
-                right = termios.tcgetattr(master)[4] == wanted
+                right = termios.tcgetattr(master)[4] == port_speed
                 frame = frames[number % len(frames)]
                 os.write(master, frame if right else bytes(len(frame) // 2))
                 number += 1
@@ -111,9 +111,9 @@ def test_nothing_is_written_to_a_device_that_is_only_listened_to() -> None:
 
 
 def test_the_bauds_of_drivers_that_know_the_device_come_first() -> None:
-    known = probing._bauds("16d0:14cc")  # a Robotiq, at 115,200 as most
-    assert known[0] == 115_200
-    assert len(known) == len(set(known)) >= 5
+    bauds = probing._bauds("16d0:14cc")  # a Robotiq, at 115,200 as most
+    assert bauds[0] == 115_200
+    assert len(bauds) == len(set(bauds)) >= 5
     assert probing._by_usb(candidates(Chunks.of([]), "serial"), "16d0:14cc")[0].kind == "robotiq"
 
 
@@ -127,10 +127,10 @@ def test_a_port_that_cannot_be_opened_is_reported_with_its_reason() -> None:
 @pytest.mark.rig
 def test_the_command_prints_what_speaks_and_the_lines_for_the_rig_file(lab: Lab) -> None:
     with played(*flexitac()) as (path, _):
-        told = lab.run(f"sensors probe {path}").out
+        output = lab.run(f"sensors probe {path}").out
         listed = json.loads(lab.run(f"sensors probe serial:{path} --json").out)
 
-    lines = [line.strip() for line in told.splitlines()]
+    lines = [line.strip() for line in output.splitlines()]
     assert lines[0].startswith(f"serial:{path} speaks flexitac (rows = 16, columns = 16): ")
     assert lines[0].endswith("at 2,000,000 baud.")
     parsed = rig.parse("\n".join(lines[lines.index("[[stream]]") :]))
@@ -149,7 +149,7 @@ def test_the_command_exits_with_5_where_nothing_is_recognised(lab: Lab) -> None:
 @pytest.mark.rig
 def test_datagrams_are_recognised_too(lab: Lab) -> None:
     sensor = rig.build_sensor("ati-netft", {}, "test")
-    frames = sensor.encode(_some(sensor))
+    frames = sensor.encode(_force_samples(sensor))
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
@@ -174,17 +174,17 @@ def test_datagrams_are_recognised_too(lab: Lab) -> None:
     assert report.findings[0].name == "ati-netft"
 
 
-def _some(sensor: Sensor) -> Samples:
+def _force_samples(sensor: Sensor) -> Samples:
     """Return samples of a force sensor behind a network box."""
     counts = RNG.integers(-(10**6), 10**6, (400, 6), np.int32)
     return Samples((np.zeros((400, 1), np.uint32), counts), seq=np.arange(400), device_seq=np.arange(400))
 
 
 def test_the_list_names_every_sensor_with_what_it_is(lab: Lab) -> None:
-    told = lab.run("sensors list").out.splitlines()
+    lines = lab.run("sensors list").out.splitlines()
     rows = {row["name"]: row for row in json.loads(lab.run("sensors list --json").out)["sensors"]}
 
-    assert [line.split()[0] for line in told] == ["sensor", *sorted(rows)]
+    assert [line.split()[0] for line in lines] == ["sensor", *sorted(rows)]
     assert rows["optoforce"] == {
         "name": "optoforce",
         "links": ["serial"],

@@ -18,19 +18,19 @@ from tests.sensors import made
 RNG = np.random.default_rng(5)
 
 
-def taxels(count: int, most: int, kind: str) -> np.ndarray[Any, Any]:
+def taxels(count: int, full_scale: int, kind: str) -> np.ndarray[Any, Any]:
     """Return smooth readings (frame, taxel) of 60 frames, which hold more structure than noise does."""
     time = np.arange(60)[:, None] / 60
-    values = most / 2 * (1 + np.sin(2 * np.pi * (time + np.linspace(0, 1, count))))
-    return np.asarray(values + RNG.normal(0, most / 200, values.shape)).clip(0, most - 1).astype(kind)
+    values = full_scale / 2 * (1 + np.sin(2 * np.pi * (time + np.linspace(0, 1, count))))
+    return np.asarray(values + RNG.normal(0, full_scale / 200, values.shape)).clip(0, full_scale - 1).astype(kind)
 
 
 def stream(sensor: Sensor, samples: Samples) -> Chunks:
     """Return the frames of samples at the sensor's rate, cut into chunks as a port might give them, begun in a frame."""
     frames = sensor.encode(samples)
     period_ns = int(1e9 / sensor.rate_hz)
-    whole = [(number * period_ns, bytes(frame)) for number, frame in enumerate(frames)]
-    return Chunks.of([(whole[0][0], whole[0][1][5:]), *whole[1:]])
+    stamped_frames = [(number * period_ns, bytes(frame)) for number, frame in enumerate(frames)]
+    return Chunks.of([(stamped_frames[0][0], stamped_frames[0][1][5:]), *stamped_frames[1:]])
 
 
 def rigged(kind: str, options: Mapping[str, Any]) -> Sensor:

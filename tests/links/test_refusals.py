@@ -1,4 +1,4 @@
-"""What keeps a link from opening is told in one sentence: which device, what is wrong, what to do."""
+"""A link that cannot be opened is refused in one sentence: which device, what is wrong, what to do."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import can
 from tacpipe.links.link import SCHEMES, parse
 from tacpipe.links.opening import OPENERS
-from tests.links.peers import Quiet, made
+from tests.links.peers import Quiet, open_address
 
 
 @pytest.fixture
@@ -50,13 +50,13 @@ def test_every_kind_of_address_has_an_opener() -> None:
 
 @pytest.mark.parametrize("scheme", ["tcp", "tcp+udp", "ws"])
 def test_a_port_that_nobody_serves_is_refused(scheme: str, closed_port: int) -> None:
-    told = rf"^Stream probe \(.+\): 127\.0\.0\.1 is there, but refuses port {closed_port}; start the program"
-    with pytest.raises(DeviceError, match=told):
-        made(f"{scheme}:127.0.0.1:{closed_port}", Quiet())
+    message = rf"^Stream probe \(.+\): 127\.0\.0\.1 is there, but refuses port {closed_port}; start the program"
+    with pytest.raises(DeviceError, match=message):
+        open_address(f"{scheme}:127.0.0.1:{closed_port}", Quiet())
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (socket.gaierror(-2, "Name or service not known"), "the host arm.lab is not known; check its name"),
         (TimeoutError(), "arm.lab did not answer on port 7 within 5 s; check that it is switched on"),
@@ -69,7 +69,7 @@ def test_a_port_that_nobody_serves_is_refused(scheme: str, closed_port: int) -> 
     ],
 )
 def test_what_the_network_answers_becomes_a_sentence(
-    error: OSError, told: str, monkeypatch: pytest.MonkeyPatch
+    error: OSError, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> socket.socket:
         raise error
@@ -77,13 +77,13 @@ def test_what_the_network_answers_becomes_a_sentence(
     monkeypatch.setattr("tacpipe.links.network.socket.create_connection", refuse)
     monkeypatch.setattr("tacpipe.links.network.socket.getaddrinfo", refuse)
     for scheme in ("tcp", "tcp+udp", "udp", "ws"):
-        with pytest.raises(DeviceError, match=re.escape(f"Stream probe ({scheme}:arm.lab:7): {told}")):
-            made(f"{scheme}:arm.lab:7", Quiet())
+        with pytest.raises(DeviceError, match=re.escape(f"Stream probe ({scheme}:arm.lab:7): {message}")):
+            open_address(f"{scheme}:arm.lab:7", Quiet())
 
 
 def test_what_is_no_websocket_is_told(rude_port: int) -> None:
     with pytest.raises(DeviceError, match=rf"127\.0\.0\.1 port {rude_port}"):
-        made(f"ws:127.0.0.1:{rude_port}", Quiet())
+        open_address(f"ws:127.0.0.1:{rude_port}", Quiet())
 
 
 def test_a_can_interface_that_is_missing_lists_those_that_are_there(
@@ -95,7 +95,7 @@ def test_a_can_interface_that_is_missing_lists_those_that_are_there(
     monkeypatch.setattr(can, "INTERFACES", tmp_path)
 
     with pytest.raises(DeviceError, match=r"CAN interface can9; there is can1\."):
-        made("can:socketcan:can9", Quiet())
+        open_address("can:socketcan:can9", Quiet())
 
 
 def test_a_can_interface_that_does_not_open_tells_how_to_bring_it_up(
@@ -110,18 +110,18 @@ def test_a_can_interface_that_does_not_open_tells_how_to_bring_it_up(
 
     monkeypatch.setattr("can.Bus", refuse)
     with pytest.raises(DeviceError, match=r"Run `sudo ip link set can0 up type can bitrate 500000`\."):
-        made("can:socketcan:can0@500000", Quiet())
+        open_address("can:socketcan:can0@500000", Quiet())
 
 
 def test_a_missing_adapter_of_slcan_is_told_as_any_serial_port() -> None:
     with pytest.raises(DeviceError, match="/dev/ttyNOWHERE"):
-        made("can:slcan:/dev/ttyNOWHERE@1000000", Quiet())
+        open_address("can:slcan:/dev/ttyNOWHERE@1000000", Quiet())
 
 
 @pytest.mark.parametrize("address", ["can:can0", "can:socketcan:", "can:slcan:/dev/ttyACM0@fast", "can:pcan:1"])
 def test_a_can_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(UsageError, match=r"CAN.*can:KIND:CHANNEL"):
-        made(address, Quiet())
+        open_address(address, Quiet())
 
 
 def test_an_unknown_kind_of_address_lists_all() -> None:

@@ -18,7 +18,7 @@ import pytest
 from tacpipe.errors import DeviceError
 from tacpipe.links import ports
 from tacpipe.sensors.sensor import Line, Sensor
-from tests.links.peers import Quiet, made
+from tests.links.peers import Quiet, open_address
 
 HOLDER = """
 import serial, sys
@@ -44,7 +44,7 @@ def test_any_rate_of_baud_can_be_set(baud: int, terminal: tuple[int, str]) -> No
     sensor = Quiet()
     sensor.baud = baud
 
-    link = made(f"serial:{path}", sensor)
+    link = open_address(f"serial:{path}", sensor)
     os.write(master, b"abc")
 
     assert link.read(5)[0][1] == b"abc"
@@ -58,7 +58,7 @@ def test_control_lines_that_a_terminal_does_not_have_do_no_harm(terminal: tuple[
     class Wired(Quiet):
         line = Line(dtr=True, rts=False)
 
-    link = made(f"serial:{terminal[1]}", Wired())
+    link = open_address(f"serial:{terminal[1]}", Wired())
     link.write(b"ok")
     assert os.read(terminal[0], 2) == b"ok"
     link.close()
@@ -77,7 +77,7 @@ def test_what_comes_while_a_device_boots_is_thrown_away(
         os.write(terminal[0], b"Hello from the bootloader\r\n")
 
     monkeypatch.setattr("tacpipe.links.ports.time.sleep", boot)
-    link = made(f"serial:{terminal[1]}", Booting())
+    link = open_address(f"serial:{terminal[1]}", Booting())
     os.write(terminal[0], b"frame")
 
     assert slept == [1.5]
@@ -92,23 +92,23 @@ def test_a_port_that_another_program_holds_is_busy_and_the_program_is_named(term
         assert holder.stdout is not None and holder.stdin is not None
         assert holder.stdout.readline() == b"held\n"
         with pytest.raises(DeviceError, match=rf"\b{holder.pid}\b") as refused:
-            made(f"serial:{terminal[1]}", Quiet())
+            open_address(f"serial:{terminal[1]}", Quiet())
         holder.stdin.close()
 
     assert refused.value.exit_code == 5
-    made(f"serial:{terminal[1]}", Quiet()).close()  # and is free again
+    open_address(f"serial:{terminal[1]}", Quiet()).close()  # The port is free again
 
 
 def test_a_port_that_another_program_reads_without_locking_it_is_busy_too(
     terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ports, "PSEUDO", "/nowhere")  # as if it were a cable
+    monkeypatch.setattr(ports, "PSEUDO", "/nowhere")  # The port counts as a real cable
     with subprocess.Popen([sys.executable, "-c", HOLDER.replace("exclusive=True", ""), terminal[1]],
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:  # fmt: skip
         assert holder.stdout is not None and holder.stdin is not None
         assert holder.stdout.readline() == b"held\n"
         with pytest.raises(DeviceError, match=rf"\b{holder.pid}\b"):
-            made(f"serial:{terminal[1]}", Quiet())
+            open_address(f"serial:{terminal[1]}", Quiet())
         holder.stdin.close()
 
 
@@ -116,12 +116,12 @@ def test_a_missing_port_lists_those_that_are_there(monkeypatch: pytest.MonkeyPat
     from serial.tools import list_ports
     from serial.tools.list_ports_common import ListPortInfo
 
-    there = ListPortInfo("/dev/ttyACM7")
-    there.vid, there.pid, there.product = 0x16D0, 0x14CC, "TSF-85"
-    monkeypatch.setattr(list_ports, "comports", lambda: [there])
+    port_info = ListPortInfo("/dev/ttyACM7")
+    port_info.vid, port_info.pid, port_info.product = 0x16D0, 0x14CC, "TSF-85"
+    monkeypatch.setattr(list_ports, "comports", lambda: [port_info])
 
     with pytest.raises(DeviceError) as missing:
-        made("serial:/dev/ttyACM0", Quiet())
+        open_address("serial:/dev/ttyACM0", Quiet())
 
     assert str(missing.value) == (
         "Stream probe (serial:/dev/ttyACM0): there is no port /dev/ttyACM0; there is serial:/dev/ttyACM7 (16d0:14cc, "
@@ -130,7 +130,7 @@ def test_a_missing_port_lists_those_that_are_there(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("number", "told"),
+    ("number", "message"),
     [
         (errno.EACCES, r"you may not open .+; it belongs to the group \w+: run `sudo usermod -aG \w+ \$USER`"),
         (errno.EBUSY, r"is held by a process of another user; end it"),
@@ -138,7 +138,7 @@ def test_a_missing_port_lists_those_that_are_there(monkeypatch: pytest.MonkeyPat
     ],
 )
 def test_what_the_system_answers_becomes_a_sentence(
-    number: int, told: str, terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    number: int, message: str, terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> int:
         raise OSError(number, os.strerror(number))
@@ -146,22 +146,22 @@ def test_what_the_system_answers_becomes_a_sentence(
     monkeypatch.setattr(ports, "holders_of_file", lambda _: [])
     monkeypatch.setattr("serial.serialposix.os.open", refuse)
 
-    with pytest.raises(DeviceError, match=told):
-        made(f"serial:{terminal[1]}", Quiet())
+    with pytest.raises(DeviceError, match=message):
+        open_address(f"serial:{terminal[1]}", Quiet())
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
 def test_a_port_without_the_right_to_it_says_how_to_get_it(terminal: tuple[int, str]) -> None:
     Path(terminal[1]).chmod(0)
     with pytest.raises(DeviceError, match="usermod -aG"):
-        made(f"serial:{terminal[1]}", Quiet())
+        open_address(f"serial:{terminal[1]}", Quiet())
     Path(terminal[1]).chmod(stat.S_IRUSR | stat.S_IWUSR)
 
 
 def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("none")
     with pytest.raises(DeviceError, match=r"notes\.txt"):
-        made(f"serial:{tmp_path / 'notes.txt'}", Quiet())
+        open_address(f"serial:{tmp_path / 'notes.txt'}", Quiet())
 
 
 def test_a_device_that_takes_no_byte_is_lost_after_a_while(
@@ -169,7 +169,7 @@ def test_a_device_that_takes_no_byte_is_lost_after_a_while(
 ) -> None:
     monkeypatch.setattr("tacpipe.links.link.WRITE_S", 0.2)
     sensor: Sensor = Quiet()
-    link = made(f"serial:{terminal[1]}", sensor)
+    link = open_address(f"serial:{terminal[1]}", sensor)
     with pytest.raises(DeviceError, match=r"0\.2 s"):
         link.write(bytes(1 << 20))
     link.close()

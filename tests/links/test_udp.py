@@ -1,4 +1,4 @@
-"""What UDP alone can tell: when the kernel got a datagram, and how many it had to drop."""
+"""Properties that only UDP has: the kernel's stamp of each datagram and the number of those it dropped."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import udp
 from tacpipe.links.link import OLDEST_NS, Arrivals, LinkLostError
 from tests.links import peers
-from tests.links.peers import Listened, Quiet, made
+from tests.links.peers import Listened, Quiet, open_address
 
 SENT = [b"one", b"two", b"three"]
-WALL_NS = 1_700_000_000_000_000_000  # by which the clock on the wall is ahead
+WALL_NS = 1_700_000_000_000_000_000  # Lead of the wall clock over the monotonic clock
 
 
 def free_port() -> int:
@@ -41,8 +41,8 @@ def stamping() -> Iterator[None]:
             asking.sendto(b"", asking.getsockname())
             time.sleep(0.01)
             read_s = time.time()
-            _, ((_, _, told),), _, _ = asking.recvmsg(1, udp.ROOM)
-            seconds, nanoseconds = struct.unpack("@ll", told)
+            _, ((_, _, stamp),), _, _ = asking.recvmsg(1, udp.ROOM)
+            seconds, nanoseconds = struct.unpack("@ll", stamp)
             late = seconds + nanoseconds / 1e9 > read_s
         yield
 
@@ -52,19 +52,19 @@ def stamping() -> Iterator[None]:
 def test_a_datagram_is_stamped_when_it_came_and_not_when_it_was_read() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         port = free_port()
-        link = made(f"udp::{port}", Quiet())
+        link = open_address(f"udp::{port}", Quiet())
         before = time.monotonic_ns()
         device.sendto(b"one", ("127.0.0.1", port))
         between = time.monotonic_ns()
         time.sleep(0.1)
         device.sendto(b"two", ("127.0.0.1", port))
         time.sleep(0.1)
-        found = link.read(1)
+        datagrams = link.read(1)
         link.close()
 
-    (first, one), (second, two) = found
+    (first, first_data), (second, second_data) = datagrams
     slack = 20_000_000  # both clocks are not read at once
-    assert (one, two) == (b"one", b"two")
+    assert (first_data, second_data) == (b"one", b"two")
     assert before - slack <= first <= between + slack
     assert second - first >= 100_000_000 - slack
 
@@ -73,7 +73,7 @@ def test_datagrams_that_the_kernel_drops_are_counted(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(udp, "QUEUE", 4096)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         port = free_port()
-        link = made(f"udp::{port}", Quiet())
+        link = open_address(f"udp::{port}", Quiet())
         for number in range(200):
             device.sendto(number.to_bytes(2, "big"), ("127.0.0.1", port))
         early = link.read(1)
@@ -90,7 +90,7 @@ def test_a_listening_link_answers_whoever_spoke_last() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.settimeout(5)
         port = free_port()
-        link = made(f"udp:127.0.0.1:{port}", Listened())
+        link = open_address(f"udp:127.0.0.1:{port}", Listened())
         assert link.local["port"] == port
         with pytest.raises(DeviceError, match="udp"):
             link.write(b"hello?")
@@ -102,23 +102,23 @@ def test_a_listening_link_answers_whoever_spoke_last() -> None:
 
 
 def test_a_port_that_is_taken_names_its_holder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.links.ports.os.getpid", lambda: -1)  # so that this process is another
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("0.0.0.0", 0))
-        port = other.getsockname()[1]
+    monkeypatch.setattr("tacpipe.links.ports.os.getpid", lambda: -1)  # This process then counts as another one
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("0.0.0.0", 0))
+        port = holder.getsockname()[1]
         with pytest.raises(DeviceError, match=rf"UDP port {port}.*\S"):
-            made(f"udp::{port}", Quiet())
+            open_address(f"udp::{port}", Quiet())
 
 
 def test_an_address_of_another_computer_cannot_be_listened_on() -> None:
     with pytest.raises(DeviceError, match=r"192\.0\.2\.7.*udp::4010"):
-        made("udp:192.0.2.7:4010", Listened())
+        open_address("udp:192.0.2.7:4010", Listened())
 
 
 @pytest.mark.parametrize("place", ["localhost", "localhost:", "localhost:70000", "localhost:x1"])
 def test_a_port_that_is_none_is_refused(place: str) -> None:
     with pytest.raises(UsageError, match="udp:"):
-        made(f"udp:{place}", Quiet())
+        open_address(f"udp:{place}", Quiet())
 
 
 def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch
 
     arrivals.look()
     assert arrivals.to_monotonic(clocks["time_ns"] - 3_000) == 999_999_997_000
-    assert arrivals.to_monotonic(clocks["time_ns"] + 10) == 1_000_000_000_000  # from the future: now
+    assert arrivals.to_monotonic(clocks["time_ns"] + 10) == 1_000_000_000_000  # A stamp from the future becomes now
     clocks["time_ns"] += 2 * OLDEST_NS  # the clock is set forward while a datagram waits
     clocks["monotonic_ns"] += 500
     arrivals.look()
@@ -160,13 +160,13 @@ class Flooded(socket.socket):
     """A port at which a datagram arrives whenever it is looked for one, until there are no more."""
 
     clocks: Clocks
-    left = 50
+    queued = 50
 
     def recvmsg(self, *_: int) -> Any:
         """Return a datagram with the stamp of its arrival, which is now."""
-        if not self.left:
+        if not self.queued:
             raise BlockingIOError
-        self.left -= 1
+        self.queued -= 1
         self.clocks.now_ns += 700
         stamp = struct.pack("@ll", *divmod(self.clocks.now_ns + WALL_NS, 1_000_000_000))
         return str(self.clocks.now_ns).encode(), [(socket.SOL_SOCKET, udp.STAMPS, stamp)], 0, None
@@ -178,11 +178,11 @@ def test_datagrams_that_come_while_others_are_fetched_bear_their_own_arrivals(mo
         link = udp.UdpLink("flood", port, prompt=True)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
             port.bind(("127.0.0.1", 0))
-            device.sendto(b"", port.getsockname())  # which makes it ready
-        found = link.read(peers.SOON_S)
+            device.sendto(b"", port.getsockname())  # The datagram makes the port ready
+        datagrams = link.read(peers.SOON_S)
         link.close()
 
-    assert [t_ns for t_ns, _ in found] == [int(data) for _, data in found]
+    assert [t_ns for t_ns, _ in datagrams] == [int(data) for _, data in datagrams]
 
 
 @given(
@@ -195,32 +195,32 @@ def test_stamps_are_as_far_apart_as_the_kernel_s_and_equal_only_where_those_are(
     with pytest.MonkeyPatch.context() as monkeypatch:
         clocks = Clocks(monkeypatch, itertools.cycle(passing))
         arrivals = Arrivals()
-        told, true = [], []
+        mapped, true = [], []
         for batch in batches:
             moments = []
             for apart_ns in batch:
                 clocks.now_ns += apart_ns
                 moments.append(clocks.now_ns)
             arrivals.look()
-            told += [arrivals.to_monotonic(t_ns + WALL_NS) for t_ns in moments]
+            mapped += [arrivals.to_monotonic(t_ns + WALL_NS) for t_ns in moments]
             true += moments
 
-    assert [later > earlier for earlier, later in itertools.pairwise(told)] == [
+    assert [later > earlier for earlier, later in itertools.pairwise(mapped)] == [
         later > earlier for earlier, later in itertools.pairwise(true)
     ]
-    assert max(abs(one - other) for one, other in zip(told, true, strict=True)) <= 2 * max(passing) + len(true)
+    assert max(abs(stamp - moment) for stamp, moment in zip(mapped, true, strict=True)) <= 2 * max(passing) + len(true)
 
 
 def test_datagrams_that_came_before_the_control_connection_closed_are_given_out_first() -> None:
-    with peers.both() as peer:
+    with peers.tcp_and_udp() as peer:
         for data in SENT:
             peer.send(data)
         peer.leave()
-        found = peer.link.read(peers.SOON_S)
+        datagrams = peer.link.read(peers.SOON_S)
         with pytest.raises(LinkLostError, match="probe"):
             peer.link.read(0)
 
-    assert [data for _, data in found] == SENT
+    assert [data for _, data in datagrams] == SENT
 
 
 def test_datagrams_that_came_before_the_port_refused_are_given_out_first() -> None:
@@ -230,23 +230,23 @@ def test_datagrams_that_came_before_the_port_refused_are_given_out_first() -> No
         for data in SENT:
             peer.send(data)
         peer.leave()
-        found = peer.link.read(peers.SOON_S)
+        datagrams = peer.link.read(peers.SOON_S)
         with pytest.raises(LinkLostError, match="probe"):
             peer.link.read(0)
 
-    assert [data for _, data in found] == SENT
+    assert [data for _, data in datagrams] == SENT
 
 
 class Crowd(socket.socket):
     """A port at which several hosts send: three datagrams of each, in turn."""
 
-    left: list[tuple[str, bytes]]
+    queued: list[tuple[str, bytes]]
 
     def recvmsg(self, *_: int) -> Any:
         """Return the next datagram, and whose it is."""
-        if not self.left:
+        if not self.queued:
             raise BlockingIOError
-        host, data = self.left.pop(0)
+        host, data = self.queued.pop(0)
         return data, [], 0, (host, 4010)
 
 
@@ -257,18 +257,18 @@ class Crowd(socket.socket):
 def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hosts: str, foreign: int) -> None:
     names = {"a": "192.0.2.1", "b": "192.0.2.2"}
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
-        port.left = [(names[host], host.encode()) for host in "abab"]
+        port.queued = [(names[host], host.encode()) for host in "abab"]
         link = udp.UdpLink("crowd", port, prompt=True, sender=sender)
-        found = link._queued()
+        datagrams = link._queued()
 
-        assert b"".join(data for _, data in found).decode() == hosts
+        assert b"".join(data for _, data in datagrams).decode() == hosts
         assert link.foreign == foreign
         link.close()
 
 
 def test_a_flood_is_left_to_the_next_read() -> None:
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
-        port.left = [("192.0.2.1", b"x")] * (udp.MOST_QUEUED + 10)
+        port.queued = [("192.0.2.1", b"x")] * (udp.MOST_QUEUED + 10)
         link = udp.UdpLink("flood", port, prompt=True)
 
         assert [len(link._queued()), len(link._queued())] == [udp.MOST_QUEUED, 10]
@@ -280,17 +280,17 @@ def test_a_flood_is_left_to_the_next_read() -> None:
 )
 def test_a_sender_that_is_no_address_is_refused(option: str) -> None:
     with pytest.raises(UsageError, match=r"\?sender=192\.168\.1\.20.*\?sender=first"):
-        made(f"udp::{free_port()}?{option}", Quiet())
+        open_address(f"udp::{free_port()}?{option}", Quiet())
 
 
 def test_a_sender_beside_a_host_is_refused() -> None:
     with pytest.raises(UsageError, match=r"127\.0\.0\.1.*\?sender=first"):
-        made("udp:127.0.0.1:4010?sender=first", Quiet())
+        open_address("udp:127.0.0.1:4010?sender=first", Quiet())
 
 
 def test_an_address_with_a_sender_listens_as_one_without() -> None:
     port = free_port()
-    link = made(f"udp::{port}?sender=127.0.0.1", Quiet())
+    link = open_address(f"udp::{port}?sender=127.0.0.1", Quiet())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.sendto(b"one", ("127.0.0.1", port))
 

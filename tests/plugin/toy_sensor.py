@@ -22,7 +22,7 @@ class Pulse(Sensor):
     counter: ClassVar[int | None] = 256
 
     rate_hz: float = 100.0  # readings a second
-    baud: int = 115_200  # of the port
+    baud: int = 115_200  # the rate of the port
 
     def fields(self) -> list[Any]:
         """Return the pressure."""

@@ -64,7 +64,7 @@ def read(params: Read, files: Files) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class Scale:
-    factor: int = 2  # that every value is multiplied by
+    factor: int = 2  # every value is multiplied by it
     refuse: int = -1  # a first value that counts as bad
     pause_s: float = 0.0  # how long each recording takes
     gate: str = ""  # a file, without which no recording is done

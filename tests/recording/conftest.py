@@ -1,4 +1,4 @@
-"""Recordings of emulated devices run in real time: they are a tier of their own, with limits that measure no computer."""
+"""Mark tests that record emulated devices in real time as a tier of their own, with limits that measure no computer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from tests.recording import patient
 SERVED = {"acquired", "rig", "served"}  # fixtures that emulate devices
 
 
-@pytest.hookimpl(tryfirst=True)  # before markers choose what runs
+@pytest.hookimpl(tryfirst=True)  # it adds markers before the selection by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    here = str(Path(__file__).parent)
+    folder = str(Path(__file__).parent)
     for item in items:
-        if SERVED & set(getattr(item, "fixturenames", ())) and str(item.path).startswith(here):
+        if SERVED & set(getattr(item, "fixturenames", ())) and str(item.path).startswith(folder):
             item.add_marker("rig")
 
 

@@ -1,10 +1,10 @@
-"""A device that numbers what it sends, written for tests alone: standard library only, and nothing of tacpipe.
+"""Emulate a device that numbers what it sends, with the standard library only and nothing of tacpipe.
 
     python counted_device.py PORT
 
 It sends a frame at a rate, over a pseudo-terminal and to a UDP port, and prints a line of JSON with the path of its
-terminal. What it sends follows from the number alone, so whoever reads a recording can compute it. Frames that the terminal
-does not take yet wait in order and are never dropped. How many it has sent stands in the file ``sent`` of its folder.
+terminal. What it sends follows from the number alone, so a reader of a recording can compute it. Frames that the terminal
+does not take yet wait in order and are never dropped. The file ``sent`` of its folder has the number of frames sent.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ def main() -> None:
                 number += 1
             with contextlib.suppress(BlockingIOError):
                 while waiting:
-                    left = waiting[0][os.write(master, waiting[0]) :]
+                    unsent = waiting[0][os.write(master, waiting[0]) :]
                     waiting.popleft()
-                    if left:
-                        waiting.appendleft(left)
+                    if unsent:
+                        waiting.appendleft(unsent)
             os.pwrite(sent.fileno(), struct.pack("<Q", number), 0)
             time.sleep(0.5 / RATE_HZ)
 

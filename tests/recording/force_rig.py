@@ -1,4 +1,4 @@
-"""A rig with one force sensor, which sends frames of rising counts by a script."""
+"""Build a rig with one force sensor, which sends frames of rising counts by a script."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.recording.test_schedule import FORCE, RATE_HZ
 
 def sending(lab: Lab, monkeypatch: pytest.MonkeyPatch, seconds: int) -> Script:
     """Write the rig file, and return the script by which its sensor sends for so many seconds."""
-    made = Script(monkeypatch)
-    made.send("force", frames(RATE_HZ * seconds), RATE_HZ)
+    new_script = Script(monkeypatch)
+    new_script.send("force", frames(RATE_HZ * seconds), RATE_HZ)
     (lab.folder / "rig.toml").write_text(FORCE)
-    return made
+    return new_script

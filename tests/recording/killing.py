@@ -1,4 +1,4 @@
-"""A recording whose process is killed, and what `acquire --recover` makes of what it left behind.
+"""Kill recordings at random times, recover them with `acquire --recover`, and compare them with what was sent.
 
     python -m tests.recording.killing [--kills 100]
 
@@ -35,13 +35,13 @@ RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
 
 @dataclass(frozen=True)
 class Cost:
-    """What a kill cost one stream."""
+    """The losses of one stream through a kill."""
 
     stream: str
     recovered: int  # samples
-    lost_s: float  # between the last recovered sample and the kill, of a recording that was still running
-    unread: int  # frames sent before the kill of which neither a sample nor the count of lost reads tells
-    told: int  # reads that the recording says were never written
+    lost_s: float  # time from the last recovered sample to the kill, 0 if the recording had ended
+    unread: int  # frames sent before the kill that are neither a sample nor counted as lost
+    reported: int  # reads that the recording reports as never written
 
 
 @contextmanager
@@ -53,11 +53,11 @@ def emulated(folder: Path) -> Iterator[Emulator]:
 
 
 def kill(
-    emulator: Emulator, folder: Path, after_s: float, duration_s: float, *, begun: bool = False
+    emulator: Emulator, folder: Path, after_s: float, duration_s: float, *, after_first_bytes: bool = False
 ) -> list[Cost] | None:
     """Kill a recording ``after_s`` seconds after its start, recover it, compare; None if it had not begun or had ended.
 
-    With ``begun`` the seconds count from the first bytes that are on the disk.
+    With ``after_first_bytes`` the seconds count from the first bytes that are on the disk.
     """
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "TACPIPE_STORE": str(folder / "store"), "PYTHONPATH": path}
@@ -66,7 +66,7 @@ def kill(
     words = ["acquire", str(folder / "rig.toml"), "-o", str(output), "--duration-s", str(duration_s), "--quiet"]
     recorder = [sys.executable, "-m", "tests.recording.patient", *words]
     process = subprocess.Popen(recorder, env=environment, stdout=subprocess.DEVNULL)
-    while begun and not any(file.stat().st_size for file in (folder / "store/spool").glob("*/bytes")):
+    while after_first_bytes and not any(file.stat().st_size for file in (folder / "store/spool").glob("*/bytes")):
         assert process.poll() is None, "the recording ended before it began"
         time.sleep(0.01)
     time.sleep(after_s)
@@ -75,17 +75,19 @@ def kill(
     process.wait()
     spooled = [path for path in (folder / "store/spool").glob("*") if (path / "bytes").stat().st_size]
     recover = [str(BIN / "tacpipe"), "acquire", "--recover", "-o", str(output), "--quiet", "--json"]
-    told: dict[str, Any] = json.loads(subprocess.run(recover, env=environment, capture_output=True, check=True).stdout)
+    report: dict[str, Any] = json.loads(
+        subprocess.run(recover, env=environment, capture_output=True, check=True).stdout
+    )
     assert not list((folder / "store/spool").glob("*/header.json")), "a spool was left"
     new = sorted(set(names(output)) - before)
     assert len(new) <= 1, "one recording became two"
     assert len(new) == 1 or not spooled, "a recording was lost"
-    if not new or not told["recordings"]:
+    if not new or not report["recordings"]:
         return None
     os.environ["TACPIPE_STORE"] = str(folder / "store")
     shard = tacpipe.open(output).recordings[new[0]]
-    whole = float(told["recordings"][0]["seconds"]) > duration_s - 0.2  # it was being sealed
-    return [_cost(emulator, shard, name, killed_ns, whole=whole) for name in shard.streams if name != "events"]
+    complete = float(report["recordings"][0]["seconds"]) > duration_s - 0.2  # it was being sealed
+    return [_cost(emulator, shard, name, killed_ns, complete=complete) for name in shard.streams if name != "events"]
 
 
 def names(output: Path) -> list[str]:
@@ -93,7 +95,7 @@ def names(output: Path) -> list[str]:
     return list(tacpipe.open(output).recordings) if (output / "manifest.json").exists() else []
 
 
-def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, whole: bool) -> Cost:
+def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, complete: bool) -> Cost:
     """Compare a recovered stream with the ledger, sample by sample."""
     table, ledger = shard.table(name), emulator.ledger[name]
     rows = ledger.whole
@@ -107,9 +109,9 @@ def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, whole: b
     lost_reads = int(shard.attributes.get(f"{name}_crash_lost_reads", 0))
     lost_bytes = int(shard.attributes.get(f"{name}_crash_lost_bytes", 0))
     frame = len(ledger.frames(rows[-1:])[0])
-    told = lost_bytes // frame if emulator.rig.streams[name].address.scheme == "serial" else lost_reads
-    lost_s = 0.0 if whole else (killed_ns - int(sent_ns[stop - 1])) / 1e9
-    return Cost(name, table.num_rows, lost_s, 0 if whole else missed - told, told)
+    reported = lost_bytes // frame if emulator.rig.streams[name].address.scheme == "serial" else lost_reads
+    lost_s = 0.0 if complete else (killed_ns - int(sent_ns[stop - 1])) / 1e9
+    return Cost(name, table.num_rows, lost_s, 0 if complete else missed - reported, reported)
 
 
 def main() -> None:
@@ -121,21 +123,23 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     rng = random.Random(chosen.seed)
     costs: list[Cost] = []
-    nothing = 0
+    without_recording = 0
     with tempfile.TemporaryDirectory(prefix="tacpipe-kill-") as name, emulated(Path(name)) as emulator:
         for number in range(chosen.kills):
-            found = kill(emulator, Path(name), rng.uniform(0.8, 4.5), 3.0)
-            nothing += found is None
-            costs += found or []
-            print(f"{number + 1}: {found}", file=sys.stderr, flush=True)
-    print(f"{chosen.kills} kills; {nothing} before the first byte or after the end; every recovered sample is equal")
-    recovered, told = sum(cost.recovered for cost in costs), sum(cost.told for cost in costs)
-    print(f"samples recovered: {recovered:,}; reads told as lost: {told:,}")
+            kill_costs = kill(emulator, Path(name), rng.uniform(0.8, 4.5), 3.0)
+            without_recording += kill_costs is None
+            costs += kill_costs or []
+            print(f"{number + 1}: {kill_costs}", file=sys.stderr, flush=True)
+    print(
+        f"{chosen.kills} kills; {without_recording} before the first byte or after the end; every recovered sample is equal"
+    )
+    recovered, reported = sum(cost.recovered for cost in costs), sum(cost.reported for cost in costs)
+    print(f"samples recovered: {recovered:,}; reads told as lost: {reported:,}")
     print(f"lost at most {max(cost.lost_s for cost in costs):.3f} s")
     print("sent before the kill, neither recovered nor told:")
     for stream in sorted({cost.stream for cost in costs}):
-        of_it = [cost.unread for cost in costs if cost.stream == stream]
-        print(f"  {stream}: {min(of_it)} to {max(of_it)} frames")
+        unread_counts = [cost.unread for cost in costs if cost.stream == stream]
+        print(f"  {stream}: {min(unread_counts)} to {max(unread_counts)} frames")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What tests of recording need: a small rig that is served, commands beside the test, and what was sent row by row."""
+"""Helpers of recording tests: a small rig that is served, commands in other processes, and each row that was sent."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def stream(name: str, sensor: str, transport: str, options: str = "{}") -> str:
 
 
 FORCE = stream("force", "optoforce", "serial:/dev/ttyACM0", "{ axes = 3, rate_hz = 333 }")  # counts, can be tared
-RANGE = stream("range", "tfmini", "serial:/dev/ttyUSB0")  # does not count, answers what it is told
+RANGE = stream("range", "tfmini", "serial:/dev/ttyUSB0")  # does not count, answers commands
 WRENCH = stream("wrench", "ati-netft", "udp:192.168.1.1:49152", "{ rate_hz = 500 }")  # counts twice
 SKIN = stream("skin", "xela", "ws:127.0.0.1:5000", "{ rate_hz = 50 }")  # taxels, and a clock
 PROGRAM = stream("program", "tap", "udp::4010")  # says when to start
@@ -40,8 +40,8 @@ PROGRAM = stream("program", "tap", "udp::4010")  # says when to start
 @contextmanager
 def served(folder: Path, *streams: str, faults: Faults | None = None, head: str = "") -> Iterator[Emulator]:
     """Serve a rig of these streams, its rig file with the addresses that were made in ``folder``."""
-    asked = rig_of.parse(head + "".join(streams))
-    with Emulator(asked, faults=faults, folder=folder / "emulated", patient=True) as emulator:
+    requested_rig = rig_of.parse(head + "".join(streams))
+    with Emulator(requested_rig, faults=faults, folder=folder / "emulated", patient=True) as emulator:
         (folder / "rig.toml").write_text(rig_of.to_toml(emulator.rig))
         yield emulator
 
@@ -56,12 +56,12 @@ def started(folder: Path, options: str, rig: str = "rig.toml", **popen: Any) -> 
 
 def spools(folder: Path) -> list[Path]:
     """Return the spools of a project that have bytes, those of a running recording among them."""
-    found = []
+    folders = []
     for path in (folder / ".tacpipe/spool").glob("*"):
         with contextlib.suppress(FileNotFoundError):  # it is begun or removed at this moment
             if (path / "header.json").stat().st_size and (path / "bytes").stat().st_size:
-                found.append(path)
-    return found
+                folders.append(path)
+    return folders
 
 
 def shards(folder: Path, output: str = "rec") -> dict[str, Any]:
@@ -88,19 +88,19 @@ def sent(emulator: Emulator, name: str) -> list[str]:
     return [repr(row) for row in zip(*columns, strict=True)]
 
 
-def place(rows: list[str], among: list[str]) -> int:
-    """Return where ``rows`` stand in ``among``, one behind the other; fails where they do not."""
+def place(rows: list[str], sent_rows: list[str]) -> int:
+    """Return where ``rows`` begin as a block in ``sent_rows``; fail if they are no block of it."""
     assert rows, "nothing was recorded"
-    for start in range(len(among) - len(rows) + 1):
-        if among[start] == rows[0] and among[start : start + len(rows)] == rows:
+    for start in range(len(sent_rows) - len(rows) + 1):
+        if sent_rows[start] == rows[0] and sent_rows[start : start + len(rows)] == rows:
             return start
     raise AssertionError("what was recorded is not what was sent")
 
 
-def in_order(rows: list[str], among: list[str]) -> bool:
-    """Return whether all of ``rows`` are found in ``among``, in this order, perhaps with others between."""
-    left = iter(among)
-    return bool(rows) and all(any(row == one for one in left) for row in rows)
+def in_order(rows: list[str], sent_rows: list[str]) -> bool:
+    """Return whether all of ``rows`` are found in ``sent_rows``, in this order, perhaps with others between."""
+    remaining = iter(sent_rows)
+    return bool(rows) and all(any(row == sent_row for sent_row in remaining) for row in rows)
 
 
 def events(shard: Any, name: str) -> list[tuple[str, int]]:

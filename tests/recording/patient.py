@@ -1,4 +1,4 @@
-"""A recorder that gives devices as long as a busy computer may take: it can be run in the place of ``tacpipe``.
+"""Run ``tacpipe`` with a recorder that gives devices as long as a busy computer may take.
 
 A trial's duration is counted in samples there: it has lasted a second once every stream gave those of a second. How long a
 device may be silent is tried over a clock that the test turns, in `test_schedule`; here such limits would measure the
@@ -37,7 +37,7 @@ def relax(patch: pytest.MonkeyPatch) -> None:
             patch.setattr(module, limit, getattr(module, limit) * TIMES)
     patch.setattr("tacpipe.recording.trials.clock", Samples(patch))
     reply = opening._reply
-    patch.setattr(opening, "_reply", lambda link, ask, *more: reply(link, longer(ask), *more))
+    patch.setattr(opening, "_reply", lambda link, ask, *args: reply(link, longer(ask), *args))
 
 
 class Samples:
@@ -51,11 +51,12 @@ class Samples:
             watches = [watch for watch in recorder.watches.values() if watch.stream.sensor.awaited]
             before = [watch.samples for watch in watches]
             tick(recorder)
-            if recorder._spool is not None:  # what comes between trials is of none
-                came = [
-                    self.counts.get(watch, 0) + watch.samples - had for watch, had in zip(watches, before, strict=True)
+            if recorder._spool is not None:  # samples between trials belong to no recording
+                counts = [
+                    self.counts.get(watch, 0) + watch.samples - previous
+                    for watch, previous in zip(watches, before, strict=True)
                 ]
-                self.counts = dict(zip(watches, came, strict=True))
+                self.counts = dict(zip(watches, counts, strict=True))
 
         patch.setattr(Recorder, "tick", counted)
 

@@ -1,4 +1,4 @@
-"""A rig without threads or devices: what each stream sends is written down, and the clock moves when it is waited on."""
+"""Emulate a rig without threads or devices: a script lists what each stream sends, and waiting moves the clock."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Script:
         self.sent: dict[str, Sent] = {}
         self.happens: list[tuple[float, Callable[[], object]]] = []
         self.tared: list[float] = []
-        self.drained_s = 0.0  # from when on readers have fetched what waited
+        self.drained_s = 0.0  # the time at which readers have fetched all that waited
         monkeypatch.setattr(clock, "now_ns", lambda: self.t_ns)
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(recorder, "Station", lambda stream: Station(self, stream))
@@ -37,7 +37,7 @@ class Script:
     def sleep(self, seconds: float) -> None:
         """Let time pass, and what happens meanwhile happen."""
         until_ns = self.t_ns + round(seconds * 1e9)
-        self.happens.sort(key=lambda one: one[0])
+        self.happens.sort(key=lambda event: event[0])
         while self.happens and START_NS + self.happens[0][0] * 1e9 <= until_ns:
             at_s, happen = self.happens.pop(0)
             self.t_ns = max(self.t_ns, START_NS + round(at_s * 1e9))
@@ -50,45 +50,45 @@ class Script:
 
 
 class Station:
-    """Stands for `tacpipe.recording.station.Station`: gives what is due."""
+    """Replace `tacpipe.recording.station.Station` and give what is due."""
 
     def __init__(self, script: Script, stream: Stream) -> None:
         self.script, self.stream = script, stream
         self.error = None
-        self._left = [(START_NS + round(t_s * 1e9), data) for t_s, data in script.sent.get(stream.name, [])]
+        self._unread = [(START_NS + round(t_s * 1e9), data) for t_s, data in script.sent.get(stream.name, [])]
         self._tally: Tally | None = None
         self._chunks = self._bytes = 0
 
     def start(self) -> None:
         """Begin now: what was sent before nobody heard."""
-        self._left = [one for one in self._left if one[0] >= self.script.t_ns]
+        self._unread = [chunk for chunk in self._unread if chunk[0] >= self.script.t_ns]
 
     def stop(self) -> None:
         """End."""
 
     def take(self) -> list[Chunks | Note]:
         """Return what came since the last call."""
-        due = [one for one in self._left if one[0] <= self.script.t_ns]
-        self._left = self._left[len(due) :]
+        due = [chunk for chunk in self._unread if chunk[0] <= self.script.t_ns]
+        self._unread = self._unread[len(due) :]
         if due and self._tally is not None:
             self._chunks, self._bytes = self._chunks + len(due), self._bytes + sum(len(data) for _, data in due)
             self._tally(self._chunks, self._bytes, due[-1][0])
         return [Chunks.of(due)] if due else []
 
     def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
-        """Return what came since the last call, and tell ``tally`` from now on."""
-        found = self.take()
-        counted = [] if early is None else [block for block in (*early, *found) if isinstance(block, Chunks)]
+        """Return what came since the last call, and report to ``tally`` from now on."""
+        blocks = self.take()
+        counted = [] if early is None else [block for block in (*early, *blocks) if isinstance(block, Chunks)]
         self._chunks = sum(len(block.size) for block in counted)
         self._bytes = sum(len(block.data) for block in counted)
         self._tally = tally
-        return found
+        return blocks
 
     def end(self) -> list[Chunks | Note]:
-        """Return what came since the last call, and tell nobody any more."""
-        found = self.take()
+        """Return what came since the last call, and stop reporting."""
+        blocks = self.take()
         self._tally = None
-        return found
+        return blocks
 
     def drained(self, since_ns: int) -> bool:
         """Return whether what waited was fetched."""

@@ -1,4 +1,4 @@
-"""`tacpipe acquire` records what a rig sent, sample by sample, and says of it what the command line says."""
+"""Test that `tacpipe acquire` records each sample that a rig sent, with the attributes of the command line."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_rig_of_the_first_paper_is_recorded_sample_by_sample(lab: Lab) -> No
         lab.run("acquire rig.toml -o rec --duration-s 1")
         shard = live.only(lab.folder)
 
-        assert sorted(shard.streams) == ["proximity", "robot", "xela1", "xela2"]  # and no events
+        assert sorted(shard.streams) == ["proximity", "robot", "xela1", "xela2"]  # there are no events
         for name in shard.streams:
             live.place(live.recorded(shard, name), live.sent(emulator, name))
             counts = shard.table(name).column("seq").to_numpy()
@@ -68,20 +68,22 @@ def test_trials_are_numbered_tared_and_labelled(lab: Lab, rig: Emulator) -> None
 
     assert list(shards) == ["press-001", "press-002", "press-003"]
     for number, shard in enumerate(shards.values(), start=1):
-        told = {name: shard.attributes[name] for name in ("trial", "material", "note", "gripper", "sensor")}
+        attributes = {name: shard.attributes[name] for name in ("trial", "material", "note", "gripper", "sensor")}
         labels = {"material": "cork", "note": "worn pad", "gripper": "left", "sensor": "optoforce"}
-        assert told == {"trial": number, **labels}
+        assert attributes == {"trial": number, **labels}
         live.place(live.recorded(shard, "force"), live.sent(rig, "force"))
-    said = [more for _, what, more in rig.ledger["force"].events[heard:] if what == "heard"]
+    commands = [payload for _, kind, payload in rig.ledger["force"].events[heard:] if kind == "heard"]
     tare = "aa003203" + "030" + "4ff"  # 333 Hz, 15 Hz low-pass, zero; the sum follows
-    assert sum(one.startswith(tare) for one in said) == 3
+    assert sum(command.startswith(tare) for command in commands) == 3
 
 
 def test_devices_are_not_tared_where_the_operator_says_no(lab: Lab, rig: Emulator) -> None:
     heard = len(rig.ledger["force"].events)
     lab.run("acquire rig.toml -o rec --duration-s 0.3 --trials 2 --no-tare")
 
-    assert not [more for _, what, more in rig.ledger["force"].events[heard:] if what == "heard" and more[12:14] == "ff"]
+    assert not [
+        payload for _, kind, payload in rig.ledger["force"].events[heard:] if kind == "heard" and payload[12:14] == "ff"
+    ]
 
 
 def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recorded(lab: Lab, rig: Emulator) -> None:
@@ -89,12 +91,12 @@ def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recor
     lab.run("acquire rig.toml -o rec --duration-s 0.3 --name press --trials 2")
     before = lab.manifest("rec")
     single = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name same")
-    several = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name press --trials 3")
+    trials = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name press --trials 3")
     folded = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name Same")  # one to a file system without case
 
-    assert (single.code, several.code, folded.code) == (2, 2, 2)
+    assert (single.code, trials.code, folded.code) == (2, 2, 2)
     assert "names already: same." in folded.err
-    assert "names already: same." in single.err and "names already: press-001, press-002." in several.err
+    assert "names already: same." in single.err and "names already: press-001, press-002." in trials.err
     assert lab.manifest("rec") == before and not live.spools(lab.folder)
 
 
@@ -123,11 +125,11 @@ def test_quiet_prints_where_it_is_and_no_more(lab: Lab, rig: Emulator) -> None:
 
 
 def test_json_tells_what_was_recorded(lab: Lab, rig: Emulator) -> None:
-    told = json.loads(lab.run("acquire rig.toml -o rec --duration-s 0.5 --name one --json").out)
+    report = json.loads(lab.run("acquire rig.toml -o rec --duration-s 0.5 --name one --json").out)
     rows = {name: live.only(lab.folder).table(name).num_rows for name in rig.rig.streams}
 
-    assert told["schema_version"] == 1 and told["output"] == "rec" and told["rows"] == sum(rows.values())
-    (recording,) = told["recordings"]
+    assert report["schema_version"] == 1 and report["output"] == "rec" and report["rows"] == sum(rows.values())
+    (recording,) = report["recordings"]
     assert recording["name"] == "one" and recording["rows"] == rows
     assert set(recording["lost"]) == set(rows) and recording["lost"]["force"] == 0
 
@@ -137,9 +139,9 @@ def test_a_dry_run_opens_every_stream_and_writes_nothing(
 ) -> None:
     monkeypatch.setattr("tacpipe.cli.acquire.DRY_RUN_S", 0.2)
     before = sorted(lab.folder.rglob("*"))
-    told = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
+    report = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
 
-    assert {name: found["samples"] > 0 for name, found in told["streams"].items()} == dict.fromkeys(
+    assert {name: figures["samples"] > 0 for name, figures in report["streams"].items()} == dict.fromkeys(
         rig.rig.streams, True
     )
     assert sorted(lab.folder.rglob("*")) == before
@@ -154,7 +156,7 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ("", "Missing option -o. Give the dataset of recordings to append to, as -o data/recordings."),
         ("-o rec --start bell", "There is no --start bell; it must be one of now, key, contact, tap."),
@@ -168,11 +170,11 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
         ("-o rec --label cork", "--label cork should read name=value, as in --label material=foam."),
     ],
 )
-def test_what_cannot_be_meant_is_refused_before_a_device_is_opened(lab: Lab, options: str, told: str) -> None:
+def test_what_cannot_be_meant_is_refused_before_a_device_is_opened(lab: Lab, options: str, message: str) -> None:
     (lab.folder / "rig.toml").write_text(live.stream("force", "optoforce", "serial:/dev/there-is-none"))
     refused = lab.call(f"acquire rig.toml {options}")
 
-    assert (refused.code, refused.err) == (2, f"tacpipe: {told}\n")
+    assert (refused.code, refused.err) == (2, f"tacpipe: {message}\n")
     assert not (lab.folder / "rec").exists()
 
 
@@ -187,25 +189,27 @@ def test_two_recordings_at_once_are_both_appended(lab: Lab, rig: Emulator) -> No
         stream = rig.rig.streams[name]
         options = "{ axes = 3, rate_hz = 333 }" if name == "force" else "{}"
         (lab.folder / f"{name}.toml").write_text(live.stream(name, stream.kind, str(stream.address), options))
-    both = [
+    processes = [
         live.started(lab.folder, f"--duration-s 1 --name {name} --quiet", f"{name}.toml") for name in ("force", "range")
     ]
-    told = [one.communicate()[1] for one in both]
+    errors = [process.communicate()[1] for process in processes]
 
-    assert [one.returncode for one in both] == [0, 0], told
-    found = live.shards(lab.folder)
-    assert {name: shard.streams[-1:] for name, shard in found.items()} == {"force": ("force",), "range": ("range",)}
-    for name, shard in found.items():
+    assert [process.returncode for process in processes] == [0, 0], errors
+    shards = live.shards(lab.folder)
+    assert {name: shard.streams[-1:] for name, shard in shards.items()} == {"force": ("force",), "range": ("range",)}
+    for name, shard in shards.items():
         live.place(live.recorded(shard, name), live.sent(rig, name))
 
 
 def test_help_ends_with_an_example(tmp_path: Path) -> None:
-    shown = " ".join(tacpipe(tmp_path, "acquire --help").stdout.split("Arguments:")[0].split())
+    help_text = " ".join(tacpipe(tmp_path, "acquire --help").stdout.split("Arguments:")[0].split())
 
-    assert shown.endswith("Example: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork")
+    assert help_text.endswith(
+        "Example: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork"
+    )
 
 
 def test_recording_imports_no_torch(lab: Lab, rig: Emulator) -> None:
-    found = imported(lab.folder, "acquire rig.toml -o rec --duration-s 0.3 --quiet")
+    modules = imported(lab.folder, "acquire rig.toml -o rec --duration-s 0.3 --quiet")
 
-    assert "numpy" in found and found & {"torch", "sklearn", "open3d", "scipy", "matplotlib"} == set()
+    assert "numpy" in modules and modules & {"torch", "sklearn", "open3d", "scipy", "matplotlib"} == set()

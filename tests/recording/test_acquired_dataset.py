@@ -1,4 +1,4 @@
-"""An acquired dataset is kept, carried, labelled and shown like any other, and damage to it is told."""
+"""Test that acquired datasets are kept, carried, labelled and shown like any other, and that damage is reported."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def acquired(lab: Lab) -> Iterator[Lab]:
 
 def damage(lab: Lab) -> None:
     """Change a byte of a shard, where it is stored and where it is linked."""
-    found = lab.manifest("rec").recordings["one"]["shards"]["force"]["digest"]
-    for path in (lab.folder / ".tacpipe/objects" / found[:2] / found, lab.folder / "rec/one/force.parquet"):
+    digest = lab.manifest("rec").recordings["one"]["shards"]["force"]["digest"]
+    for path in (lab.folder / ".tacpipe/objects" / digest[:2] / digest, lab.folder / "rec/one/force.parquet"):
         content = path.read_bytes()
         path.chmod(0o644)
         path.unlink()
@@ -55,9 +55,9 @@ def test_gc_keeps_recordings_even_where_their_dataset_was_deleted(acquired: Lab)
 def test_gc_leaves_a_spool_that_is_written_alone(acquired: Lab) -> None:
     process = live.started(acquired.folder, "--name three")
     (spool,) = live.awaited(lambda: live.spools(acquired.folder))
-    then = time.time() - 300 * 86400
+    long_ago_s = time.time() - 300 * 86400
     for path in spool.iterdir():
-        os.utime(path, (then, then))
+        os.utime(path, (long_ago_s, long_ago_s))
     acquired.run("store gc")
     files = {path.name for path in spool.iterdir()}
     process.send_signal(signal.SIGINT)
@@ -85,11 +85,11 @@ def test_damage_to_a_recording_is_told_with_what_brings_it_back(acquired: Lab) -
     acquired.run(f"store push {remote} rec")
     damage(acquired)
     for command in ("show rec", "synchronize rec -o grid --rate-hz 50", "store repair"):
-        told = acquired.call(command)
+        ran = acquired.call(command)
         sentence = (
             "It is the recording one/force.parquet, which cannot be recomputed: restore it with `tacpipe store pull`."
         )
-        assert told.code == 4 and sentence in told.out + told.err, command
+        assert ran.code == 4 and sentence in ran.out + ran.err, command
     acquired.run(f"store pull {remote} rec")
 
     acquired.run("store verify")
@@ -121,20 +121,24 @@ def test_an_acquired_dataset_is_pushed_and_pulled(acquired: Lab, monkeypatch: py
 def test_labels_are_changed_afterwards_and_stay_when_more_is_recorded(acquired: Lab) -> None:
     acquired.run("label rec one --set material=foam --exclude 'the pad fell off'")
     acquired.run("acquire rig.toml -o rec --duration-s 0.3 --name three")
-    found = acquired.manifest("rec").recordings
+    recordings = acquired.manifest("rec").recordings
 
-    assert [found[name]["attributes"].get("material") for name in ("one", "two", "three")] == ["foam", "cork", None]
-    assert found["one"]["attributes"]["excluded"] == "the pad fell off"
+    assert [recordings[name]["attributes"].get("material") for name in ("one", "two", "three")] == [
+        "foam",
+        "cork",
+        None,
+    ]
+    assert recordings["one"]["attributes"]["excluded"] == "the pad fell off"
 
 
 def test_show_and_explain_tell_of_every_stream(acquired: Lab) -> None:
-    shown = acquired.run("show rec").out
-    told = json.loads(acquired.run("show rec --json").out)
+    show_text = acquired.run("show rec").out
+    report = json.loads(acquired.run("show rec --json").out)
     explained = acquired.run("explain rec").out
 
     rows = {name: shard.table("force").num_rows for name, shard in live.shards(acquired.folder).items()}
-    assert {name: found["force"]["rows"] for name, found in told["recordings"].items()} == rows
-    assert "made by acquire" in shown and "material: cork (2)" in shown and "sensor: optoforce (2)" in shown
+    assert {name: streams["force"]["rows"] for name, streams in report["recordings"].items()} == rows
+    assert "made by acquire" in show_text and "material: cork (2)" in show_text and "sensor: optoforce (2)" in show_text
     assert "acquire version 1" in explained and "one/rig.toml" in explained
 
 

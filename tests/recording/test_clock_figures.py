@@ -1,4 +1,4 @@
-"""Ten emulated minutes with a device's clock 50 ppm off and 0.9 s lost: what a recording tells of that clock."""
+"""Test the clock figures of ten emulated minutes with a device clock 50 ppm off and 0.9 s lost."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.sensors import made
 
 MINUTES, SKEW_PPM, OFFSET_S = 10, 50.0, 12.345
 BLOCK = 500  # samples that are encoded at once, the values of which are those of the block before
-LOST_S = (300.0, 300.9)  # in the middle
+LOST_S = (300.0, 300.9)  # a part in the middle
 RIG = """
 [[stream]]
 name = "device"
@@ -38,8 +38,8 @@ options = {options}
 STREAMS = {
     "contactile": ("serial:/dev/ttyACM0", "{ rate_hz = 500 }"),  # its clock ticks in microseconds
     "xela": ("ws:127.0.0.1:5000", "{ rate_hz = 50 }"),
-    "weiss-wts": ("serial:/dev/ttyACM0", "{ rate_hz = 100 }"),  # in steps of 10 us
-    "ur-rtde": ("tcp:127.0.0.1:30004", "{}"),  # in seconds, a float
+    "weiss-wts": ("serial:/dev/ttyACM0", "{ rate_hz = 100 }"),  # its clock has steps of 10 us
+    "ur-rtde": ("tcp:127.0.0.1:30004", "{}"),  # its clock is a float in seconds
 }
 
 
@@ -61,19 +61,19 @@ class Recorded:
         for start in range(0, len(numbers), BLOCK):
             rows = slice(start, start + BLOCK)
             count = len(numbers[rows])
-            block = made.taken(base, slice(0, count))
+            block = made.select_rows(base, slice(0, count))
             counter = None if sensor.counter is None else numbers[rows] * sensor.step % sensor.counter
             block = replace(block, seq=counter, t_device_ns=clock_ns[rows])
-            came = zip(arrival_ns[rows].tolist(), made.pieces(sensor, sensor.encode(block)), strict=True)
-            kept = [(t_ns, data) for t_ns, data in came if not LOST_S[0] * 1e9 <= t_ns < LOST_S[1] * 1e9]
-            spool.append("device", Chunks.of(kept))
+            arrivals = zip(arrival_ns[rows].tolist(), made.pieces(sensor, sensor.encode(block)), strict=True)
+            received = [(t_ns, data) for t_ns, data in arrivals if not LOST_S[0] * 1e9 <= t_ns < LOST_S[1] * 1e9]
+            spool.append("device", Chunks.of(received))
         spool.close()
         read = Spooled(spool.folder)
-        read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}  # so that stamps compare with the true time
+        read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}  # stamps then compare with the true time
         self.sealed = sealing.stream(read, rig, "device")
         self.table = self.sealed.table
-        there = (arrival_ns < LOST_S[0] * 1e9) | (arrival_ns >= LOST_S[1] * 1e9)
-        self.taken_ns = taken_ns[there]
+        is_received = (arrival_ns < LOST_S[0] * 1e9) | (arrival_ns >= LOST_S[1] * 1e9)
+        self.taken_ns = taken_ns[is_received]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_offset_is_found_to_half_a_sample_and_drift_to_two_ppm(sensor: str, tmp_
 
     fit = fit_clock(device_ns, arrival_ns)
 
-    assert len(fit.segments) == 1  # what was lost is no restart
+    assert len(fit.segments) == 1  # a loss is no restart
     assert abs(fit.drift_ppm + SKEW_PPM) < 2
     wrong_ns = np.abs(host_times(fit, device_ns, arrival_ns) - recorded.taken_ns)
     assert wrong_ns.max() < 0.5e9 / recorded.rate_hz
@@ -108,15 +108,15 @@ def test_synchronize_tells_the_clock_masks_what_was_lost_and_keeps_the_stamps(xe
             return Columns(to_parquet(xela.table))
 
     stage = registry.load("synchronize")
-    made: Any = stage(stage.params(rate_hz=50.0, values="interpolate"), Recording())
+    output: Any = stage(stage.params(rate_hz=50.0, values="interpolate"), Recording())
 
-    assert abs(float(made.attributes["device_clock_drift_ppm"]) + SKEW_PPM) < 2
-    assert float(made.attributes["device_clock_residual_ms"]) < 2
-    table = made.streams[""]
+    assert abs(float(output.attributes["device_clock_drift_ppm"]) + SKEW_PPM) < 2
+    assert float(output.attributes["device_clock_residual_ms"]) < 2
+    table = output.streams[""]
     gap, t_ns = table.column("device_gap").to_numpy(zero_copy_only=False), table.column("t_ns").to_numpy()
     inside = (t_ns > (LOST_S[0] + 0.1) * 1e9) & (t_ns < (LOST_S[1] - 0.1) * 1e9)
     assert gap[inside].all() and inside.sum() > 30
-    assert gap.sum() < 60  # and nothing else
+    assert gap.sum() < 60  # no other rows are masked
     assert table.column("device_t_device_ns").type == pa.int64()
 
 
@@ -130,13 +130,13 @@ def test_another_judge_of_clocks_finds_the_same_drift(xela: Recorded, tmp_path: 
             stamp = {"sec": device // 1_000_000_000, "nanosec": device % 1_000_000_000}
             row = {"topic": "/device", "schema_name": "touch", "data": {"header": {"stamp": stamp, "frame_id": ""}}}
             lines.write(json.dumps({**row, "log_time_ns": arrival, "publish_time_ns": arrival}) + "\n")
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "clockdoctor.cli", str(file), "--out-dir", str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert not done.returncode, done.stderr
-    drift = re.search(r"source skew:.*drift=([-+.\d]+)ppm", done.stdout)
+    assert not process.returncode, process.stderr
+    drift = re.search(r"source skew:.*drift=([-+.\d]+)ppm", process.stdout)
     assert drift and abs(float(drift[1]) + SKEW_PPM) < 0.5
     assert abs(float(drift[1]) - fit_clock(device_ns, arrival_ns).drift_ppm) < 0.5

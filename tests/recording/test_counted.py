@@ -1,4 +1,4 @@
-"""Whatever happens to a recorder, each number that a device counted is in the dataset once, in order, or reported as lost.
+"""Test that each number that a device counted is in the dataset once, in order, or is reported as lost.
 
 The device and what compares are of this test's own: they share no code with tacpipe or its emulator, and read the dataset's
 files with pyarrow alone.
@@ -57,10 +57,10 @@ class Counting:
     folder: Path
     rig: str
 
-    def sends(self, more: int) -> None:
+    def sends(self, count: int) -> None:
         """Wait until it has sent so many more."""
-        until_s, wanted = time.monotonic() + HANGS_S, self.sent + more
-        while self.sent < wanted:
+        until_s, target = time.monotonic() + HANGS_S, self.sent + count
+        while self.sent < target:
             assert time.monotonic() < until_s, "the device hangs"
             time.sleep(0.01)
 
@@ -80,8 +80,8 @@ def device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Counting]:
     words = [sys.executable, "-I", counted_device.__file__, str(port)]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        told = json.loads(process.stdout.readline())
-        yield Counting(folder, RIG.format(port=port, **told))
+        announced = json.loads(process.stdout.readline())
+        yield Counting(folder, RIG.format(port=port, **announced))
         process.kill()
 
 
@@ -128,12 +128,12 @@ def events(lab: Lab) -> list[dict[str, Any]]:
     return pq.read_table(path).to_pylist() if path.exists() else []
 
 
-def check(lab: Lab, least: int) -> None:
+def check(lab: Lab, min_count: int) -> None:
     """Fail unless each number from the first to the last is there once, in order, or is reported as lost by the network."""
     for stream in ("wire", "net"):
         numbers, attributes = recorded(lab, stream)
-        assert len(numbers) >= least
-        assert all(one < other for one, other in itertools.pairwise(numbers)), "out of order, or twice"
+        assert len(numbers) >= min_count
+        assert all(number < following for number, following in itertools.pairwise(numbers)), "out of order, or twice"
         missing = numbers[-1] - numbers[0] + 1 - len(numbers)
         assert missing == attributes[f"{stream}_lost"]
         assert missing == 0 or stream == "net", "the terminal loses nothing"
@@ -142,13 +142,13 @@ def check(lab: Lab, least: int) -> None:
 def test_a_recorder_that_was_stopped_has_every_number_and_says_which_are_late(lab: Lab, device: Counting) -> None:
     recorder = Recorder(lab, device)
     recorder.process.send_signal(signal.SIGSTOP)
-    time.sleep(1.0)  # at least, however busy the computer is
+    time.sleep(1.0)  # the shortest wait, however busy the computer is
     device.sends(200)
     recorder.process.send_signal(signal.SIGCONT)
     device.sends(100)
     recorder.ends(signal.SIGINT)
 
-    check(lab, least=300)
+    check(lab, min_count=300)
     stalls = [event["stream"] for event in events(lab) if event["cause"] == "recorder_stalled"]
     assert set(stalls) == {"wire", "net"}
     wire, net = (pq.read_table(lab.folder / f"rec/one/{stream}.parquet") for stream in ("wire", "net"))
@@ -162,7 +162,7 @@ def test_a_disk_that_is_slow_to_sync_costs_no_number(lab: Lab, device: Counting)
     device.sends(400)
     recorder.ends(signal.SIGINT)
 
-    check(lab, least=350)
+    check(lab, min_count=350)
 
 
 def test_a_recorder_that_was_killed_leaves_every_number_up_to_then(lab: Lab, device: Counting) -> None:
@@ -171,7 +171,7 @@ def test_a_recorder_that_was_killed_leaves_every_number_up_to_then(lab: Lab, dev
     recorder.ends(signal.SIGKILL, -signal.SIGKILL)
     lab.run("acquire --recover")
 
-    check(lab, least=100)
+    check(lab, min_count=100)
     _, attributes = recorded(lab, "wire")
     assert (attributes["ended"], attributes["requested_duration_s"]) == ("recovered", 1000.0)
     assert [event["cause"] for event in events(lab) if not event["stream"]] == ["recovered"]
@@ -182,5 +182,5 @@ def test_a_recorder_whose_terminal_was_closed_has_every_number_up_to_then(lab: L
     device.sends(200)
     recorder.ends(signal.SIGHUP)
 
-    check(lab, least=150)
+    check(lab, min_count=150)
     assert recorded(lab, "wire")[1]["ended"] == "interrupted"

@@ -1,4 +1,4 @@
-"""A recording tells how it ended and how long it should have been; its raw bytes are kept where somebody asks for them."""
+"""Test that a recording states how it ended and how long it was to last, and keeps its raw bytes on request."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def described(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:
     """Return how the only recording ended, what was asked for, and the events of it as a whole."""
     shard = live.only(lab.folder)
     rows = shard.table("events").to_pylist() if "events" in shard.streams else []
-    whole = [(row["cause"], row["detail"]) for row in rows if not row["stream"]]
-    return shard.attributes["ended"], shard.attributes.get("requested_duration_s"), whole
+    recording_events = [(row["cause"], row["detail"]) for row in rows if not row["stream"]]
+    return shard.attributes["ended"], shard.attributes.get("requested_duration_s"), recording_events
 
 
 def crash_at(lab: Lab, script: Script, at_s: float) -> None:
@@ -56,7 +56,7 @@ def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script:
 
 
 @pytest.mark.parametrize(
-    ("options", "number", "ended"),
+    ("options", "number", "expected_end"),
     [
         ("--duration-s 10", signal.SIGINT, "interrupted"),
         ("--duration-s 10", signal.SIGTERM, "interrupted"),
@@ -67,23 +67,23 @@ def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script:
     ],
 )
 def test_a_recording_that_a_signal_cut_short_is_interrupted(
-    lab: Lab, script: Script, options: str, number: signal.Signals, ended: str
+    lab: Lab, script: Script, options: str, number: signal.Signals, expected_end: str
 ) -> None:
     if "tap" in options:
         (lab.folder / "rig.toml").write_text(FORCE + live.PROGRAM)
     script.happens.append((4.0, lambda: os.kill(os.getpid(), number)))
     lab.run(f"acquire rig.toml -o rec --name one {options}")
     requested = 10.0 if "duration" in options else None
-    of = "10 s were requested" if requested else "no duration was requested"
+    request_text = "10 s were requested" if requested else "no duration was requested"
     lasts_s = (counts(live.only(lab.folder))[-1] - counts(live.only(lab.folder))[0]) / RATE_HZ
 
-    events = [] if ended == "completed" else [("interrupted", f"{lasts_s:.1f} s are there; {of}")]
-    assert described(lab) == (ended, requested, events)
-    shown = lab.run("show rec").out
-    assert f"ended: {ended} (1)" in shown
-    of = " of 10" if requested else ""
-    line = f"not completed: one: interrupted before its end, {lasts_s:.1f}{of} s"
-    assert (line in shown) == (ended == "interrupted")
+    events = [] if expected_end == "completed" else [("interrupted", f"{lasts_s:.1f} s are there; {request_text}")]
+    assert described(lab) == (expected_end, requested, events)
+    show_text = lab.run("show rec").out
+    assert f"ended: {expected_end} (1)" in show_text
+    of_requested = " of 10" if requested else ""
+    line = f"not completed: one: interrupted before its end, {lasts_s:.1f}{of_requested} s"
+    assert (line in show_text) == (expected_end == "interrupted")
 
 
 def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, script: Script) -> None:
@@ -102,7 +102,7 @@ def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, scrip
 def test_a_recording_that_ended_and_was_sealed_by_another_process_is_whole_and_says_so(
     lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*given: Any) -> str:
+    def fail(*args: Any) -> str:
         raise OSError("the power is gone")
 
     with monkeypatch.context() as patch:
@@ -120,7 +120,7 @@ def test_what_a_label_says_of_the_end_of_a_recording_counts_for_nothing(lab: Lab
 
 
 def test_a_spool_of_before_is_recovered_without_a_word_on_its_duration(lab: Lab) -> None:
-    folder = spooled(lab)  # without `duration_s` and `keep`, and with an absolute path
+    folder = spooled(lab)  # its header has no `duration_s` and no `keep`, and an absolute path
 
     assert not {"duration_s", "keep"} & set(Spooled(folder).header)
     lab.run("acquire --recover")
@@ -137,18 +137,18 @@ def test_a_duration_that_is_no_number_is_refused(lab: Lab, duration_s: Any) -> N
 
 
 def test_a_note_on_the_recording_is_read_with_any_stream_and_given_out_with_none(tmp_path: Path) -> None:
-    made = Spool(tmp_path, {"rig": ""}, ["a", "b"])
-    made.note(Note(1, "b", "lost", "unplugged"))
-    made.note(Note(2, "", "ended", "interrupted"))
-    made.close()
-    read = Spooled(made.folder)
+    spool = Spool(tmp_path, {"rig": ""}, ["a", "b"])
+    spool.note(Note(1, "b", "lost", "unplugged"))
+    spool.note(Note(2, "", "ended", "interrupted"))
+    spool.close()
+    read = Spooled(spool.folder)
 
     assert read.ended == "recovered"  # nothing is read yet
     assert list(read.blocks("a")) == [] and read.ended == "interrupted" and not read.damage
     assert list(read.blocks()) == [("b", Note(1, "b", "lost", "unplugged"))]
 
 
-def kept(lab: Lab, err: str) -> Path:
+def kept_spool(lab: Lab, err: str) -> Path:
     """Return where a command says that it kept a spool."""
     (path,) = (lab.store.root / "kept-spools").iterdir()
     assert err.endswith(f"; its spool is kept in {path}\n")
@@ -163,7 +163,7 @@ def test_a_spool_is_kept_where_asked_for_and_no_collection_removes_it(lab: Lab, 
     if crashed:
         after_crash(lab)
         ran = lab.run("acquire --recover")
-    path = kept(lab, ran.err)
+    path = kept_spool(lab, ran.err)
     content = (path / "bytes").read_bytes()
     age(lab, days=300)
     lab.run("store gc --recordings")

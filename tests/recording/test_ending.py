@@ -1,4 +1,4 @@
-"""Ctrl-C ends a recording and keeps it; a second one while it is sealed leaves it to `acquire --recover`."""
+"""Test that Ctrl-C ends and keeps a recording, and that a second one while it is sealed leaves it to `acquire --recover`."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def while_sealing() -> Iterator[Interrupt]:
     patch, real = pytest.MonkeyPatch(), sealing.seal
 
     def interrupt(times: int, apart_s: float = 2 * TWICE_S, number: signal.Signals = signal.SIGINT) -> None:
-        def seal(*given: Any) -> Any:
+        def seal(*args: Any) -> Any:
             patch.undo()
             for _ in range(times):
                 os.kill(os.getpid(), number)
                 time.sleep(apart_s)
-            return real(*given)
+            return real(*args)
 
         patch.setattr(sealing, "seal", seal)
 
@@ -59,13 +59,13 @@ def test_a_signal_ends_a_recording_and_it_is_sealed(lab: Lab, rig: Emulator, num
     out, err = process.communicate()
 
     assert process.returncode == 0, err
-    (told,) = json.loads(out)["recordings"]
+    (report,) = json.loads(out)["recordings"]
     shard = live.only(lab.folder)
-    assert told["name"] == "one" and not live.spools(lab.folder)
+    assert report["name"] == "one" and not live.spools(lab.folder)
     for name in ("force", "skin"):
         rows = live.recorded(shard, name)
         live.place(rows, live.sent(rig, name))
-        assert told["rows"][name] == len(rows) and shard.attributes[f"{name}_lost"] == 0
+        assert report["rows"][name] == len(rows) and shard.attributes[f"{name}_lost"] == 0
 
 
 @pytest.mark.parametrize("options", ["", "--stop key"])
@@ -85,11 +85,11 @@ def test_a_terminal_that_is_closed_ends_a_recording_and_it_is_sealed(lab: Lab, r
 
     def recorded() -> bool:
         with contextlib.suppress(BlockingIOError):
-            os.read(master, 1 << 16)  # what is shown; a terminal that nobody reads takes no more after a while
+            os.read(master, 1 << 16)  # the display; a terminal that nobody reads takes no more after a while
         return any((spool / "bytes").stat().st_size > 4000 for spool in live.spools(lab.folder))
 
     live.awaited(recorded)
-    os.close(master)  # from here on every write to the terminal is an error
+    os.close(master)  # every later write to the terminal is an error
 
     assert process.wait() == 0
     shard = live.only(lab.folder)
@@ -138,7 +138,7 @@ def test_two_signals_at_once_are_one_wish(
     lab: Lab, rig: Emulator, while_sealing: Interrupt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tacpipe.io.termination.TWICE_S", 1000.0)  # however slow the computer is between the two
-    while_sealing(2, 0)  # as of `timeout`, which signals a process and then its group
+    while_sealing(2, 0)  # `timeout` also signals a process and then its group
     lab.run("acquire rig.toml -o rec --duration-s 0.5")
 
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
@@ -170,14 +170,14 @@ def test_a_second_signal_while_sealing_leaves_the_spool_and_it_is_recovered(
     lab: Lab, rig: Emulator, while_sealing: Interrupt
 ) -> None:
     while_sealing(2)
-    ended = lab.call("acquire rig.toml -o rec --duration-s 0.5 --name one")
+    interrupted = lab.call("acquire rig.toml -o rec --duration-s 0.5 --name one")
     (spool,) = live.spools(lab.folder)
 
-    assert ended.code == 130 and not (lab.folder / "rec").exists()
-    assert without_created_store(ended.err) == (
+    assert interrupted.code == 130 and not (lab.folder / "rec").exists()
+    assert without_created_store(interrupted.err) == (
         f"tacpipe: interrupted. What was recorded is kept in {spool}; `tacpipe acquire --recover` seals it.\n"
     )
-    told = lab.run("acquire --recover")
-    assert told.err.startswith("recovered one: ") and told.err.count("\n") == 1
+    recovered = lab.run("acquire --recover")
+    assert recovered.err.startswith("recovered one: ") and recovered.err.count("\n") == 1
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
     assert not live.spools(lab.folder)

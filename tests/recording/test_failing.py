@@ -1,4 +1,4 @@
-"""What fails while a rig records ends neither the recording of other streams nor what came before."""
+"""Test that a failure during a recording neither ends other streams nor loses earlier samples."""
 
 from __future__ import annotations
 
@@ -44,43 +44,43 @@ def frames(count: int) -> list[bytes]:
     return [bytes(frame) for frame in OptoForce(axes=3).encode(Samples(values, seq=np.arange(count)))]
 
 
-def chunks(rows: range, every: list[bytes], since_ns: int = 0) -> Chunks:
-    return Chunks.of([(since_ns + row * PERIOD_NS, every[row]) for row in rows])
+def chunks(rows: range, all_frames: list[bytes], since_ns: int = 0) -> Chunks:
+    return Chunks.of([(since_ns + row * PERIOD_NS, all_frames[row]) for row in rows])
 
 
 def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
-    made = Spool(folder, {"rig": RIG, "output": "rec", "recording": "r", "attributes": {}}, list(streams))
+    spool = Spool(folder, {"rig": RIG, "output": "rec", "recording": "r", "attributes": {}}, list(streams))
     for name, blocks in streams.items():
         count = size = 0
         for block in blocks:
             if isinstance(block, Note):
-                made.note(block)
+                spool.note(block)
                 continue
-            made.append(name, block)
+            spool.append(name, block)
             count, size = count + len(block.size), size + len(block.data)
-            made.tally(made.streams[name], count, size, int(block.t_ns[-1]))
-    made.close()
-    return Spooled(made.folder)
+            spool.tally(spool.streams[name], count, size, int(block.t_ns[-1]))
+    spool.close()
+    return Spooled(spool.folder)
 
 
 class Link:
-    """A link that gives what it is told to, and raises what it is told to."""
+    """A link that gives the items of a list and raises those that are errors."""
 
     packets, overruns, foreign, kernel_stamped = False, 0, 0, False
     local: dict[str, Any] = {}  # noqa: RUF012
 
-    def __init__(self, came: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:
-        self.came, self.closing, self.pace_s = came, closing, pace_s
+    def __init__(self, incoming: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:
+        self.incoming, self.closing, self.pace_s = incoming, closing, pace_s
 
     def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
-        if not self.came:
+        if not self.incoming:
             time.sleep(0.01)
             return []
         time.sleep(self.pace_s)
-        found = self.came.pop(0)
-        if isinstance(found, Exception):
-            raise found
-        return [(time.monotonic_ns(), found)]
+        item = self.incoming.pop(0)
+        if isinstance(item, Exception):
+            raise item
+        return [(time.monotonic_ns(), item)]
 
     def write(self, data: bytes) -> None:
         return None
@@ -100,10 +100,10 @@ def opened(monkeypatch: pytest.MonkeyPatch, links: dict[str, list[Link]]) -> Rec
     return Recorder(rig_of.parse(RIG))
 
 
-def until(what: Any, recorder: Recorder) -> None:
+def until(condition: Any, recorder: Recorder) -> None:
     deadline_s = time.monotonic() + 300
-    recorder.run(lambda: what() or time.monotonic() > deadline_s)
-    assert what()
+    recorder.run(lambda: condition() or time.monotonic() > deadline_s)
+    assert condition()
 
 
 def test_a_link_that_cannot_even_be_closed_is_lost_told_and_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,8 +123,8 @@ def test_a_driver_that_fails_ends_no_recording_and_other_streams_are_sealed(
     sent = frames(300)
     decode = OptoForce.decode
 
-    def fail(self: OptoForce, found: Any) -> Samples:
-        samples = decode(self, found)
+    def fail(self: OptoForce, batch: Any) -> Samples:
+        samples = decode(self, batch)
         if fail_on[0] and np.any(samples.seq == 150):
             raise RuntimeError("no sense")
         return samples
@@ -137,16 +137,16 @@ def test_a_driver_that_fails_ends_no_recording_and_other_streams_are_sealed(
         spool = Spool(tmp_path, header, ["a", "b"])
         with recorder.recording(spool):
             until(lambda: recorder.watches["a"].error != "", recorder)
-            until(lambda: not recorder.stations["a"]._link.came, recorder)  # type: ignore[union-attr]
+            until(lambda: not recorder.stations["a"]._link.incoming, recorder)  # type: ignore[union-attr]
         spool.close()
 
-    found = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"]
+    sealed = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"]
 
-    assert found.received > 200 * 16  # what came after the driver failed is there
-    assert found.undecoded and [event.cause for event in found.events].count(sealing.UNDECODED) == 1
+    assert sealed.received > 200 * 16  # it has the bytes that came after the driver failed
+    assert sealed.undecoded and [event.cause for event in sealed.events].count(sealing.UNDECODED) == 1
     fail_on[0] = False
-    again = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"].table
-    assert again.num_rows == found.received // 16 and again.column("seq")[-1].as_py() == 299
+    resealed_table = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"].table
+    assert resealed_table.num_rows == sealed.received // 16 and resealed_table.column("seq")[-1].as_py() == 299
 
 
 def test_a_stream_that_falls_silent_before_the_end_says_so(tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_bytes_of_which_no_sample_comes_are_not_removed(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("labels = 3\n" + RIG, "labels is 3"),
         ("[labels]\nx = nan\n" + RIG, "label x is nan"),
@@ -242,14 +242,14 @@ def test_bytes_of_which_no_sample_comes_are_not_removed(lab: Lab) -> None:
         (RIG.replace("options", "optoins", 1), "no key optoins"),
     ],
 )
-def test_a_rig_file_that_is_wrong_is_refused_with_its_place(text: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_a_rig_file_that_is_wrong_is_refused_with_its_place(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         rig_of.parse(text)
 
 
 def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with open(os.devnull) as nothing:
-        monkeypatch.setattr("sys.stdin", nothing)
+    with open(os.devnull) as devnull:
+        monkeypatch.setattr("sys.stdin", devnull)
         with triggers.keys() as pressed:
             assert pressed() is False
             with pytest.raises(UsageError):

@@ -1,4 +1,4 @@
-"""Datagrams with a false count, and of senders that nobody declared: what a recording makes of them."""
+"""Test recordings of datagrams with a false count and of datagrams from undeclared senders."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Crowded(Link):
 
     def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
         """Return what the device sent; with each chunk three datagrams of others came."""
-        found = super().read(timeout_s)
-        self.foreign += 3 * len(found)
-        return found
+        chunks = super().read(timeout_s)
+        self.foreign += 3 * len(chunks)
+        return chunks
 
 
 def test_packets_of_other_senders_are_reported_once_a_second_and_at_the_end(
@@ -63,15 +63,15 @@ def test_packets_of_other_senders_are_reported_once_a_second_and_at_the_end(
     spool = Spool(tmp_path, {"rig": ""}, ["program"])
     reader.begin(lambda *_: None, None)
     reader._thread.start()
-    live.awaited(lambda: not link.came)
+    live.awaited(lambda: not link.incoming)
     live.awaited(lambda: link.foreign == 600)
     for block in reader.end():
         spool.note(block) if isinstance(block, Note) else spool.append("program", block)
     reader.stop()
     spool.close()
     sealed = sealing.stream(Spooled(spool.folder), rig, "program")
-    told = [event.detail for event in sealed.events if event.cause == station.FOREIGN]
+    details = [event.detail for event in sealed.events if event.cause == station.FOREIGN]
 
-    assert sum(int(detail.split()[0]) for detail in told) == 600
-    assert all(detail.endswith(" packets of other senders were left out") for detail in told)
+    assert sum(int(detail.split()[0]) for detail in details) == 600
+    assert all(detail.endswith(" packets of other senders were left out") for detail in details)
     assert sealed.table.num_rows == 200 and sealed.lost == 0

@@ -1,4 +1,4 @@
-"""A stream's bytes become samples, and each lost frame is counted once, with its cause."""
+"""Test that a stream's bytes become samples, and each lost frame is counted once, with its cause."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_an_outage_longer_than_the_counter_is_counted_by_the_clock() -> None:
 @given(st.lists(st.integers(1, 700), min_size=1, max_size=6), st.sets(st.integers(1, 98), max_size=20))
 def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[int], dropped: set[int]) -> None:
     sent = b"".join(frame for row, frame in enumerate(frames(100)) if row not in dropped)
-    whole, first = read([(0, sent)])
+    batches, first = read([(0, sent)])
     reading = Reading(SENSOR)
     parts, place, step = [], 0, 0
     while place < len(sent):
@@ -132,7 +132,7 @@ def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[i
 
     joined = [int(seq) for batch in parts if batch.seq is not None for seq in batch.seq]
     assert joined == [row for row in range(100) if row not in dropped]
-    assert whole[0].seq is not None and whole[0].seq.tolist() == joined
+    assert batches[0].seq is not None and batches[0].seq.tolist() == joined
     assert first.lost == reading.lost == len(dropped)
 
 

@@ -1,4 +1,4 @@
-"""What a crash or a full disk leaves behind is sealed later, once, with what was lost told."""
+"""Test that the spool of a crash or a full disk is sealed later, once, and its losses are reported."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def rig(lab: Lab) -> Iterator[Emulator]:
 def spooled(lab: Lab, name: str = "one", text: str = RIG, unread: int = 0, count: int = 100) -> Path:
     """Write a spool as a process leaves it that was killed, ``unread`` chunks short of what it had received."""
     header = {"output": str(lab.folder / "rec"), "recording": name, "attributes": {"material": "cork"}, "rig": text}
-    made = Spool(lab.folder / ".tacpipe", header, ["force"])
+    spool = Spool(lab.folder / ".tacpipe", header, ["force"])
     sent = [(row * PERIOD_NS, frame) for row, frame in enumerate(frames(count))]
     size = sum(len(frame) for _, frame in sent)
-    made.tally(0, count, size, sent[-1][0])
+    spool.tally(0, count, size, sent[-1][0])
     if sent[: count - unread]:
-        made.append("force", Chunks.of(sent[: count - unread]))
-    made.close()
-    return made.folder
+        spool.append("force", Chunks.of(sent[: count - unread]))
+    spool.close()
+    return spool.folder
 
 
 def _is_spool(handle: int) -> bool:
@@ -69,12 +69,12 @@ def test_of_killed_recordings_all_that_was_written_is_recovered_and_told_what_wa
 ) -> None:
     monkeypatch.setenv("TACPIPE_STORE", str(tmp_path / "store"))
     with killing.emulated(tmp_path) as emulator:
-        found = [killing.kill(emulator, tmp_path, one_s, 3.0, begun=True) for one_s in after_s]
-        costs = [cost for several in found for cost in several or []]
+        costs_by_kill = [killing.kill(emulator, tmp_path, one_s, 3.0, after_first_bytes=True) for one_s in after_s]
+        costs = [cost for kill_costs in costs_by_kill for cost in kill_costs or []]
 
         assert costs, "no recording had begun when it was killed"
         assert all(cost.recovered > 0 for cost in costs)
-        assert all(cost.unread >= 0 for cost in costs)  # no more is told than was sent and is missing
+        assert all(cost.unread >= 0 for cost in costs)  # the reported loss is at most what was sent and is missing
         counts.count("kills survived", len(after_s))
 
 
@@ -87,24 +87,26 @@ def test_what_was_read_and_never_written_is_told(lab: Lab) -> None:
     events = {event["cause"]: event for event in shard.table("events").to_pylist()}
     assert set(events) == {"crash", "recovered"}
     assert (events["crash"]["stream"], events["crash"]["bytes"]) == ("force", 7 * 16)
-    told = {name: shard.attributes[name] for name in ("force_crash_lost_reads", "force_crash_lost_bytes", "material")}
-    assert told == {"force_crash_lost_reads": 7, "force_crash_lost_bytes": 112, "material": "cork"}
+    attributes = {
+        name: shard.attributes[name] for name in ("force_crash_lost_reads", "force_crash_lost_bytes", "material")
+    }
+    assert attributes == {"force_crash_lost_reads": 7, "force_crash_lost_bytes": 112, "material": "cork"}
 
 
 def test_what_came_before_the_trigger_counts_as_read(lab: Lab, rig: Emulator) -> None:
-    found = rig_of.read(lab.folder / "rig.toml")
-    recorder, store = Recorder(found), lab.folder / ".tacpipe"
+    parsed_rig = rig_of.read(lab.folder / "rig.toml")
+    recorder, store = Recorder(parsed_rig), lab.folder / ".tacpipe"
     with recorder.open():
         recorder.run(lambda: recorder.watches["force"].samples > 150)
-        made = Spool(store, {"output": "", "recording": "", "attributes": {}, "rig": ""}, ["force"])
-        with recorder.recording(made, preroll=True):
+        spool = Spool(store, {"output": "", "recording": "", "attributes": {}, "rig": ""}, ["force"])
+        with recorder.recording(spool, preroll=True):
             recorder.run(lambda: recorder.watches["force"].samples > 250)
-        made.close()
-    sealed = seal(Spooled(made.folder), found)["force"]
-    chunks = sum(len(block.size) for _, block in Spooled(made.folder).blocks() if isinstance(block, Chunks))
+        spool.close()
+    sealed = seal(Spooled(spool.folder), parsed_rig)["force"]
+    chunks = sum(len(block.size) for _, block in Spooled(spool.folder).blocks() if isinstance(block, Chunks))
 
     assert sealed.table.num_rows > 100 and sealed.crashed == (0, 0)
-    assert Spooled(made.folder).tallied()["force"].chunks == chunks
+    assert Spooled(spool.folder).tallied()["force"].chunks == chunks
 
 
 def test_recovering_twice_does_nothing_the_second_time(lab: Lab) -> None:
@@ -113,7 +115,7 @@ def test_recovering_twice_does_nothing_the_second_time(lab: Lab) -> None:
     manifest = (lab.folder / "rec/manifest.json").read_bytes()
     second = lab.run("acquire --recover --json")
 
-    assert [one["name"] for one in json.loads(first.out)["recordings"]] == ["one"]
+    assert [recording["name"] for recording in json.loads(first.out)["recordings"]] == ["one"]
     assert json.loads(second.out)["recordings"] == [] and second.err == ""
     assert (lab.folder / "rec/manifest.json").read_bytes() == manifest and not live.spools(lab.folder)
 
@@ -128,23 +130,23 @@ def test_the_next_recording_recovers_first(lab: Lab, rig: Emulator) -> None:
 
 def test_a_process_that_was_killed_after_it_published_is_not_appended_twice(lab: Lab) -> None:
     folder = spooled(lab)
-    kept = lab.folder / "kept"
-    shutil.copytree(folder, kept)
+    backup = lab.folder / "kept"
+    shutil.copytree(folder, backup)
     lab.run("acquire --recover")
     manifest = (lab.folder / "rec/manifest.json").read_bytes()
-    shutil.copytree(kept, folder)
-    told = lab.run("acquire --recover")
+    shutil.copytree(backup, folder)
+    ran = lab.run("acquire --recover")
 
-    assert told.err == "recovered one: 0.1 s, force 100 samples\n"
+    assert ran.err == "recovered one: 0.1 s, force 100 samples\n"
     assert (lab.folder / "rec/manifest.json").read_bytes() == manifest and not live.spools(lab.folder)
 
 
-def test_a_spool_whose_rig_file_no_longer_parses_stays_and_is_told(lab: Lab) -> None:
+def test_a_spool_whose_parsed_rig_no_longer_parses_stays_and_is_told(lab: Lab) -> None:
     stays = spooled(lab, "old", text=RIG.replace("axes", "axles"))
     spooled(lab, "new")
     for _ in range(2):
         ran = lab.call("acquire --recover")
-        line = next(one for one in ran.err.splitlines() if one.startswith("tacpipe: "))
+        line = next(printed for printed in ran.err.splitlines() if printed.startswith("tacpipe: "))
 
         assert ran.code == 1 and stays.exists()
         assert (
@@ -189,24 +191,24 @@ def test_a_spool_that_was_begun_and_has_no_header_is_removed_when_it_is_old(lab:
 def test_a_spool_that_is_being_sealed_is_left_to_the_process_that_does_it(
     lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = []
+    observed = []
     real = appending.append
 
-    def append(store: store_of.Store, *more: Any) -> str:
-        seen.append((live.spools(lab.folder), spool_folders.abandoned(store.root)))
-        return real(store, *more)
+    def append(store: store_of.Store, *args: Any) -> str:
+        observed.append((live.spools(lab.folder), spool_folders.abandoned(store.root)))
+        return real(store, *args)
 
     monkeypatch.setattr(appending, "append", append)
     lab.run("acquire rig.toml -o rec --duration-s 0.3")
 
-    ((there, abandoned),) = seen
-    assert len(there) == 1 and abandoned == []
+    ((spools, abandoned),) = observed
+    assert len(spools) == 1 and abandoned == []
 
 
 def test_a_spool_that_another_process_holds_is_not_recovered(lab: Lab) -> None:
     folder = spooled(lab)
-    with (folder / "bytes").open("rb") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
+    with (folder / "bytes").open("rb") as spool_file:
+        fcntl.flock(spool_file, fcntl.LOCK_EX)
         assert json.loads(lab.run("acquire --recover --json").out)["recordings"] == []
     assert json.loads(lab.run("acquire --recover --json").out)["rows"] == 100
 
@@ -223,11 +225,11 @@ def test_a_disk_that_is_full_while_it_records_ends_it_with_a_sentence_and_what_c
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
-        ended = lab.call("acquire rig.toml -o rec --name one")
+        ran = lab.call("acquire rig.toml -o rec --name one")
     (folder,) = live.spools(lab.folder)
 
-    assert ended.code == 1 and not (lab.folder / "rec").exists()
-    assert without_created_store(ended.err) == (
+    assert ran.code == 1 and not (lab.folder / "rec").exists()
+    assert without_created_store(ran.err) == (
         f"tacpipe: The disk takes nothing more of the recording (No space left on device), so it ended. What came until "
         f"then is in {folder}; free some space, and `tacpipe acquire --recover` seals it.\n"
     )
@@ -249,14 +251,14 @@ def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
-        ended = lab.call("acquire rig.toml -o rec --duration-s 1 --name one")
+        ran = lab.call("acquire rig.toml -o rec --duration-s 1 --name one")
     (folder,) = live.spools(lab.folder)
 
-    assert ended.code == 1 and not (lab.folder / "rec").exists()
-    err = without_created_store(ended.err)
+    assert ran.code == 1 and not (lab.folder / "rec").exists()
+    err = without_created_store(ran.err)
     assert err.startswith("tacpipe: The disk under ") and err.count("\n") == 1
-    kept = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is fixed.\n"
-    assert err.endswith(kept)
+    sentence = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is fixed.\n"
+    assert err.endswith(sentence)
     lab.run("acquire --recover")
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
     assert not live.spools(lab.folder)

@@ -1,4 +1,4 @@
-"""What a recording does and when: dry runs, trials, triggers and time limits, over a clock that the test turns."""
+"""Test dry runs, trials, triggers and time limits of recordings, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Closed(io.StringIO):
 @pytest.fixture
 def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
     """A rig with a force sensor that sends 333 frames a second for 20 s."""
-    made = Script(monkeypatch)
-    made.send("force", frames(RATE_HZ * LASTS_S), RATE_HZ)
+    new_script = Script(monkeypatch)
+    new_script.send("force", frames(RATE_HZ * LASTS_S), RATE_HZ)
     (lab.folder / "rig.toml").write_text(FORCE)
-    return made
+    return new_script
 
 
 def seconds(shard: Any, name: str = "force") -> tuple[float, float]:
@@ -56,8 +56,8 @@ def seconds(shard: Any, name: str = "force") -> tuple[float, float]:
 
 def counts(shard: Any) -> list[int]:
     """Return the counter of a recorded force sensor."""
-    found: list[int] = shard.table("force").column("seq").to_pylist()
-    return found
+    numbers: list[int] = shard.table("force").column("seq").to_pylist()
+    return numbers
 
 
 def test_a_dry_run_tells_rates_and_writes_nothing(lab: Lab, script: Script) -> None:
@@ -67,23 +67,25 @@ def test_a_dry_run_tells_rates_and_writes_nothing(lab: Lab, script: Script) -> N
 
     assert 3 <= script.t_s < 3.2
     assert ran.out == f"force 333.0 Hz, jitter 0.0 ms, {samples} samples, 0 lost\n"
-    told = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
-    assert told["schema_version"] == 1
-    (found,) = told["streams"].values()
-    assert set(found) == {"rate_hz", "jitter_ms", "latency_ms", "samples", "lost", "bytes_lost"}
-    assert found["rate_hz"] == pytest.approx(RATE_HZ) and (found["lost"], found["bytes_lost"]) == (0, 0)
+    report = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
+    assert report["schema_version"] == 1
+    (figures,) = report["streams"].values()
+    assert set(figures) == {"rate_hz", "jitter_ms", "latency_ms", "samples", "lost", "bytes_lost"}
+    assert figures["rate_hz"] == pytest.approx(RATE_HZ) and (figures["lost"], figures["bytes_lost"]) == (0, 0)
     assert sorted(lab.folder.rglob("*")) == before
 
 
 @pytest.mark.parametrize(
-    ("sends_hz", "told"), [(333, ""), (310, ""), (290, "; 333 Hz were expected"), (380, "; 333 Hz")]
+    ("sends_hz", "warning"), [(333, ""), (310, ""), (290, "; 333 Hz were expected"), (380, "; 333 Hz")]
 )
-def test_a_rate_that_is_a_tenth_off_the_rig_files_is_told(lab: Lab, script: Script, sends_hz: int, told: str) -> None:
+def test_a_rate_that_is_a_tenth_off_the_rig_files_is_told(
+    lab: Lab, script: Script, sends_hz: int, warning: str
+) -> None:
     script.send("force", frames(20 * sends_hz), sends_hz)
     out = lab.run("acquire rig.toml --dry-run").out
 
     assert out.startswith(f"force {sends_hz}.0 Hz, jitter 0.0 ms, ")
-    assert told in out and (" were expected\n" in out) == bool(told)
+    assert warning in out and (" were expected\n" in out) == bool(warning)
 
 
 def test_frames_that_never_come_are_lost_in_a_dry_run(lab: Lab, script: Script) -> None:
@@ -98,9 +100,9 @@ def test_trials_last_as_long_as_asked_and_are_tared(lab: Lab, script: Script) ->
 
     assert list(shards) == ["press-001", "press-002", "press-003"] and len(script.tared) == 3
     for shard in shards.values():
-        found = counts(shard)
-        assert found == list(range(found[0], found[0] + len(found))) and shard.attributes["force_lost"] == 0
-        assert 0.5 * RATE_HZ - 1 <= len(found) <= 0.55 * RATE_HZ + 1  # a tick of 50 ms longer at most
+        numbers = counts(shard)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))) and shard.attributes["force_lost"] == 0
+        assert 0.5 * RATE_HZ - 1 <= len(numbers) <= 0.55 * RATE_HZ + 1  # a tick of 50 ms longer at most
 
 
 def test_a_stream_that_gives_nothing_is_awaited_for_three_seconds(lab: Lab, script: Script) -> None:
@@ -121,14 +123,14 @@ def test_a_stream_that_was_silent_for_two_seconds_at_the_end_is_lost(
 
     assert ran.code == code
     assert bool(re.search(r"nothing came for 2\.[12] s, though it is open\.", ran.err)) == (code == 5)
-    assert counts(live.only(lab.folder))[-1] == len(script.sent["force"]) - 1  # and all is kept
+    assert counts(live.only(lab.folder))[-1] == len(script.sent["force"]) - 1  # all samples are kept
 
 
 def test_lines_of_standard_input_begin_and_end_trials(
     lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, write = os.pipe()
-    for at_s, typed in ((2.0, b"\n"), (3.0, b"\n\n"), (4.0, b"\n")):  # at 3 s one ends the first, one begins the second
+    for at_s, typed in ((2.0, b"\n"), (3.0, b"\n\n"), (4.0, b"\n")):  # the lines at 3 s end and begin a trial
         script.happens.append((at_s, lambda typed=typed: os.write(write, typed)))  # type: ignore[misc]
     with os.fdopen(read) as source:
         monkeypatch.setattr(sys, "stdin", source)
@@ -136,26 +138,26 @@ def test_lines_of_standard_input_begin_and_end_trials(
     os.close(write)
     first, second = (counts(shard) for shard in live.shards(lab.folder).values())
 
-    for found, begins_s, ends_s in ((first, 1.5, 3.0), (second, 2.5, 4.0)):  # half a second before is recorded too
-        assert found == list(range(found[0], found[-1] + 1))
-        assert begins_s - 0.01 <= found[0] / RATE_HZ <= begins_s + 0.11
-        assert ends_s <= found[-1] / RATE_HZ <= ends_s + 0.11
+    for numbers, begins_s, ends_s in ((first, 1.5, 3.0), (second, 2.5, 4.0)):  # half a second before is recorded too
+        assert numbers == list(range(numbers[0], numbers[-1] + 1))
+        assert begins_s - 0.01 <= numbers[0] / RATE_HZ <= begins_s + 0.11
+        assert ends_s <= numbers[-1] / RATE_HZ <= ends_s + 0.11
 
 
 def test_a_touch_begins_a_trial_and_half_a_second_without_ends_it(lab: Lab, script: Script) -> None:
     def taxels(number: int) -> bytes:
-        touched = 200 <= number < 300 and not 240 <= number < 260  # from 2 to 3 s, with a gap of 0.2 s
+        touched = 200 <= number < 300 and not 240 <= number < 260  # a touch from 2 to 3 s, with a gap of 0.2 s
         return struct.pack("<4H", *[TOUCHED if touched else REST] * 4)
 
     script.send("pad", map(taxels, range(1000)), 100)
     (lab.folder / "rig.toml").write_text(PAD)
     lab.run("acquire rig.toml -o rec --start contact --stop contact --contact-count 500")
-    found = live.only(lab.folder).table("pad").column("taxel01").to_numpy()
-    touched = np.flatnonzero(found == TOUCHED)
+    values = live.only(lab.folder).table("pad").column("taxel01").to_numpy()
+    touched = np.flatnonzero(values == TOUCHED)
 
     assert len(touched) == 80 and touched[-1] - touched[0] == 99
     assert 45 <= touched[0] <= 50  # half a second before the touch, less what the tick took to see it
-    assert 50 <= len(found) - 1 - touched[-1] <= 61
+    assert 50 <= len(values) - 1 - touched[-1] <= 61
 
 
 def test_a_program_begins_and_ends_trials_and_a_start_meanwhile_begins_no_other(lab: Lab, script: Script) -> None:
@@ -167,9 +169,9 @@ def test_a_program_begins_and_ends_trials_and_a_start_meanwhile_begins_no_other(
 
     assert list(shards) == ["press-001", "press-002"]
     for shard, begins_s, ends_s in zip(shards.values(), (1.5, 4.5), (3.0, 6.0), strict=True):
-        found = counts(shard)
-        assert begins_s - 0.01 <= found[0] / RATE_HZ <= begins_s + 0.11
-        assert ends_s <= found[-1] / RATE_HZ <= ends_s + 0.11
+        numbers = counts(shard)
+        assert begins_s - 0.01 <= numbers[0] / RATE_HZ <= begins_s + 0.11
+        assert ends_s <= numbers[-1] / RATE_HZ <= ends_s + 0.11
     first, second = (shard.table("program").column("event").to_pylist() for shard in shards.values())
     assert (first, second) == (["start", "start", "stop"], ["start", "stop"])
 
@@ -185,9 +187,9 @@ def test_lines_about_a_recording_come_every_five_seconds(lab: Lab, script: Scrip
 def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch) -> None:
     seal = sealing.seal
 
-    def slowly(*given: Any) -> Any:
+    def slowly(*args: Any) -> Any:
         script.sleep(60.0)
-        return seal(*given)
+        return seal(*args)
 
     monkeypatch.setattr(sealing, "seal", slowly)
     lab.run("acquire rig.toml -o rec --duration-s 1 --quiet")
@@ -200,16 +202,16 @@ def test_a_terminal_that_closes_ends_a_recording_which_is_sealed_though_nothing_
         monkeypatch.setattr(sys, "stderr", Closed())
         os.kill(os.getpid(), signal.SIGHUP)
 
-    before = signal.signal(signal.SIGHUP, lambda *_: None)  # that it would end this process too is another matter
+    before = signal.signal(signal.SIGHUP, lambda *_: None)  # the signal must not end this process
     script.happens.append((6.0, hang_up))
     try:
         lab.run("acquire rig.toml -o rec --duration-s 15 --name one")
     finally:
         signal.signal(signal.SIGHUP, before)
-    found = counts(live.only(lab.folder))
+    numbers = counts(live.only(lab.folder))
 
-    assert found == list(range(found[0], found[-1] + 1))
-    assert 5.9 <= found[-1] / RATE_HZ <= 6.11
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert 5.9 <= numbers[-1] / RATE_HZ <= 6.11
 
 
 def test_lines_that_cannot_be_printed_end_no_recording(
@@ -222,18 +224,18 @@ def test_lines_that_cannot_be_printed_end_no_recording(
 
 
 def test_a_crash_costs_what_came_since_the_last_tick(lab: Lab, script: Script) -> None:
-    seen: list[tuple[float, int]] = []
+    progress: list[tuple[float, int]] = []
 
     def look() -> None:
         (spool,) = live.spools(lab.folder)
         blocks = [block for _, block in Spooled(spool).blocks("force")]
-        seen.append((script.t_s, sum(len(block.size) for block in blocks if isinstance(block, Chunks))))
+        progress.append((script.t_s, sum(len(block.size) for block in blocks if isinstance(block, Chunks))))
 
     for at_s in np.linspace(1.0, 3.0, 11):
         script.happens.append((float(at_s), look))
     lab.run("acquire rig.toml -o rec --duration-s 4")
-    began = counts(live.only(lab.folder))[0]
+    first_number = counts(live.only(lab.folder))[0]
 
-    assert len(seen) == 11
-    for at_s, written in seen:
-        assert (at_s - recorder.TICK_S) * RATE_HZ - 1 <= began + written <= at_s * RATE_HZ + 1
+    assert len(progress) == 11
+    for at_s, sample_count in progress:
+        assert (at_s - recorder.TICK_S) * RATE_HZ - 1 <= first_number + sample_count <= at_s * RATE_HZ + 1

@@ -1,4 +1,4 @@
-"""A long recording is sealed without being in memory, and its bytes are those of its table."""
+"""Test that a long recording is sealed without being in memory, and its bytes are those of its table."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def recorded(store: Store, seconds: int, output: str = "rec") -> Spooled:
         count = np.arange(second * BLOCK, (second + 1) * BLOCK)
         floats = np.sin(count[:, None] + np.arange(41.0))  # (sample, channel)
         floats[:, 3:7] = [0.0, 0.0, 0.0, 1.0]
-        one = np.ones((BLOCK, 1), dtype=np.float32)
-        none = np.zeros((BLOCK, 3), dtype=np.uint8), np.zeros((BLOCK, 2), dtype=np.uint64)
-        data = sensor.encode(Samples((floats, one, *none), seq=count)).tobytes()
+        unit_floats = np.ones((BLOCK, 1), dtype=np.float32)
+        zeros = np.zeros((BLOCK, 3), dtype=np.uint8), np.zeros((BLOCK, 2), dtype=np.uint64)
+        data = sensor.encode(Samples((floats, unit_floats, *zeros), seq=count)).tobytes()
         spool.append("robot", Chunks(count * 1_000_000, np.full(BLOCK, len(data) // BLOCK), data))
         spool.write()
     spool.close()
@@ -41,7 +41,7 @@ def recorded(store: Store, seconds: int, output: str = "rec") -> Spooled:
 
 @pytest.mark.long
 def test_a_long_stream_is_decoded_and_stored_without_being_in_memory(tmp_path: Path) -> None:
-    """Peaks of memory of sealing 20 s and 320 s of an arm: the rows of the longer one alone would be 100 MB."""
+    """Compare the peaks of memory of sealing 20 s and 320 s of an arm: the rows of the longer one alone would be 100 MB."""
     short, long = (sealed_alone(tmp_path / str(seconds), seconds) for seconds in (20, 320))
 
     assert long < 1.4 * short

@@ -1,4 +1,4 @@
-"""A device that is missing, held, forbidden, silent, set otherwise or another one: one sentence, and nothing is written."""
+"""Test the sentence about a device that is missing, held, forbidden, silent, set otherwise or another one."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def place(served: Emulator, name: str) -> str:
 
 
 def test_a_port_that_is_not_there_is_named_with_those_that_are(lab: Lab) -> None:
-    (told,) = refused(lab, live.stream("force", "optoforce", "serial:/dev/gone"))
+    (message,) = refused(lab, live.stream("force", "optoforce", "serial:/dev/gone"))
 
     assert re.fullmatch(
         r"Stream force \(serial:/dev/gone\): there is no port /dev/gone; there (is|are) .+\. "
         r"Plug the device in, or correct the transport\.",
-        told,
+        message,
     )
 
 
@@ -82,11 +82,11 @@ def test_a_port_that_another_program_holds_is_told_with_that_program(lab: Lab, s
     with subprocess.Popen([sys.executable, "-c", program, silent], **pipes) as holder:
         assert holder.stdout is not None and holder.stdin is not None
         holder.stdout.readline()
-        (told,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+        (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
         holder.stdin.close()
 
     about = re.escape(f"Stream force (serial:{silent}): {silent} is held by ")
-    assert re.fullmatch(rf"{about}.+ \(process {holder.pid}\).*; end it, because two readers share no bytes\.", told)
+    assert re.fullmatch(rf"{about}.+ \(process {holder.pid}\).*; end it, because two readers share no bytes\.", message)
 
 
 def test_a_port_that_is_forbidden_is_told_with_the_group_that_may(
@@ -94,23 +94,23 @@ def test_a_port_that_is_forbidden_is_told_with_the_group_that_may(
 ) -> None:
     real = os.open
 
-    def forbidden(path: Any, *more: Any, **named: Any) -> int:
+    def forbidden(path: Any, *args: Any, **kwargs: Any) -> int:
         if path == silent:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
-        return real(path, *more, **named)
+        return real(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "open", forbidden)
-    (told,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+    (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
 
     group = r"it belongs to the group \w+: run `sudo usermod -aG \w+ \$USER`, then log in again\."
     about = re.escape(f"Stream force (serial:{silent}): you may not open {silent}; ")
-    assert re.fullmatch(about + group, told)
+    assert re.fullmatch(about + group, message)
 
 
 def test_a_silent_port_is_told_with_its_rate(lab: Lab, silent: str) -> None:
-    (told,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+    (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
 
-    assert told == (
+    assert message == (
         f"Stream force (serial:{silent}): a frame of optoforce was awaited for 1 s, but nothing came. Check power and "
         f"cable, and that it is optoforce, set to 1000000 baud as we are; `tacpipe sensors probe serial:{silent}` tries all "
         "rates."
@@ -118,9 +118,9 @@ def test_a_silent_port_is_told_with_its_rate(lab: Lab, silent: str) -> None:
 
 
 def test_a_device_that_does_not_answer_at_all_is_told_with_what_was_awaited(lab: Lab, silent: str) -> None:
-    (told,) = refused(lab, live.stream("range", "tfmini", f"serial:{silent}"))
+    (message,) = refused(lab, live.stream("range", "tfmini", f"serial:{silent}"))
 
-    assert told.startswith(
+    assert message.startswith(
         f"Stream range (serial:{silent}): the reply to command 0x05 was awaited for 2 s, but nothing came."
     )
 
@@ -128,57 +128,57 @@ def test_a_device_that_does_not_answer_at_all_is_told_with_what_was_awaited(lab:
 @pytest.mark.parametrize("baud", [9600, 57600, 460800])
 def test_a_port_at_another_rate_is_told_as_a_possibility(lab: Lab, served: Emulator, baud: int) -> None:
     at = place(served, "range")
-    (told,) = refused(lab, live.stream("range", "tfmini", at, f"{{ baud = {baud} }}"))
+    (message,) = refused(lab, live.stream("range", "tfmini", at, f"{{ baud = {baud} }}"))
 
     assert re.fullmatch(
         re.escape(f"Stream range ({at}): the reply to command 0x05 was awaited for 2 s, but ")
         + r"[\d,]+ bytes came that hold none\. "
         + re.escape(f"Either the device is set to another rate than {baud} baud, or speaks another protocol; ")
         + re.escape(f"`tacpipe sensors probe {at}` tries what is known."),
-        told,
+        message,
     )
 
 
 def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
     at = place(served, "range")
-    (told,) = refused(lab, live.stream("force", "optoforce", at, "{ baud = 115200 }"))
+    (message,) = refused(lab, live.stream("force", "optoforce", at, "{ baud = 115200 }"))
 
     assert re.fullmatch(
         re.escape(f"Stream force ({at}): a frame of optoforce was awaited for 3 s, but ")
         + r"[\d,]+ bytes came that hold none\. They are frames of tfmini: name that in the rig file, or plug in the other "
         r"device\.",
-        told,
+        message,
     )
 
 
 def test_another_sensor_than_the_one_that_should_answer_is_named(lab: Lab, served: Emulator) -> None:
-    (told,) = refused(lab, live.stream("pad", "paxini", place(served, "range"), "{ baud = 115200 }"))
+    (message,) = refused(lab, live.stream("pad", "paxini", place(served, "range"), "{ baud = 115200 }"))
 
-    assert "They are frames of tfmini: name that in the rig file" in told
+    assert "They are frames of tfmini: name that in the rig file" in message
 
 
 def test_a_sensor_that_sends_and_does_not_answer_is_told_from_another_one(lab: Lab, served: Emulator) -> None:
-    (told,) = refused(lab, live.stream("range", "tfmini", place(served, "plain")))
+    (message,) = refused(lab, live.stream("range", "tfmini", place(served, "plain")))
 
-    assert told.endswith(
+    assert message.endswith(
         "bytes came that hold none. They are frames of tfmini, so the device does not hear us or is another model: check "
         "the wire that we send on, and the model in the rig file."
     )
 
 
 @pytest.mark.parametrize(
-    ("stream", "sensor", "options", "wanted"),
+    ("stream", "sensor", "options", "expected_options"),
     [
         ("slow", "optoforce", "{ axes = 6, rate_hz = 100, filter_hz = 5.0, baud = 115200 }", "optoforce (axes = 3)"),
         ("skin", "xela", "{ sensor = 3 }", "xela (sensor = 1)"),
     ],
 )
 def test_the_option_that_is_wrong_is_named(
-    lab: Lab, served: Emulator, stream: str, sensor: str, options: str, wanted: str
+    lab: Lab, served: Emulator, stream: str, sensor: str, options: str, expected_options: str
 ) -> None:
-    (told,) = refused(lab, live.stream("load", sensor, place(served, stream), options))
+    (message,) = refused(lab, live.stream("load", sensor, place(served, stream), options))
 
-    assert told.endswith(f"They are frames of {wanted}: set that among the options in the rig file.")
+    assert message.endswith(f"They are frames of {expected_options}: set that among the options in the rig file.")
 
 
 def test_a_port_that_nobody_serves_is_told(lab: Lab) -> None:
@@ -199,9 +199,9 @@ def test_a_box_that_refuses_datagrams_is_told(lab: Lab) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    (told,) = refused(lab, live.stream("wrench", "ati-netft", f"udp:127.0.0.1:{port}"))
+    (message,) = refused(lab, live.stream("wrench", "ati-netft", f"udp:127.0.0.1:{port}"))
 
-    assert told == (
+    assert message == (
         f"Stream wrench (udp:127.0.0.1:{port}) is lost: the host is there, but refuses the port. Check the port, and that "
         f"it streams."
     )
@@ -211,16 +211,16 @@ def test_a_box_that_sends_no_datagram_is_told(lab: Lab) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
         box.bind(("127.0.0.1", 0))
         at = f"udp:127.0.0.1:{box.getsockname()[1]}"
-        (told,) = refused(lab, live.stream("wrench", "ati-netft", at))
+        (message,) = refused(lab, live.stream("wrench", "ati-netft", at))
 
-    assert told == (
+    assert message == (
         f"Stream wrench ({at}): a frame of ati-netft was awaited for 1 s, but nothing came. Check power and cable, and that "
         f"it is ati-netft. The box sends to one program: once another asks for records, they stop here."
     )
 
 
 def test_every_stream_that_is_wrong_has_a_sentence(lab: Lab, served: Emulator, tmp_path: Path) -> None:
-    told = refused(
+    messages = refused(
         lab,
         live.stream("one", "optoforce", "serial:/dev/gone"),
         live.stream("good", "tfmini", place(served, "range")),
@@ -228,5 +228,5 @@ def test_every_stream_that_is_wrong_has_a_sentence(lab: Lab, served: Emulator, t
         live.stream("three", "optoforce", f"serial:{tmp_path}"),
     )
 
-    assert [line.split()[1] for line in told] == ["one", "two", "three"]
-    assert f"{tmp_path} is not a serial port" in told[2]
+    assert [line.split()[1] for line in messages] == ["one", "two", "three"]
+    assert f"{tmp_path} is not a serial port" in messages[2]

@@ -1,4 +1,4 @@
-"""A spool gives back what was appended, up to where a crash or a disk tore it."""
+"""Test that a spool gives back what was appended, up to where a crash or a disk tore it."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ def pairs(blocks: list[tuple[str, Chunks | Note]]) -> list[tuple[str, int, bytes
     ]
 
 
-def written(folder: Path, blocks: int = 20) -> tuple[Path, list[tuple[str, int, bytes]]]:
-    made = Spool(folder, HEADER, STREAMS)
+def written_spool(folder: Path, blocks: int = 20) -> tuple[Path, list[tuple[str, int, bytes]]]:
+    spool = Spool(folder, HEADER, STREAMS)
     rng = np.random.default_rng(0)
     expected = []
     for number in range(blocks):
         name = STREAMS[number % 2]
         chunks = [(number * 10 + k, rng.bytes(int(rng.integers(0, 40)))) for k in range(3)]
-        made.append(name, Chunks.of(chunks))
-        made.write()
+        spool.append(name, Chunks.of(chunks))
+        spool.write()
         expected += [(name, t_ns, data) for t_ns, data in chunks]
-    made.close()
-    return made.folder, expected
+    spool.close()
+    return spool.folder, expected
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
@@ -60,63 +60,63 @@ def written(folder: Path, blocks: int = 20) -> tuple[Path, list[tuple[str, int, 
 def test_what_was_appended_is_read_in_its_order(
     tmp_path: Path, parts: list[tuple[str, list[tuple[int, bytes]]]]
 ) -> None:
-    made = Spool(tmp_path, HEADER, STREAMS)
+    spool = Spool(tmp_path, HEADER, STREAMS)
     for name, chunks in parts:
-        made.append(name, Chunks.of(chunks))
-    made.note(Note(7, "b", "lost", "unplugged"))
-    made.close()
+        spool.append(name, Chunks.of(chunks))
+    spool.note(Note(7, "b", "lost", "unplugged"))
+    spool.close()
 
-    read = list(Spooled(made.folder).blocks())
+    read = list(Spooled(spool.folder).blocks())
 
     assert pairs(read) == [(name, t_ns, data) for name, chunks in parts for t_ns, data in chunks]
     assert read[-1] == ("b", Note(7, "b", "lost", "unplugged"))
 
 
 def test_a_torn_end_costs_the_block_that_is_torn(tmp_path: Path) -> None:
-    folder, expected = written(tmp_path)
+    folder, expected = written_spool(tmp_path)
     file = folder / "bytes"
-    whole = file.read_bytes()
+    content = file.read_bytes()
     rng = np.random.default_rng(1)
-    for cut in rng.integers(1, len(whole), 50).tolist():
-        file.write_bytes(whole[:cut])
+    for cut in rng.integers(1, len(content), 50).tolist():
+        file.write_bytes(content[:cut])
         read = Spooled(folder)
-        found = pairs(list(read.blocks()))
-        torn = sum(one.bytes for one in read.damage)
+        recovered = pairs(list(read.blocks()))
+        torn = sum(damage.bytes for damage in read.damage)
 
-        assert found == expected[: len(found)] and len(found) % 3 == 0
+        assert recovered == expected[: len(recovered)] and len(recovered) % 3 == 0
         assert torn < 200  # less than one block here
 
 
 def test_a_flipped_bit_costs_its_block_and_no_other(tmp_path: Path) -> None:
-    folder, expected = written(tmp_path)
+    folder, expected = written_spool(tmp_path)
     file = folder / "bytes"
-    whole = file.read_bytes()
+    content = file.read_bytes()
     rng = np.random.default_rng(2)
-    for place in rng.integers(0, len(whole), 100).tolist():
-        flipped = bytearray(whole)
+    for place in rng.integers(0, len(content), 100).tolist():
+        flipped = bytearray(content)
         flipped[place] ^= 1 << int(rng.integers(8))
         file.write_bytes(flipped)
         read = Spooled(folder)
-        found = pairs(list(read.blocks()))
+        recovered = pairs(list(read.blocks()))
 
-        assert set(found) < set(expected) and len(found) == len(expected) - 3
+        assert set(recovered) < set(expected) and len(recovered) == len(expected) - 3
         assert len(read.damage) == 1
 
 
 def test_zeros_that_a_loss_of_power_left_are_passed_over(tmp_path: Path) -> None:
-    folder, expected = written(tmp_path)
+    folder, expected = written_spool(tmp_path)
     file = folder / "bytes"
     file.write_bytes(file.read_bytes() + bytes(4096))
 
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == expected
-    assert [one.bytes for one in read.damage] == [4096]
+    assert [damage.bytes for damage in read.damage] == [4096]
 
 
 @pytest.mark.parametrize("first", [False, True])
 def test_a_hole_of_a_terabyte_is_passed_over_without_being_read(tmp_path: Path, first: bool) -> None:
-    folder, expected = written(tmp_path)
+    folder, expected = written_spool(tmp_path)
     content = (folder / "bytes").read_bytes()
     with (folder / "bytes").open("r+b") as file:
         if first:  # blocks, a hole, and the same blocks again
@@ -127,20 +127,20 @@ def test_a_hole_of_a_terabyte_is_passed_over_without_being_read(tmp_path: Path, 
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == expected * (2 if first else 1)
-    assert sum(one.bytes for one in read.damage) == (1 << 40) - len(content)
+    assert sum(damage.bytes for damage in read.damage) == (1 << 40) - len(content)
 
 
 def test_one_stream_is_read_alone(tmp_path: Path) -> None:
-    folder, expected = written(tmp_path)
+    folder, expected = written_spool(tmp_path)
 
     assert pairs(list(Spooled(folder).blocks("b"))) == [row for row in expected if row[0] == "b"]
 
 
 def test_a_spool_that_is_written_is_not_abandoned_and_one_of_a_killed_process_is(tmp_path: Path) -> None:
-    made = Spool(tmp_path, HEADER, STREAMS)
+    spool = Spool(tmp_path, HEADER, STREAMS)
     assert spool_folders.abandoned(tmp_path) == []
-    made.close()
-    assert spool_folders.abandoned(tmp_path) == [made.folder]
+    spool.close()
+    assert spool_folders.abandoned(tmp_path) == [spool.folder]
     program = f"""
 import time
 from pathlib import Path
@@ -162,7 +162,7 @@ time.sleep(60)
     child.wait()
     child.stdout.close()
 
-    folder = next(path for path in spool_folders.abandoned(tmp_path) if path != made.folder)
+    folder = next(path for path in spool_folders.abandoned(tmp_path) if path != spool.folder)
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == [("a", 1, b"one"), ("a", 2, b"two")]
@@ -177,9 +177,9 @@ def test_a_spool_without_a_header_is_refused_with_a_sentence(tmp_path: Path) -> 
 
 def test_stamps_are_mapped_to_utc_by_one_reading_of_both_clocks(tmp_path: Path) -> None:
     before_ns = time.time_ns()
-    made = Spool(tmp_path, HEADER, STREAMS)
+    spool = Spool(tmp_path, HEADER, STREAMS)
     stamp_ns = time.monotonic_ns()
     after_ns = time.time_ns()
-    made.close()
+    spool.close()
 
-    assert before_ns - 1_000_000 <= Spooled(made.folder).utc_ns(stamp_ns) <= after_ns + 1_000_000
+    assert before_ns - 1_000_000 <= Spooled(spool.folder).utc_ns(stamp_ns) <= after_ns + 1_000_000

@@ -1,4 +1,4 @@
-"""A recorder that was stopped, starved or suspended says so, and how uncertain that makes the arrival of what had waited."""
+"""Test that a recorder that was stopped, starved or suspended reports it, and how uncertain the late arrivals are."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ class Device:
         self.now_ns = max(self.now_ns + 20_000, until_ns)
         for at_ns in [at_ns for at_ns in self.stops if at_ns <= self.now_ns]:
             lasts_ns = self.stops.pop(at_ns)
-            if self.suspends:  # the device was without power, and goes on where it was
+            if self.suspends:  # the device was without power, and continues where it was
                 self.asleep_ns += lasts_ns
             else:
                 self.now_ns += lasts_ns
-        due = [one for one in self.sent if one[0] <= self.now_ns][:500]  # no more fits into one read
+        due = [chunk for chunk in self.sent if chunk[0] <= self.now_ns][:500]  # no more fits into one read
         self.sent = self.sent[len(due) :]
         if not self.sent:
             self.station._ending.set()
-        return [(one[0] if self.kernel_stamped else self.now_ns, one[1]) for one in due]
+        return [(chunk[0] if self.kernel_stamped else self.now_ns, chunk[1]) for chunk in due]
 
     def write(self, data: bytes) -> None:
         """Take nothing."""
@@ -90,49 +90,49 @@ def recorded(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
     return sealing.stream(read, rig, name)
 
 
-def stalls(found: Sealed) -> list[tuple[int, str]]:
+def stalls(sealed: Sealed) -> list[tuple[int, str]]:
     """Return time and detail of each stall in ms after the start."""
-    return [((event.t_ns - START_NS) // MS, event.detail) for event in found.events if event.cause == pace.STALLED]
+    return [((event.t_ns - START_NS) // MS, event.detail) for event in sealed.events if event.cause == pace.STALLED]
 
 
 def test_a_recorder_that_is_never_held_up_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = recorded(tmp_path, Device(monkeypatch, frames(5000), {1000: 80, 2000: 60}))  # ordinary delays
+    sealed = recorded(tmp_path, Device(monkeypatch, frames(5000), {1000: 80, 2000: 60}))  # ordinary delays
 
-    assert not found.events and not found.uncertain
-    assert sealing.UNCERTAIN not in found.table.column_names
+    assert not sealed.events and not sealed.uncertain
+    assert sealing.UNCERTAIN not in sealed.table.column_names
 
 
 def test_a_link_is_drained_when_a_read_found_nothing_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     device = Device(monkeypatch, frames(5000), {1000: 2000})  # 2,000 frames wait then, and a read gives 500
-    read, told = device.read, []
+    read, reads = device.read, []
 
     def noted(timeout_s: float) -> list[tuple[int, bytes]]:
-        told.append((len(came := read(timeout_s)), device.station.drained(START_NS + 3000 * MS)))
-        return came
+        reads.append((len(chunks := read(timeout_s)), device.station.drained(START_NS + 3000 * MS)))
+        return chunks
 
     device.read = noted  # type: ignore[method-assign]
     recorded(tmp_path, device)
-    many = [drained for count, drained in told if count == 500]
-    assert len(many) == 4 and not any(many)  # of the read before
-    assert [drained for _, drained in told][-1]
+    full_reads = [drained for count, drained in reads if count == 500]
+    assert len(full_reads) == 4 and not any(full_reads)  # each is the state after the read before it
+    assert [drained for _, drained in reads][-1]
 
 
 @pytest.mark.parametrize("lasts_ms", [250, 460, 5000])
 def test_what_waited_while_the_recorder_was_stopped_has_an_uncertain_arrival(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_ms: int
 ) -> None:
-    found = recorded(tmp_path, Device(monkeypatch, frames(8000), {1000: lasts_ms}))
-    table = found.table
+    sealed = recorded(tmp_path, Device(monkeypatch, frames(8000), {1000: lasts_ms}))
+    table = sealed.table
     t_ns, uncertain_ns = (table.column(name).to_numpy() for name in ("t_ns", sealing.UNCERTAIN))
     sent_ns = START_NS + (table.column("seq").to_numpy() + 1) * MS
     late = t_ns - sent_ns > MS
 
-    ((at_ms, detail),) = stalls(found)
+    ((at_ms, detail),) = stalls(sealed)
     assert at_ms == 1000 + lasts_ms and f"stamped up to {lasts_ms / 1000 + 0.001:.3f} s late" in detail
     assert late.sum() >= lasts_ms - 2 and (uncertain_ns[late] > 0).all()
     assert (sent_ns >= t_ns - np.maximum(uncertain_ns, MS)).all()  # when it truly came lies within what is given
-    assert found.uncertain == np.count_nonzero(uncertain_ns) <= lasts_ms + CATCH_UP_NS // MS + 5
-    assert found.lost == 0
+    assert sealed.uncertain == np.count_nonzero(uncertain_ns) <= lasts_ms + CATCH_UP_NS // MS + 5
+    assert sealed.lost == 0
 
 
 def test_stamps_of_the_kernel_are_right_however_late_they_are_read(
@@ -140,18 +140,18 @@ def test_stamps_of_the_kernel_are_right_however_late_they_are_read(
 ) -> None:
     device = Device(monkeypatch, frames(5000), {1000: 2000})
     device.kernel_stamped = True
-    found = recorded(tmp_path, device)
+    sealed = recorded(tmp_path, device)
 
-    assert len(stalls(found)) == 1 and not found.uncertain
+    assert len(stalls(sealed)) == 1 and not sealed.uncertain
 
 
 def test_time_in_which_the_computer_was_suspended_is_in_the_stamps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = recorded(tmp_path, Device(monkeypatch, frames(4000), {1000: 3_600_000}, asleep=True))
-    steps_ns = np.diff(found.table.column("t_ns").to_numpy())
+    sealed = recorded(tmp_path, Device(monkeypatch, frames(4000), {1000: 3_600_000}, asleep=True))
+    steps_ns = np.diff(sealed.table.column("t_ns").to_numpy())
 
-    ((_, detail),) = stalls(found)
+    ((_, detail),) = stalls(sealed)
     assert "the computer was suspended for 3600.000 s of it" in detail
     assert (steps_ns > 3600 * S).sum() == 1 and steps_ns.max() < 3601 * S
 
@@ -240,7 +240,7 @@ def test_a_recorder_that_was_stopped_at_the_end_blames_no_device(
     script.happens.append((at_s, lambda: setattr(script, "t_ns", script.t_ns + round(stopped_s * 1e9))))
     lab.run("acquire rig.toml -o rec --duration-s 4")
 
-    assert counts(live.only(lab.folder))[-1] >= (at_s + stopped_s) * RATE_HZ - 1  # what had waited is fetched
+    assert counts(live.only(lab.folder))[-1] >= (at_s + stopped_s) * RATE_HZ - 1  # the samples that waited are fetched
 
 
 def test_a_recorder_that_is_stopped_at_the_start_awaits_the_first_sample_as_long_as_ever(

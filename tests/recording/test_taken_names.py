@@ -1,4 +1,4 @@
-"""A recording that is to be acquired has a name of its own on every file system: upper and lower case count as one."""
+"""Test that a recording gets a unique name on every file system: upper and lower case count as one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ ENTRY: dict[str, Any] = {"attributes": {}, "shards": {}}
 
 
 @pytest.mark.parametrize(
-    ("name", "there"), [("cup", "Cup"), ("CUP", "Cup"), ("Cup-001", "cup-001"), ("STRASSE", "straße")]
+    ("name", "existing_name"), [("cup", "Cup"), ("CUP", "Cup"), ("Cup-001", "cup-001"), ("STRASSE", "straße")]
 )
 def test_a_name_that_a_recording_has_but_for_case_is_refused_and_numbered_where_it_was_taken_meanwhile(
-    name: str, there: str, monkeypatch: pytest.MonkeyPatch
+    name: str, existing_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = Manifest(ACQUIRE, 1, recordings={there: ENTRY, "another": ENTRY})
+    before = Manifest(ACQUIRE, 1, recordings={existing_name: ENTRY, "another": ENTRY})
     monkeypatch.setattr(appending, "existing", lambda output: before)
-    with pytest.raises(UsageError, match=f"names already: {there}"):
+    with pytest.raises(UsageError, match=f"names already: {existing_name}"):
         appending.refuse_taken(Path("rec"), ["bowl", name])
     appending.refuse_taken(Path("rec"), ["bowl", f"{name}-2"])
     assert appending._free_name(name, before.recordings) == f"{name}-2"

@@ -1,4 +1,4 @@
-"""A sensor that a third party installed stands beside the built-in ones."""
+"""Test that a sensor that a third party installed is used like the built-in ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_third_party_s_sensor_is_listed_emulated_and_recorded(lab: Lab) -> Non
         lab.run("acquire rig.toml -o rec --duration-s 1 --quiet")
 
     (shard,) = shards(lab.folder).values()
-    found = recorded(shard, "pulse")
-    place(found, sent(emulator, "pulse"))
+    rows = recorded(shard, "pulse")
+    place(rows, sent(emulator, "pulse"))
     assert shard.attributes["pulse_lost"] == 0
     assert shard.attributes["sensor"] == "pulse"

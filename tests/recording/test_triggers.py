@@ -1,4 +1,4 @@
-"""A trial begins and ends with a key, a touch, or a word of one of the lab's own programs, and what came before is in it."""
+"""Test that a key, a touch or an event of another program begins and ends a trial, with the time before it."""
 
 from __future__ import annotations
 
@@ -124,11 +124,11 @@ def test_a_touch_begins_a_trial_and_its_end_ends_it(lab: Lab, monkeypatch: pytes
     lab.run("acquire rig.toml -o rec --start contact --stop contact --contact-count 500")
     pad.ended.set()
     pad.join()
-    found = live.only(lab.folder).table("pad").column("taxel01").to_numpy()
-    touched = (found == TOUCHED).nonzero()[0]
+    values = live.only(lab.folder).table("pad").column("taxel01").to_numpy()
+    touched = (values == TOUCHED).nonzero()[0]
 
-    assert TOUCHED in found
-    assert found[-1] == REST
+    assert TOUCHED in values
+    assert values[-1] == REST
     assert touched[-1] - touched[0] + 1 == len(touched)
 
 

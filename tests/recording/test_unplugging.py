@@ -1,4 +1,4 @@
-"""A device that goes away is told, what it cost is counted, and no other stream suffers."""
+"""Test that the loss of a device is reported and counted, and that no other stream suffers."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def plug(rig: Emulator, name: str, *, back: bool) -> None:
     """Take a device away, or bring it back, and wait until that has happened."""
     before = len(rig.ledger[name].events)
     (rig.replug if back else rig.unplug)(name)
-    what = "replug" if back else "unplug"
-    live.awaited(lambda: what in [told for _, told, _ in rig.ledger[name].events[before:]])
+    kind = "replug" if back else "unplug"
+    live.awaited(lambda: kind in [event_kind for _, event_kind, _ in rig.ledger[name].events[before:]])
 
 
 def enough(rig: Emulator, name: str, frames: int) -> None:
@@ -36,7 +36,7 @@ def enough(rig: Emulator, name: str, frames: int) -> None:
     live.awaited(lambda: len(rig.ledger[name].whole) > before + frames)
 
 
-def begun(lab: Lab, rig: Emulator) -> subprocess.Popen[str]:
+def start_recording(lab: Lab, rig: Emulator) -> subprocess.Popen[str]:
     process = live.started(lab.folder, "--name one")
     live.awaited(lambda: live.spools(lab.folder))
     for name in rig.rig.streams:
@@ -44,7 +44,7 @@ def begun(lab: Lab, rig: Emulator) -> subprocess.Popen[str]:
     return process
 
 
-def ended(process: subprocess.Popen[str]) -> str:
+def end_recording(process: subprocess.Popen[str]) -> str:
     process.send_signal(signal.SIGINT)
     _, err = process.communicate()
     assert process.returncode == 0, err
@@ -57,53 +57,53 @@ def numbers(rig: Emulator, shard: Any, name: str) -> list[int]:
     samples = ledger.samples()
     assert samples.seq is not None and modulus is not None
     rows = live.sent(rig, name)
-    known = {
+    rows_by_seq = {
         int(seq): (row, int(number))
         for seq, row, number in zip(samples.seq, rows, ledger.column("number")[ledger.whole], strict=True)
     }
     counts = shard.table(name).column("seq").to_numpy() % modulus
-    found = [known[int(seq)] for seq in counts]
-    assert [row for row, _ in found] == live.recorded(shard, name)
-    return [number for _, number in found]
+    sent_samples = [rows_by_seq[int(seq)] for seq in counts]
+    assert [row for row, _ in sent_samples] == live.recorded(shard, name)
+    return [number for _, number in sent_samples]
 
 
 @pytest.mark.parametrize("name", ["force", "skin"])
 def test_a_device_that_is_plugged_in_again_goes_on_and_its_loss_is_exact(lab: Lab, rig: Emulator, name: str) -> None:
-    process = begun(lab, rig)
+    process = start_recording(lab, rig)
     plug(rig, name, back=False)
     enough(rig, "range", 20)
     plug(rig, name, back=True)
     enough(rig, name, 40)
-    ended(process)
+    end_recording(process)
     shard = live.only(lab.folder)
 
-    told = live.events(shard, name)
-    assert [cause for cause, _ in told if cause in (LOST, OPENED)] == [LOST, OPENED]
+    events = live.events(shard, name)
+    assert [cause for cause, _ in events if cause in (LOST, OPENED)] == [LOST, OPENED]
     skipped = int((np.diff(numbers(rig, shard, name)) - 1).sum())
     assert skipped > 0
-    assert skipped == live.missing(shard, name) == shard.attributes[f"{name}_lost"] == sum(lost for _, lost in told)
-    for other in {"force", "skin", "range"} - {name}:
-        live.place(live.recorded(shard, other), live.sent(rig, other))
+    assert skipped == live.missing(shard, name) == shard.attributes[f"{name}_lost"] == sum(lost for _, lost in events)
+    for other_name in {"force", "skin", "range"} - {name}:
+        live.place(live.recorded(shard, other_name), live.sent(rig, other_name))
 
 
 def test_a_device_that_does_not_count_is_lost_and_opened_too(lab: Lab, rig: Emulator) -> None:
-    process = begun(lab, rig)
+    process = start_recording(lab, rig)
     plug(rig, "range", back=False)
     enough(rig, "force", 300)
     plug(rig, "range", back=True)
     enough(rig, "range", 20)
-    ended(process)
+    end_recording(process)
     shard = live.only(lab.folder)
 
-    told = live.events(shard, "range")
-    assert [cause for cause, _ in told if cause in (LOST, OPENED)] == [LOST, OPENED]
+    events = live.events(shard, "range")
+    assert [cause for cause, _ in events if cause in (LOST, OPENED)] == [LOST, OPENED]
     assert live.in_order(live.recorded(shard, "range"), live.sent(rig, "range"))
-    assert shard.attributes["range_lost"] > 0  # by the clock
+    assert shard.attributes["range_lost"] > 0  # the loss is estimated by the clock
 
 
 @pytest.mark.parametrize("name", ["force", "range"])
 def test_a_device_that_is_away_at_the_end_is_an_error_and_the_rest_is_kept(lab: Lab, rig: Emulator, name: str) -> None:
-    process = begun(lab, rig)
+    process = start_recording(lab, rig)
     plug(rig, name, back=False)
     enough(rig, "skin", 40)
     process.send_signal(signal.SIGINT)
@@ -131,7 +131,7 @@ def test_a_box_of_datagrams_that_went_mute_is_asked_anew(lab: Lab, monkeypatch: 
             live.awaited(lambda: live.spools(lab.folder))
             enough(rig, "wrench", 50)
             plug(rig, "wrench", back=False)
-            plug(rig, "wrench", back=True)  # as if it had lost its power: it sends nothing until it is asked
+            plug(rig, "wrench", back=True)  # it is as after a loss of power, and sends nothing until it is asked
             enough(rig, "wrench", 50)
             signal.raise_signal(signal.SIGINT)
 
@@ -141,8 +141,8 @@ def test_a_box_of_datagrams_that_went_mute_is_asked_anew(lab: Lab, monkeypatch: 
         thread.join()
         shard = live.only(lab.folder)
 
-        told = live.events(shard, "wrench")
-        assert [cause for cause, _ in told if cause in (LOST, OPENED)] == [LOST, OPENED]
+        events = live.events(shard, "wrench")
+        assert [cause for cause, _ in events if cause in (LOST, OPENED)] == [LOST, OPENED]
         skipped = int((np.diff(numbers(rig, shard, "wrench")) - 1).sum())
-        assert skipped == live.missing(shard, "wrench") == sum(lost for _, lost in told)
+        assert skipped == live.missing(shard, "wrench") == sum(lost for _, lost in events)
         live.place(live.recorded(shard, "force"), live.sent(rig, "force"))

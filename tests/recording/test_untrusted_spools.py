@@ -1,4 +1,4 @@
-"""A spool that was unpacked, shared or made up: it writes nowhere but where one records, and keeps nobody from recording."""
+"""Test that a forged, unpacked or shared spool writes to no other place, and does not stop others from recording."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def declare(folder: Path, **values: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
-def beside(lab: Lab) -> set[Path]:
+def files_outside_store(lab: Lab) -> set[Path]:
     """Return all that lies in the project outside of its store, and what lies next to the project."""
     project = {path for path in lab.folder.rglob("*") if not path.is_relative_to(lab.store.root)}
     return project | set(lab.folder.parent.iterdir())
@@ -36,13 +36,13 @@ def beside(lab: Lab) -> set[Path]:
 
 def refused(lab: Lab, folder: Path) -> str:
     """Return why a spool is not sealed; fails if it is, if anything was written for it, or if it says more than a line."""
-    before, files = beside(lab), sorted(folder.iterdir())
+    before, files = files_outside_store(lab), sorted(folder.iterdir())
     ran = lab.call("acquire --recover")
-    assert ran.code == 1 and beside(lab) == before
+    assert ran.code == 1 and files_outside_store(lab) == before
     assert sorted(folder.iterdir()) == files
-    said = f"tacpipe: The spool {folder} stays as it is. "
-    assert ran.err.startswith(said) and ran.err.endswith("\n") and ran.err[:-1].isprintable()
-    return ran.err.removeprefix(said)
+    prefix = f"tacpipe: The spool {folder} stays as it is. "
+    assert ran.err.startswith(prefix) and ran.err.endswith("\n") and ran.err[:-1].isprintable()
+    return ran.err.removeprefix(prefix)
 
 
 @pytest.mark.long
@@ -151,9 +151,9 @@ def test_a_spool_that_is_none_stays_and_keeps_nobody_from_recording(
 
 
 def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, begun = spooled(lab), spooled(lab)
-    (begun / "header.json").unlink()
-    for path in (begun / "bytes", begun):
+    folder, unfinished = spooled(lab), spooled(lab)
+    (unfinished / "header.json").unlink()
+    for path in (unfinished / "bytes", unfinished):
         os.utime(path, (LONG_AGO_S, LONG_AGO_S))
     monkeypatch.setenv("TACPIPE_STORE", str(lab.folder / ".tacpipe"))
     monkeypatch.setattr(os, "geteuid", lambda: 12345)
@@ -161,9 +161,9 @@ def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypa
     ran = lab.run("acquire --recover")
 
     mine = spool_folders.user(folder.stat().st_uid)
-    for left in (folder, begun):
-        assert f"The spool {left} belongs to {mine}, who alone can seal it.\n" in ran.err
-        assert (left / "bytes").exists()
+    for spool in (folder, unfinished):
+        assert f"The spool {spool} belongs to {mine}, who alone can seal it.\n" in ran.err
+        assert (spool / "bytes").exists()
     assert not (lab.folder / "rec").exists()
 
 

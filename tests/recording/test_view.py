@@ -1,4 +1,4 @@
-"""What is seen while a rig records: rates and losses as lines, and as a table with a map of the taxels on a terminal."""
+"""Test the display while a rig records: lines with rates and losses, and on a terminal a table with a taxel map."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def pad(touched: int | None = None) -> Watch:
     """Return a pad that was at rest for a second, then had a taxel pressed."""
     sensor = rig.build_sensor("generic", {"rate_hz": 100, "packets": True, "numbers": [NUMBERS]}, "here")
     watch = Watch(Stream("pad", "generic", sensor, Address("udp", ":4000")))
-    rest = np.full(TAXELS, 100, "<u2")
+    idle = np.full(TAXELS, 100, "<u2")
     for tick in range(20):
-        watch.feed([Chunks.of([(tick * 10_000_000, rest.tobytes())])])
-    pressed = rest.copy()
+        watch.feed([Chunks.of([(tick * 10_000_000, idle.tobytes())])])
+    pressed = idle.copy()
     if touched is not None:
         pressed[touched] = 900
     watch.feed([Chunks.of([(200_000_000, pressed.tobytes())])])

@@ -1,4 +1,4 @@
-"""What a sensor writes to its device in a dialogue that the device answers."""
+"""Messages that a sensor writes to its device in a dialogue that the device answers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from tests.sensors import talking
 
 
 def hold(dialogue: Dialogue, device: Device, before: bytes = b"") -> list[bytes]:
-    """Carry out a dialogue and return what was written; ``before`` is what the device was still sending."""
-    written: list[bytes] = []
+    """Carry out a dialogue and return the messages sent; ``before`` is what the device was still sending."""
+    sent_messages: list[bytes] = []
 
     def noted() -> Dialogue:
         reply = None
@@ -17,8 +17,8 @@ def hold(dialogue: Dialogue, device: Device, before: bytes = b"") -> list[bytes]
                 ask = next(dialogue) if reply is None else dialogue.send(reply)
             except StopIteration:
                 return
-            written.append(ask.send)
+            sent_messages.append(ask.send)
             reply = yield ask
 
     talking.carried_out(noted(), device, before)
-    return written
+    return sent_messages

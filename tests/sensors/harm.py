@@ -79,20 +79,20 @@ def sent(sensor: Sensor, pieces: Sequence[bytes], faults: Sequence[Harm], rng: n
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a harmed frame leads to among sound neighbours, beside what the sound one does; samples as `made.rows`."""
+    """The effect of a harmed frame among sound neighbours, against that of the sound frame; samples as `made.rows`."""
 
-    other: set[bytes]  # samples that nobody sent: the protocol cannot see this fault
-    missing: set[bytes]  # samples that do not come
-    told: bool  # whether a loss says so
+    other: set[bytes]  # Samples that nobody sent: the protocol cannot see this fault.
+    missing: set[bytes]  # Samples that do not arrive.
+    told: bool  # True if a loss is reported.
 
 
 def outcome(sensor: Sensor, pieces: Sequence[bytes], harm: Harm) -> Outcome:
-    """Return what a fault leads to by itself."""
+    """Return the outcome of a single fault."""
     before = [part for piece in pieces[harm.row - BEFORE : harm.row] for part in packets(sensor, piece)]
     after = [part for piece in pieces[harm.row + 1 : harm.row + 1 + AFTER] for part in packets(sensor, piece)]
     sound, lost = _rows(sensor, [*before, *packets(sensor, pieces[harm.row]), *after])
-    found, lost_more = _rows(sensor, [*before, *harm.packets, *after])
-    return Outcome(found - sound, sound - found, lost_more > lost)
+    harmed_rows, lost_more = _rows(sensor, [*before, *harm.packets, *after])
+    return Outcome(harmed_rows - sound, sound - harmed_rows, lost_more > lost)
 
 
 def _rows(sensor: Sensor, chunks: Sequence[bytes]) -> tuple[set[bytes], int]:

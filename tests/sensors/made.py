@@ -40,7 +40,7 @@ def samples(kind: str, sensor: Sensor, count: int, seed: int = 0) -> Samples:
 def blocks(kind: str, sensor: Sensor, columns: Columns) -> tuple[AnyArray, ...]:
     """Return the columns as blocks (sample, channel), one for each stretch of fields of one type.
 
-    Sensors whose outputs are chosen in the rig file have a block an output instead.
+    Sensors whose outputs are chosen in the rig file have one block per output instead.
     """
     fields = sensor.fields()
     edges = [row for row in range(1, len(fields)) if fields[row].type != fields[row - 1].type]
@@ -55,14 +55,16 @@ def blocks(kind: str, sensor: Sensor, columns: Columns) -> tuple[AnyArray, ...]:
     )
 
 
-def taken(samples: Samples, rows: Any) -> Samples:
+def select_rows(samples: Samples, rows: Any) -> Samples:
     """Return some of the samples."""
 
-    def of(values: AnyArray | None) -> AnyArray | None:
+    def select(values: AnyArray | None) -> AnyArray | None:
         return None if values is None else values[rows]
 
     values = tuple(block[rows] for block in samples.values)
-    return Samples(values, of(samples.seq), of(samples.t_device_ns), of(samples.device_seq), of(samples.rows))
+    return Samples(
+        values, select(samples.seq), select(samples.t_device_ns), select(samples.device_seq), select(samples.rows)
+    )
 
 
 def pieces(sensor: Sensor, frames: Any) -> list[bytes]:
@@ -81,49 +83,53 @@ def through(
     runs: list[Run] = []
     losses: list[Loss] = []
     for start in range(0, len(stamped), at_once):
-        found, lost = framer.feed(Chunks.of(stamped[start : start + at_once]))
-        runs, losses = runs + found, losses + lost
-    found, lost = framer.flush()
-    return runs + found, losses + lost
+        new_runs, lost = framer.feed(Chunks.of(stamped[start : start + at_once]))
+        runs, losses = runs + new_runs, losses + lost
+    new_runs, lost = framer.flush()
+    return runs + new_runs, losses + lost
 
 
 def decoded(sensor: Sensor, runs: Sequence[Run]) -> Samples:
     """Return the samples of all runs, one after another."""
-    every = [part for run in runs if len(part := sensor.decode(run.frames))]
-    if not every:
+    decoded_runs = [part for run in runs if len(part := sensor.decode(run.frames))]
+    if not decoded_runs:
         return Samples(tuple(np.zeros((0, 0)) for _ in sensor.fields()))
 
     def joined(name: str) -> Any:
-        found = [getattr(part, name) for part in every]
-        return None if found[0] is None else np.concatenate(found)
+        columns = [getattr(part, name) for part in decoded_runs]
+        return None if columns[0] is None else np.concatenate(columns)
 
-    values = tuple(np.concatenate(several) for several in zip(*(part.values for part in every), strict=True))
+    values = tuple(
+        np.concatenate(channel_blocks) for channel_blocks in zip(*(part.values for part in decoded_runs), strict=True)
+    )
     return Samples(values, joined("seq"), joined("t_device_ns"), joined("device_seq"))
 
 
-def same(found: Samples, sent: Samples) -> bool:
-    """Return whether samples are equal to the bit, in all that the device tells: NaN is equal to itself."""
-    pairs: list[tuple[Any, Any]] = [(_bits(found.values), _bits(sent.values))]
+def same(received: Samples, sent: Samples) -> bool:
+    """Return whether samples are equal to the bit in all values that the device sends: NaN is equal to itself."""
+    pairs: list[tuple[Any, Any]] = [(_bits(received.values), _bits(sent.values))]
     pairs += [
-        (getattr(found, name), getattr(sent, name))
+        (getattr(received, name), getattr(sent, name))
         for name in ("seq", "t_device_ns", "device_seq")
-        if getattr(found, name) is not None
+        if getattr(received, name) is not None
     ]
-    return all(np.array_equal(one, other) for one, other in pairs)
+    return all(np.array_equal(received_bits, sent_bits) for received_bits, sent_bits in pairs)
 
 
-def near(sensor: Sensor, found: Samples, sent: Samples) -> bool:
+def nearly_equal(sensor: Sensor, received: Samples, sent: Samples) -> bool:
     """Return whether samples are equal but for the rounding of a protocol that sends floats in fewer digits or otherwise."""
     names = [field.name for field in sensor.fields()]
-    one, other = (np.hstack([block.astype(np.float64) for block in part.values]) for part in (found, sent))
-    if one.shape != other.shape:
+    received_numbers, sent_numbers = (
+        np.hstack([block.astype(np.float64) for block in part.values]) for part in (received, sent)
+    )
+    if received_numbers.shape != sent_numbers.shape:
         return False
     for name in names:
         if name.endswith("orientation_w"):  # a rotation is both a quaternion and its negative
             turned = [names.index(name[:-1] + part) for part in "xyzw"]
-            along = (one[:, turned] * other[:, turned]).sum(axis=1, keepdims=True)
-            one[:, turned] *= np.where(along < 0, -1, 1)
-    return np.allclose(one, other, rtol=1e-6, atol=1e-3, equal_nan=True)
+            along = (received_numbers[:, turned] * sent_numbers[:, turned]).sum(axis=1, keepdims=True)
+            received_numbers[:, turned] *= np.where(along < 0, -1, 1)
+    return np.allclose(received_numbers, sent_numbers, rtol=1e-6, atol=1e-3, equal_nan=True)
 
 
 def rows(samples: Samples) -> list[bytes]:
@@ -160,9 +166,9 @@ def _column(field: Any, count: int, rng: np.random.Generator, limits: Limits) ->
     if kind.kind == "f":
         return np.asarray(rng.normal(0.0, 100.0, count).astype(kind))
     low, high = np.iinfo(kind).min, np.iinfo(kind).max
-    for name, (least, most) in limits.items():
+    for name, (lower, upper) in limits.items():
         if field.name.startswith(name):
-            low, high = least, most
+            low, high = lower, upper
     return np.asarray(rng.integers(low, high, count, dtype=kind, endpoint=True))
 
 
@@ -193,13 +199,13 @@ def _one_part_at_a_time(columns: Columns, sensor: Sensor) -> Columns:
     for name, values in columns.items():
         for row in range(len(values)):
             part = "buttons" if row % 10 == 9 else "rotation" if split and row % 2 else "translation"
-            told = name.startswith(part) or (not split and part == "translation" and name.startswith("rotation"))
-            values[row] = values[row] if told else values[row - 1] if row else 0
+            included = name.startswith(part) or (not split and part == "translation" and name.startswith("rotation"))
+            values[row] = values[row] if included else values[row - 1] if row else 0
     return columns
 
 
 TEXT = "word"
-LIMITS: dict[str, Limits] = {  # of fields whose names begin so, where a device uses less than their type holds
+LIMITS: dict[str, Limits] = {  # Limits by the start of a field's name, where a device uses less than the type's range.
     "biotac": {"": (0, 4095)},
     "grasps": {"request": (0, 1 << 61), "grasp": (0, 0)},
     "plan": {"t_target": (0, 1 << 61)},
@@ -216,9 +222,10 @@ CLOCKS = {  # tick in ns and modulus of device clocks that are coarser than 1 ns
     "lines": (1000, 1 << 32),
     "weiss-wts": (10_000, 1 << 32),
 }
-BY_OUTPUT: dict[str, Any] = {"kuka-rsi": [], "tap": [], "ur-rtde": np.zeros((0, 4), dtype=np.uint8)}  # and no frames
-ROUNDED = ("franka", "kuka-rsi", "ur-rtde")  # that send floats in fewer digits, or orientations in other terms
-OPTIONS: dict[str, dict[str, Any]] = {  # of sensors that are nothing without
+# Empty frames of each sensor whose outputs are chosen in the rig file.
+BY_OUTPUT: dict[str, Any] = {"kuka-rsi": [], "tap": [], "ur-rtde": np.zeros((0, 4), dtype=np.uint8)}
+ROUNDED = ("franka", "kuka-rsi", "ur-rtde")  # Sensors that send floats in fewer digits, or orientations in other terms.
+OPTIONS: dict[str, dict[str, Any]] = {  # Options of sensors that cannot be built without them.
     "generic": {
         "rate_hz": 500,
         "marker": "AA 55",

@@ -1,4 +1,4 @@
-"""What tests of serial drivers need: bytes fed in pieces, a dialogue without a port, a pseudo-terminal with a device."""
+"""Helpers for tests of serial drivers: bytes fed in pieces, a dialogue without a port, a pseudo-terminal with a device."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[lis
 
 def values(samples: Sequence[Samples]) -> list[AnyArray]:
     """Return the blocks of samples one after the other, each (sample, channel)."""
-    there = [each for each in samples if len(each)]
-    return [np.concatenate(blocks) for blocks in zip(*(each.values for each in there), strict=True)]
+    non_empty = [batch for batch in samples if len(batch)]
+    return [np.concatenate(blocks) for blocks in zip(*(batch.values for batch in non_empty), strict=True)]
 
 
 def rows_of(samples: Sequence[Samples]) -> list[bytes]:
@@ -49,22 +49,22 @@ def stream(frames: Any) -> bytes:
     return b"".join(bytes(frame) for frame in frames)
 
 
-def held(dialogue: Dialogue, device: Device, between: bytes = b"", size: int = 7) -> list[bytes]:
-    """Hold a dialogue with a device whose replies come in pieces, behind ``between``; return what was written."""
-    written: list[bytes] = []
+def hold_dialogue(dialogue: Dialogue, device: Device, between: bytes = b"", size: int = 7) -> list[bytes]:
+    """Hold a dialogue with a device whose replies come in pieces, after ``between``; return the messages sent."""
+    sent_messages: list[bytes] = []
     reply: bytes | None = None
     while True:
         try:
             ask = dialogue.send(reply) if reply is not None else next(dialogue)
         except StopIteration:
-            return written
-        written.append(ask.send)
-        came = between + b"".join(device.hear(ask.send))
+            return sent_messages
+        sent_messages.append(ask.send)
+        incoming = between + b"".join(device.hear(ask.send))
         reply = b""
         if ask.until is not None:
-            found = next((n for stop in range(0, len(came) + size, size) if (n := ask.found(came[:stop]))), None)
-            assert found is not None, f"no {ask.what} among {came.hex(' ')}"
-            reply = came[slice(*found)]
+            span = next((n for stop in range(0, len(incoming) + size, size) if (n := ask.found(incoming[:stop]))), None)
+            assert span is not None, f"no {ask.what} among {incoming.hex(' ')}"
+            reply = incoming[slice(*span)]
 
 
 def streams(device: Device) -> bool:
@@ -78,11 +78,11 @@ def served(device: Device, frame: Callable[[int], bytes], period_s: float = 0.00
     master, slave = os.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
-    done = threading.Event()
+    stopped = threading.Event()
 
     def serve() -> None:
         sent = 0
-        while not done.is_set():
+        while not stopped.is_set():
             if select.select([master], [], [], period_s)[0]:
                 for reply in device.hear(os.read(master, 4096)):
                     os.write(master, reply)
@@ -98,7 +98,7 @@ def served(device: Device, frame: Callable[[int], bytes], period_s: float = 0.00
     try:
         yield os.ttyname(slave)
     finally:
-        done.set()
+        stopped.set()
         thread.join()
         os.close(master)
         os.close(slave)
@@ -109,17 +109,17 @@ class FakeSerial:
 
     is_open = True
 
-    def __init__(self, data: bytes, most: int = 1 << 30) -> None:
-        self.data, self.place, self.most = data, 0, most
+    def __init__(self, data: bytes, read_limit: int = 1 << 30) -> None:
+        self.data, self.place, self.read_limit = data, 0, read_limit
 
     @property
     def in_waiting(self) -> int:
-        return min(self.most, len(self.data) - self.place)
+        return min(self.read_limit, len(self.data) - self.place)
 
     def read(self, size: int = 1) -> bytes:
-        found = self.data[self.place : self.place + min(size, self.most)]
-        self.place += len(found)
-        return found
+        chunk = self.data[self.place : self.place + min(size, self.read_limit)]
+        self.place += len(chunk)
+        return chunk
 
     def read_until(self, expected: bytes = b"\n") -> bytes:
         stop = self.data.find(expected, self.place)

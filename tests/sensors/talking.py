@@ -10,27 +10,27 @@ from tacpipe.sensors.sensor import Ask, Device, Dialogue, Sensor
 
 def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> bytes:
     """Carry out a dialogue; ``greeting`` came before any reply. Return what came that was no reply."""
-    came, other, reply = greeting, b"", None
+    incoming, unrelated, reply = greeting, b"", None
     while True:
         try:
             ask = dialogue.send(reply) if reply is not None else next(dialogue)
         except StopIteration:
-            return other + came
-        came += b"".join(device.hear(ask.send))
+            return unrelated + incoming
+        incoming += b"".join(device.hear(ask.send))
         if ask.until is None:
             reply = b""
             continue
-        found = ask.found(came)
-        assert found is not None, f"no reply to {ask.send.hex(' ')}, only {came.hex(' ')}"
-        other += came[: found[0]]
-        reply, came = came[slice(*found)], came[found[1] :]
+        span = ask.found(incoming)
+        assert span is not None, f"no reply to {ask.send.hex(' ')}, only {incoming.hex(' ')}"
+        unrelated += incoming[: span[0]]
+        reply, incoming = incoming[slice(*span)], incoming[span[1] :]
 
 
-def reply_of(ask: Ask, came: bytes) -> bytes:
+def reply_of(ask: Ask, incoming: bytes) -> bytes:
     """Return the reply that a question finds in what came."""
-    found = ask.found(came)
-    assert found is not None
-    return came[slice(*found)]
+    span = ask.found(incoming)
+    assert span is not None
+    return incoming[slice(*span)]
 
 
 def opened(sensor: Sensor, local: Mapping[str, Any] | None = None, greeting: bytes = b"") -> Device:

@@ -34,18 +34,20 @@ def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
 
 @pytest.mark.parametrize("kind", ["points", "wrist"])
 def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
-    whole, stage = scene(), load("segment.grasps")
-    assert whole.cloud.colours is not None
-    wrist = estimated_wrist(whole.grasp)
-    grasp = Grasp(whole.grasp.g1_m, whole.grasp.g2_m, wrist if kind == "wrist" else None)
-    told = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
+    full_scene, stage = scene(), load("segment.grasps")
+    assert full_scene.cloud.colours is not None
+    wrist = estimated_wrist(full_scene.grasp)
+    grasp = Grasp(full_scene.grasp.g1_m, full_scene.grasp.g2_m, wrist if kind == "wrist" else None)
+    record = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
-    came = {
-        "scene": acquired(Clouds(), ply.packed(whole.cloud.points_m, whole.cloud.colours)),
-        "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": told}).encode()),
+    acquired_streams = {
+        "scene": acquired(Clouds(), ply.packed(full_scene.cloud.points_m, full_scene.cloud.colours)),
+        "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": record}).encode()),
     }
 
-    held = {"scene": whole.cloud.table(), "grasp": grasp.table(5)}
-    found, expected = (stage(stage.params(), FakeRecording(streams)).streams for streams in (came, held))
-    np.testing.assert_array_equal(Cloud.of(found["cloud"]).points_m, Cloud.of(expected["cloud"]).points_m)
-    assert found["grasp"].equals(expected["grasp"])
+    expected_streams = {"scene": full_scene.cloud.table(), "grasp": grasp.table(5)}
+    segmented, expected = (
+        stage(stage.params(), FakeRecording(streams)).streams for streams in (acquired_streams, expected_streams)
+    )
+    np.testing.assert_array_equal(Cloud.of(segmented["cloud"]).points_m, Cloud.of(expected["cloud"]).points_m)
+    assert segmented["grasp"].equals(expected["grasp"])

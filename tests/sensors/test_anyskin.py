@@ -26,7 +26,7 @@ class Client(AnySkinBase):  # type: ignore[misc]
     in_waiting = property(lambda self: self.fake.in_waiting)
 
     def __init__(self, data: bytes, magnetometers: int, mode: str) -> None:
-        self.fake = FakeSerial(data, most=3000)
+        self.fake = FakeSerial(data, read_limit=3000)
         self.num_mags, self.burst_mode = magnetometers, mode == "binary"
         self._msg_floats = 4 * magnetometers
         self._msg_length = 4 * self._msg_floats + 2
@@ -44,7 +44,7 @@ class Client(AnySkinBase):  # type: ignore[misc]
     def __del__(self) -> None: ...
 
 
-def made(count: int, seed: int, magnetometers: int = 5) -> Float32s:
+def random_flux(count: int, seed: int, magnetometers: int = 5) -> Float32s:
     rng = np.random.default_rng(seed)
     flux = rng.normal(0, 500, (count, magnetometers, 4))
     flux[:, :, 0] = 25 + flux[:, :, 0] / 1000
@@ -65,15 +65,15 @@ def test_a_frame_by_hand_is_read_magnetometer_by_magnetometer() -> None:
 def test_what_was_encoded_is_decoded_but_for_the_first_of_which_nobody_knows_the_begin(
     mode: Any, seed: int, sizes: list[int]
 ) -> None:
-    sensor, numbers = AnySkin(mode=mode), made(20, seed)
-    found, losses = read(sensor, stream(sensor.encode(Samples((numbers,)))), sizes)
-    assert rows_of(found) == [row.tobytes() for row in numbers[1:]]
+    sensor, numbers = AnySkin(mode=mode), random_flux(20, seed)
+    batches, losses = read(sensor, stream(sensor.encode(Samples((numbers,)))), sizes)
+    assert rows_of(batches) == [row.tobytes() for row in numbers[1:]]
     assert [loss.cause for loss in losses] == ["start"]
 
 
 @MODES
 def test_the_vendor_reads_the_same_values(mode: Any) -> None:
-    sensor, numbers = AnySkin(mode=mode), made(30, 1)
+    sensor, numbers = AnySkin(mode=mode), random_flux(30, 1)
     data = stream(sensor.encode(Samples((numbers,))))
     client = Client(data + data[:400], 5, mode)  # it wants more bytes than a frame has before it reads one
     rows = np.array([row[1:] for row in client.get_data(30)])
@@ -83,37 +83,37 @@ def test_the_vendor_reads_the_same_values(mode: Any) -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), at=st.integers(2, 15), cut=st.integers(1, 81))
 def test_after_a_cut_no_number_is_read_that_was_not_sent(seed: int, at: int, cut: int) -> None:
-    sensor, numbers = AnySkin(), made(20, seed)
+    sensor, numbers = AnySkin(), random_flux(20, seed)
     frames = [bytes(frame) for frame in sensor.encode(Samples((numbers,)))]
     frames[at] = frames[at][:-cut]
-    found, _ = read(sensor, b"".join(frames))
-    rows = rows_of(found)
+    batches, _ = read(sensor, b"".join(frames))
+    rows = rows_of(batches)
     assert set(rows) <= {row.tobytes() for row in numbers} and len(rows) >= 15
 
 
 @MODES
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 def test_a_frame_with_a_number_that_no_chip_gives_is_lost(mode: Any, wrong: float) -> None:
-    sensor, numbers = AnySkin(mode=mode), made(20, 4)
+    sensor, numbers = AnySkin(mode=mode), random_flux(20, 4)
     numbers[10, 7] = wrong
-    found, losses = read(sensor, stream(sensor.encode(Samples((numbers,)))))
-    assert rows_of(found) == [row.tobytes() for row in [*numbers[1:10], *numbers[11:]]]
+    batches, losses = read(sensor, stream(sensor.encode(Samples((numbers,)))))
+    assert rows_of(batches) == [row.tobytes() for row in [*numbers[1:10], *numbers[11:]]]
     assert losses[-1].cause == "garbled" and losses[-1].frames == 1
 
 
 def test_ends_of_frames_among_the_numbers_that_hold_still_mislead_nobody() -> None:
-    sensor, numbers = AnySkin(), made(20, 5)
+    sensor, numbers = AnySkin(), random_flux(20, 5)
     data = bytearray(stream(sensor.encode(Samples((numbers,)))))
     for row in range(20):
         data[82 * row + 41 : 82 * row + 43] = b"\r\n"
-    found, _ = read(sensor, bytes(data[17:]))
+    batches, _ = read(sensor, bytes(data[17:]))
     sent = {row.tobytes() for row in sensor.decode(np.frombuffer(bytes(data), np.uint8).reshape(20, 82)).values[0]}
-    assert set(rows_of(found)) <= sent
+    assert set(rows_of(batches)) <= sent
 
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    sensor, numbers = AnySkin(), made(100, 6)
+    sensor, numbers = AnySkin(), random_flux(100, 6)
     frames = sensor.encode(Samples((numbers,)))
     with served(sensor.device(), lambda number: bytes(frames[number % 100])) as port:
         client = AnySkinBase(num_mags=5, port=port, temp_filtered=False)

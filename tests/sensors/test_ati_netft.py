@@ -17,8 +17,8 @@ from tacpipe.sensors.sensor import Samples
 from tests.sensors.talking import carried_out, opened
 
 
-def record(sent: int, taken: int, counts: tuple[int, ...] = (1, -2, 3, -4, 5, -6), status: int = 0) -> bytes:
-    return struct.pack(">III6i", sent, taken, status, *counts)
+def record(sent: int, sample_count: int, counts: tuple[int, ...] = (1, -2, 3, -4, 5, -6), status: int = 0) -> bytes:
+    return struct.pack(">III6i", sent, sample_count, status, *counts)
 
 
 def frames(*records: bytes) -> np.ndarray:
@@ -26,21 +26,21 @@ def frames(*records: bytes) -> np.ndarray:
 
 
 def test_a_record_of_the_manual_is_read() -> None:
-    found = AtiNetFT().decode(frames(record(7, 70, status=0x80010000)))
+    samples = AtiNetFT().decode(frames(record(7, 70, status=0x80010000)))
 
-    assert found.values[0].tolist() == [[0x80010000]]
-    assert found.values[1].tolist() == [[1, -2, 3, -4, 5, -6]]
-    assert found.values[1].dtype == np.int32
-    assert found.seq is not None and found.device_seq is not None
-    assert (found.seq.tolist(), found.device_seq.tolist()) == ([7], [70])
+    assert samples.values[0].tolist() == [[0x80010000]]
+    assert samples.values[1].tolist() == [[1, -2, 3, -4, 5, -6]]
+    assert samples.values[1].dtype == np.int32
+    assert samples.seq is not None and samples.device_seq is not None
+    assert (samples.seq.tolist(), samples.device_seq.tolist()) == ([7], [70])
 
 
 def test_counts_become_newtons_by_the_boxs_own_scale() -> None:
     sensor = AtiNetFT(counts_per_force=1e6, counts_per_torque=1e3)
 
-    found = sensor.decode(frames(record(1, 1, (1_500_000, 0, -1_000_000, 250, 0, -1000))))
+    samples = sensor.decode(frames(record(1, 1, (1_500_000, 0, -1_000_000, 250, 0, -1000))))
 
-    assert found.values[1].tolist() == [[1.5, 0.0, -1.0, 0.25, 0.0, -1.0]]
+    assert samples.values[1].tolist() == [[1.5, 0.0, -1.0, 0.25, 0.0, -1.0]]
     assert [field.name for field in sensor.fields()][1:] == [
         *(f"force_{axis}_n" for axis in "xyz"),
         *(f"torque_{axis}_nm" for axis in "xyz"),
@@ -49,10 +49,10 @@ def test_counts_become_newtons_by_the_boxs_own_scale() -> None:
 
 def test_a_lost_packet_and_a_sample_that_the_box_skipped_are_told_apart() -> None:
     sensor = AtiNetFT(rate_hz=1000)  # every seventh of the samples that the box takes
-    taken = {1: 703, 2: 710, 4: 724, 5: 738, 6: 745}  # packet 3 is lost; before packet 5 the box skipped one
+    sample_counts = {1: 703, 2: 710, 4: 724, 5: 738, 6: 745}  # packet 3 is lost; before packet 5 the box skipped one
     reading = Reading(sensor)
 
-    batch = reading.feed(Chunks.of([(1_000_000 * sent, record(sent, count)) for sent, count in taken.items()]))
+    batch = reading.feed(Chunks.of([(1_000_000 * sent, record(sent, count)) for sent, count in sample_counts.items()]))
 
     assert [(event.cause, event.frames, event.t_ns) for event in batch.events] == [
         (LINK, 1, 4_000_000),
@@ -103,14 +103,16 @@ def test_what_is_encoded_is_decoded(seed: int, rate_hz: float, scale: float) -> 
     counts = rng.integers(-(1 << 31), 1 << 31, (9, 6)).astype(np.int32)
     status = rng.integers(0, 1 << 32, (9, 1)).astype(np.uint32)
     device = rng.integers(0, (1 << 32) // sensor.every, 9)
-    given_ = Samples((status, counts / scale if scale else counts), seq=rng.integers(0, 1 << 32, 9), device_seq=device)
+    original = Samples(
+        (status, counts / scale if scale else counts), seq=rng.integers(0, 1 << 32, 9), device_seq=device
+    )
 
-    found = sensor.decode(sensor.encode(given_))
+    decoded = sensor.decode(sensor.encode(original))
 
-    for block, expected in zip(found.values, given_.values, strict=True):
+    for block, expected in zip(decoded.values, original.values, strict=True):
         np.testing.assert_array_equal(block, expected)
-    np.testing.assert_array_equal(found.seq, given_.seq)
-    np.testing.assert_array_equal(found.device_seq, device)
+    np.testing.assert_array_equal(decoded.seq, original.seq)
+    np.testing.assert_array_equal(decoded.device_seq, device)
 
 
 @pytest.mark.parametrize("options", [{"rate_hz": 8000}, {"counts_per_force": 1e6}, {"counts_per_torque": 1e6}])

@@ -33,7 +33,7 @@ def test_words_by_hand_have_odd_parity() -> None:
 
 
 def test_the_parity_is_that_of_the_published_table() -> None:
-    published = "01 02 04 07 08 0B 0D 0E 10 13 15 16 19 1A 1C 1F 20 23 25 26"  # of 0 to 19
+    published = "01 02 04 07 08 0B 0D 0E 10 13 15 16 19 1A 1C 1F 20 23 25 26"  # Published bytes of the values 0 to 19.
     assert with_parity(np.arange(20, dtype=np.uint16)).tobytes() == bytes.fromhex(published)
     assert (
         with_parity(np.array([0x40, 0x40 | 17], dtype=np.uint16)).tobytes().hex() == "80a2"
@@ -45,13 +45,13 @@ def test_a_frame_by_hand_is_decoded_in_the_order_of_the_fields() -> None:
     readings = [value for pair in zip([*electrodes, 300, 400, 500], pac, strict=True) for value in pair]
     runs, losses = made.through(BioTac().framer(), [frame(0xFFFF, readings)])
 
-    found = made.decoded(BioTac(), runs)
+    samples = made.decoded(BioTac(), runs)
 
-    values = dict(zip([field.name for field in biotac_fields()], found.values[0][0].tolist(), strict=True))
+    values = dict(zip([field.name for field in biotac_fields()], samples.values[0][0].tolist(), strict=True))
     assert (values["pdc"], values["tac"], values["tdc"]) == (300, 400, 500)
     assert [values[f"electrode{number:02d}"] for number in range(1, 20)] == electrodes
     assert [values[f"pac{number:02d}"] for number in range(1, 23)] == pac
-    assert found.seq is not None and found.seq.tolist() == [0xFFFF] and losses == []
+    assert samples.seq is not None and samples.seq.tolist() == [0xFFFF] and losses == []
 
 
 @pytest.mark.parametrize("fingers", [1, 3])

@@ -48,11 +48,12 @@ def test_crcs_are_those_of_the_standard_library(frames: Bytes) -> None:
 @settings(deadline=None, max_examples=50)
 @given(FRAMES)
 def test_the_sum_of_wts_is_that_of_its_step_byte_by_byte(frames: Bytes) -> None:
-    for frame, found in zip(frames, checks.crc16_wts(frames).tolist(), strict=True):
+    for frame, checksum in zip(frames, checks.crc16_wts(frames).tolist(), strict=True):
         crc = 0xFFFF
         for byte in frame.tobytes():
-            crc = binascii.crc_hqx(bytes([(crc ^ byte) & 0xFF]), 0) ^ (crc >> 8)  # of one byte: the table of 0x1021
-        assert found == crc
+            # The CRC of one byte is an entry of the table of 0x1021.
+            crc = binascii.crc_hqx(bytes([(crc ^ byte) & 0xFF]), 0) ^ (crc >> 8)
+        assert checksum == crc
 
 
 def test_long_frames_are_summed_in_blocks_as_short_ones_are() -> None:

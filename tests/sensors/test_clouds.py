@@ -36,7 +36,7 @@ nan nan nan 0
 """
 
 
-def made(points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_cloud(points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.normal(size=(points, 3)).astype(np.float32), rng.integers(0, 256, (points, 3)).astype(np.uint8)
 
@@ -60,9 +60,9 @@ def test_a_stream_of_clouds_has_the_columns_of_a_scene() -> None:
     import pyarrow as pa
 
     sensor = Clouds()
-    found = sensor.decode([TEXT_PLY])
+    samples = sensor.decode([TEXT_PLY])
 
-    columns = [pa.array(np.ascontiguousarray(column)) for block in found.values for column in block.T]
+    columns = [pa.array(np.ascontiguousarray(column)) for block in samples.values for column in block.T]
     scene = Cloud.of(
         pa.Table.from_arrays([pa.array([1, 1]), *columns], names=["t_ns", *(f.name for f in sensor.fields())])
     )
@@ -73,7 +73,7 @@ def test_a_stream_of_clouds_has_the_columns_of_a_scene() -> None:
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_open3d_reads_the_same_points_of_a_file(form: str, tmp_path: Path) -> None:
     pytest.importorskip("open3d", reason="open3d is not installed")
-    points, colours = made(50, 1)
+    points, colours = random_cloud(50, 1)
     kinds = KINDS.replace("property uchar red", "property double quality\nproperty uchar red")
     rows = np.zeros(
         50, np.dtype([*((axis, "f4") for axis in "xyz"), ("quality", "f8"), *((name, "u1") for name in "rgb")])
@@ -89,20 +89,20 @@ def test_open3d_reads_the_same_points_of_a_file(form: str, tmp_path: Path) -> No
     path = tmp_path / "cloud.ply"
     path.write_bytes(HEAD.format(form=form, count=50, kinds=kinds).encode() + body)
 
-    found, expected = Clouds().decode([path.read_bytes()]), files.read(path)
+    samples, expected = Clouds().decode([path.read_bytes()]), files.read(path)
 
-    np.testing.assert_array_equal(found.values[0], expected.points_m)
-    np.testing.assert_array_equal(found.values[1], expected.colours)
+    np.testing.assert_array_equal(samples.values[0], expected.points_m)
+    np.testing.assert_array_equal(samples.values[1], expected.colours)
 
 
 def test_millimetres_become_metres() -> None:
-    found = Clouds(unit_m=0.001).decode([TEXT_PLY]).values[0]
+    points_m = Clouds(unit_m=0.001).decode([TEXT_PLY]).values[0]
 
-    np.testing.assert_allclose(found[0], [1e-4, 2e-4, 7e-4], rtol=1e-6)
+    np.testing.assert_allclose(points_m[0], [1e-4, 2e-4, 7e-4], rtol=1e-6)
 
 
 def test_a_depth_image_becomes_the_points_that_were_measured() -> None:
-    found = Clouds(unit_m=0.001).decode([frame().to_bytes()])  # the unit is that of files alone
+    samples = Clouds(unit_m=0.001).decode([frame().to_bytes()])  # the unit is that of files alone
 
     # x = (column - 1) z / 100, y = (row - 0.5) z / 200, worked out by hand
     expected = [
@@ -112,16 +112,16 @@ def test_a_depth_image_becomes_the_points_that_were_measured() -> None:
         [0.0, 0.002, 0.8],
         [0.009, 0.00225, 0.9],
     ]
-    np.testing.assert_allclose(found.values[0], expected, atol=1e-8)
-    assert found.values[1][:2].tolist() == [[0, 1, 2], [6, 7, 8]]
+    np.testing.assert_allclose(samples.values[0], expected, atol=1e-8)
+    assert samples.values[1][:2].tolist() == [[0, 1, 2], [6, 7, 8]]
 
 
 def test_a_depth_image_is_what_its_bytes_say() -> None:
-    again = DepthFrame.of_bytes(frame().to_bytes())
+    restored = DepthFrame.of_bytes(frame().to_bytes())
 
-    assert again.depth.tolist() == frame().depth.tolist()
-    assert again.colours is not None and again.colours.tolist() == np.arange(18).reshape(2, 3, 3).tolist()
-    assert (again.focal, again.centre) == ((100.0, 200.0), (1.0, 0.5))
+    assert restored.depth.tolist() == frame().depth.tolist()
+    assert restored.colours is not None and restored.colours.tolist() == np.arange(18).reshape(2, 3, 3).tolist()
+    assert (restored.focal, restored.centre) == ((100.0, 200.0), (1.0, 0.5))
     for content in (b"", frame().to_bytes()[:-1], b"X" + frame().to_bytes()[1:]):
         with pytest.raises(TacpipeError):
             DepthFrame.of_bytes(content)
@@ -152,7 +152,7 @@ def test_what_is_no_whole_cloud_is_malformed(content: bytes) -> None:
 
 
 def test_a_cloud_without_the_colours_that_the_rig_tells_of_is_refused() -> None:
-    points, colours = made(3, 0)
+    points, colours = random_cloud(3, 0)
     bare, coloured = ply.packed(points, None), ply.packed(points, colours)
 
     for sensor, right in ((Clouds(colour=False), bare), (Clouds(), coloured)):
@@ -164,18 +164,18 @@ def test_a_cloud_without_the_colours_that_the_rig_tells_of_is_refused() -> None:
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 30), max_size=4), st.booleans())
 def test_what_is_encoded_is_decoded(seed: int, sizes: list[int], colour: bool) -> None:
-    points, colours = made(sum(sizes), seed)
+    points, colours = random_cloud(sum(sizes), seed)
     rows = np.repeat(np.arange(len(sizes)), sizes)
     sensor = Clouds(colour=colour)
 
     frames = sensor.encode(Samples((points, colours) if colour else (points,), rows=rows)) if sizes else []
-    found = sensor.decode(frames)
+    decoded = sensor.decode(frames)
 
     assert not sensor.framer().feed(Chunks.of(list(enumerate(frames))))[1]
-    np.testing.assert_array_equal(found.values[0], points)
+    np.testing.assert_array_equal(decoded.values[0], points)
     if colour:
-        np.testing.assert_array_equal(found.values[1], colours)
-    np.testing.assert_array_equal(found.rows, rows)
+        np.testing.assert_array_equal(decoded.values[1], colours)
+    np.testing.assert_array_equal(decoded.rows, rows)
 
 
 def test_a_unit_of_nothing_is_refused() -> None:

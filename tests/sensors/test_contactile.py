@@ -43,7 +43,7 @@ def frame(
     """Return a frame from values (sensor, pillar, 6) and (sensor, 6), built straight from the protocol's description."""
     first = 1 + 4 * (2 + width) + padding
     hub = struct.pack("<IQ", 77, 123_456)
-    extra = b"\x55\x66\x77\x88\xaa\xbb\xcc\xdd"  # of type 7, which may hold markers
+    extra = b"\x55\x66\x77\x88\xaa\xbb\xcc\xdd"  # A part of type 7 may hold markers.
     start = first + len(hub)
 
     def nested(start: int) -> bytes:
@@ -55,10 +55,10 @@ def frame(
         return table(sensors, width, start if absolute else 0)
 
     pillars = nested(start)
-    whole = table([struct.pack("<H6f", 2, *six) for six in wholes], width, start + len(pillars) if absolute else 0)
-    places = {1: first, 3: start, 4: start + len(pillars), 7: start + len(pillars) + len(whole)}
+    totals = table([struct.pack("<H6f", 2, *six) for six in wholes], width, start + len(pillars) if absolute else 0)
+    places = {1: first, 3: start, 4: start + len(pillars), 7: start + len(pillars) + len(totals)}
     index = b"".join(struct.pack("<H", kind) + place.to_bytes(width, "little") for kind, place in places.items())
-    body = bytes([width]) + index + bytes(padding) + hub + pillars + whole + extra
+    body = bytes([width]) + index + bytes(padding) + hub + pillars + totals + extra
     return b"\x55\x66\x77\x88" + body + struct.pack("<H", sum(body) & 0xFFFF) + b"\xaa\xbb\xcc\xdd"
 
 
@@ -68,10 +68,10 @@ def test_a_frame_by_hand_is_decoded() -> None:
 
     runs, losses = made.through(ONE.framer(), [BY_HAND])
 
-    found = made.decoded(ONE, runs)
-    assert found.values[0].tolist() == [[1, 2, 3, 4, 5, 6, 1, 2, 3, -1, -2, -3]]
-    assert found.seq is not None and found.seq.tolist() == [1]
-    assert found.t_device_ns is not None and found.t_device_ns.tolist() == [1_000_000_000]
+    samples = made.decoded(ONE, runs)
+    assert samples.values[0].tolist() == [[1, 2, 3, 4, 5, 6, 1, 2, 3, -1, -2, -3]]
+    assert samples.seq is not None and samples.seq.tolist() == [1]
+    assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [1_000_000_000]
     assert losses == []
     assert [field.name for field in ONE.fields()][::6] == ["sensor1_pillar1_force_x_n", "sensor1_force_x_n"]
 
@@ -95,7 +95,7 @@ def test_tables_of_any_width_padding_and_base_are_read(
     rng = np.random.default_rng(seed)
     pillars = 2 if width == 1 else 9
     if width == 1 and sensors == 2:
-        pillars = 1  # what an offset of 8 bits reaches
+        pillars = 1  # Offsets of 8 bits reach no further.
     values = rng.normal(0, 9, (sensors, pillars, 6)).astype(np.float32)
     wholes = rng.normal(0, 9, (sensors, 6)).astype(np.float32)
     sensor = Contactile(sensors=sensors, pillars=pillars)
@@ -103,9 +103,9 @@ def test_tables_of_any_width_padding_and_base_are_read(
 
     runs, losses = made.through(sensor.framer(), [sent])
 
-    found = made.decoded(sensor, runs)
-    assert found.values[0].tolist() == [[*values.ravel().tolist(), *wholes.ravel().tolist()]]
-    assert found.seq is not None and found.seq.tolist() == [77] and losses == []
+    samples = made.decoded(sensor, runs)
+    assert samples.values[0].tolist() == [[*values.ravel().tolist(), *wholes.ravel().tolist()]]
+    assert samples.seq is not None and samples.seq.tolist() == [77] and losses == []
 
 
 @pytest.mark.parametrize("slip", [False, True])
@@ -165,13 +165,13 @@ def test_tables_that_contradict_themselves_make_no_frame(place: int, value: int)
 
 def test_frames_of_two_layouts_in_one_batch_are_told_apart() -> None:
     values, wholes = [[[1.0] * 6]], [[2.0] * 6]
-    one = frame(values, wholes, width=2, absolute=True, padding=3)
-    other = frame(values, wholes, width=2, absolute=False, padding=3)
-    frames = np.frombuffer(one + other + one, np.uint8).reshape(3, -1)
+    absolute_frame = frame(values, wholes, width=2, absolute=True, padding=3)
+    relative_frame = frame(values, wholes, width=2, absolute=False, padding=3)
+    frames = np.frombuffer(absolute_frame + relative_frame + absolute_frame, np.uint8).reshape(3, -1)
 
-    found = {tuple(rows.tolist()) for rows, layout in pts.layouts(frames) if layout is not None}
+    layouts = {tuple(rows.tolist()) for rows, layout in pts.layouts(frames) if layout is not None}
 
-    assert found == {(0, 2), (1,)}
+    assert layouts == {(0, 2), (1,)}
     assert ONE.decode(frames).values[0].tolist() == [[1.0] * 6 + [2.0] * 6] * 3
 
 
@@ -194,17 +194,17 @@ def test_frames_of_the_last_session_are_thrown_away(last: int) -> None:
 
     runs, losses = framer.feed(Chunks.of(chunks[:100]))
     assert runs == [] and framer.account.pending == framer.account.received  # not known yet
-    found, lost = framer.feed(Chunks.of(chunks[100:]))
+    later_runs, lost = framer.feed(Chunks.of(chunks[100:]))
 
-    assert counters(found) == list(range(5000, 5400))
+    assert counters(later_runs) == list(range(5000, 5400))
     assert [(loss.cause, loss.frames, loss.bytes) for loss in losses + lost] == [("stale", 0, 40 * len(BY_HAND))]
     assert framer.account.pending == 0
 
 
 def test_without_a_jump_nothing_is_thrown_away_and_later_jumps_are_left_to_the_counter() -> None:
     framer = ONE.framer()
-    begun = session((1 << 32) - 100, 150)[:140] + session(45, 300)  # it goes round, and five packets are lost
-    chunks = [(2_000_000 * row, data) for row, data in enumerate(begun + session(90_000, 20))]
+    first_session = session((1 << 32) - 100, 150)[:140] + session(45, 300)  # it goes round, and five packets are lost
+    chunks = [(2_000_000 * row, data) for row, data in enumerate(first_session + session(90_000, 20))]
 
     runs, losses = framer.feed(Chunks.of(chunks))
 

@@ -30,48 +30,48 @@ def interrupted(first: int, outage_s: float, after: int, modulus: int = WRAP, ra
 
 
 def test_a_device_that_began_anew_while_it_was_away_is_reset_and_the_clock_tells_the_loss() -> None:
-    found = interrupted(60_000, outage_s=10, after=0)
+    counters = interrupted(60_000, outage_s=10, after=0)
 
-    assert found.missing.tolist() == [9_999] + [0] * 9
-    assert found.reset.tolist() == [True] + [False] * 9
-    assert found.seq.tolist() == list(range(70_000, 70_010))
+    assert counters.missing.tolist() == [9_999] + [0] * 9
+    assert counters.reset.tolist() == [True] + [False] * 9
+    assert counters.seq.tolist() == list(range(70_000, 70_010))
 
 
-@given(first=st.integers(0, WRAP - 1), gone=st.integers(1, 1_000_000), drift=st.floats(-0.04, 0.04))
+@given(first=st.integers(0, WRAP - 1), lost_count=st.integers(1, 1_000_000), drift=st.floats(-0.04, 0.04))
 def test_a_device_that_went_on_counting_while_the_link_was_away_loses_what_its_counter_says(
-    first: int, gone: int, drift: float
+    first: int, lost_count: int, drift: float
 ) -> None:
-    found = interrupted(first, outage_s=gone * (1 + drift) / RATE_HZ, after=first + gone)
+    counters = interrupted(first, outage_s=lost_count * (1 + drift) / RATE_HZ, after=first + lost_count)
 
-    # beyond 5 % of 655 s the clock no longer tells how often a counter of 65 s went round
-    if gone * abs(drift) < WRAP / 2 - 100:
-        assert found.missing.tolist() == [gone - 1] + [0] * 9
-        assert not found.reset.any()
+    # Beyond 5 % of 655 s the clock cannot show how often a counter of 65 s wrapped.
+    if lost_count * abs(drift) < WRAP / 2 - 100:
+        assert counters.missing.tolist() == [lost_count - 1] + [0] * 9
+        assert not counters.reset.any()
 
 
 @given(first=st.integers(0, WRAP - 1), after=st.integers(0, WRAP - 1), outage_s=st.floats(0.1, 600))
 def test_whatever_a_device_begins_with_the_loss_is_about_what_the_clock_says(
     first: int, after: int, outage_s: float
 ) -> None:
-    found = interrupted(first, outage_s, after)
+    counters = interrupted(first, outage_s, after)
 
     expected = outage_s * RATE_HZ
-    assert abs(int(found.missing[0]) + 1 - expected) <= 33 + 0.05 * expected
-    assert np.diff(found.seq).tolist() == [1] * 9
-    assert not found.duplicate.any() and not found.late.any()
+    assert abs(int(counters.missing[0]) + 1 - expected) <= 33 + 0.05 * expected
+    assert np.diff(counters.seq).tolist() == [1] * 9
+    assert not counters.duplicate.any() and not counters.late.any()
 
 
 @pytest.mark.parametrize("after", [95, 100])
 def test_a_counter_that_stands_or_is_a_little_back_after_an_outage_began_anew(after: int) -> None:
-    found = interrupted(100, outage_s=0.005, after=after)
+    counters = interrupted(100, outage_s=0.005, after=after)
 
-    assert found.reset[0] and found.missing[0] == 4
-    assert not found.duplicate.any() and not found.late.any()
+    assert counters.reset[0] and counters.missing[0] == 4
+    assert not counters.duplicate.any() and not counters.late.any()
 
 
 def test_only_the_first_sample_after_an_outage_is_doubted() -> None:
     counting = Counting(WRAP, RATE_HZ)
-    counting.reopened()  # before anything came there is nothing to doubt
+    counting.reopened()  # Before the first sample there is nothing to doubt.
     assert not counted(counting, 500, 3, 0).reset.any()
     counting.reopened()
     assert len(counted(counting, 0, 0, 1).seq) == 0  # nothing came yet
@@ -83,8 +83,8 @@ def test_only_the_first_sample_after_an_outage_is_doubted() -> None:
 
 def test_where_no_rate_is_known_a_counter_that_grew_is_believed() -> None:
     assert interrupted(10, 5, after=30, rate_hz=0).missing.tolist() == [19] + [0] * 9
-    found = interrupted(10, 5, after=0, rate_hz=0)
-    assert found.reset[0] and found.missing[0] == 0
+    counters = interrupted(10, 5, after=0, rate_hz=0)
+    assert counters.reset[0] and counters.missing[0] == 0
 
 
 def test_a_counter_that_grows_by_more_than_one_is_doubted_in_samples() -> None:
@@ -127,15 +127,15 @@ def test_a_count_that_jumps_beyond_what_time_allows_is_a_reset_and_no_loss(
 def test_a_program_of_unknown_rate_loses_what_its_count_says_up_to_what_time_allows(
     gap_s: float, rate_hz: float
 ) -> None:
-    gone = max(1, round(gap_s * rate_hz))
+    elapsed_count = max(1, round(gap_s * rate_hz))
     for reopened in (False, True):
         counting = Counting(1 << 62, 0.0)
         counting.feed(np.array([7]), np.array([0]))
         if reopened:
             counting.reopened()
-        found = counting.feed(np.array([7 + gone]), np.array([round(gap_s * 1e9)]))
+        counters = counting.feed(np.array([7 + elapsed_count]), np.array([round(gap_s * 1e9)]))
 
-        assert found.missing.tolist() == [gone - 1] and not found.reset.any()
+        assert counters.missing.tolist() == [elapsed_count - 1] and not counters.reset.any()
 
 
 def test_a_false_count_behind_a_lost_sample_costs_that_one_alone() -> None:
@@ -143,7 +143,7 @@ def test_a_false_count_behind_a_lost_sample_costs_that_one_alone() -> None:
     t_ns = np.array([0, 10, 30, 40, 50]) * 1_000_000
     counting = Counting(1 << 32, 100.0)
 
-    found = [counting.feed(raw[row : row + 1], t_ns[row : row + 1]) for row in range(len(raw))]
+    batches = [counting.feed(raw[row : row + 1], t_ns[row : row + 1]) for row in range(len(raw))]
 
-    assert [int(one.seq[0]) for one in found] == [9911, 9912, 9914, 9915, 9916]
-    assert sum(int(one.missing.sum()) for one in found) == 1
+    assert [int(batch.seq[0]) for batch in batches] == [9911, 9912, 9914, 9915, 9916]
+    assert sum(int(batch.missing.sum()) for batch in batches) == 1

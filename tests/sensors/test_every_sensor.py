@@ -124,35 +124,35 @@ def test_fields_have_names_of_their_own_units_and_quantities(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_decoded_blocks_are_the_fields_side_by_side_in_their_types(case: str) -> None:
-    one = sent(case, 40)
-    values = understood(one.sensor, one.frames).values
+    recorded = sent(case, 40)
+    values = understood(recorded.sensor, recorded.frames).values
     kinds = [block.dtype for block in values for _ in range(block.shape[1])]
-    assert kinds == [np.dtype(field.type.to_pandas_dtype()) for field in one.sensor.fields()]
+    assert kinds == [np.dtype(field.type.to_pandas_dtype()) for field in recorded.sensor.fields()]
     assert {len(block) for block in values} == {40}
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_encoded_is_decoded(case: str, seed: int) -> None:
-    one = sent(case, 60, seed)
-    found = understood(one.sensor, one.frames)
-    assert made.same(found, one.samples) or (
-        CASES[case][0] in made.ROUNDED and made.near(one.sensor, found, one.samples)
+    recorded = sent(case, 60, seed)
+    decoded = understood(recorded.sensor, recorded.frames)
+    assert made.same(decoded, recorded.samples) or (
+        CASES[case][0] in made.ROUNDED and made.nearly_equal(recorded.sensor, decoded, recorded.samples)
     )
-    assert (found.seq is None) == (one.sensor.counter is None)
-    assert (found.device_seq is None) == (one.sensor.device_counter is None)
+    assert (decoded.seq is None) == (recorded.sensor.counter is None)
+    assert (decoded.device_seq is None) == (recorded.sensor.device_counter is None)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_clean_frames_come_through_but_for_those_at_both_ends(case: str) -> None:
-    one = sent(case, 200)
-    chunks = harm.sent(one.sensor, one.pieces, [], np.random.default_rng(1))
-    framer = one.sensor.framer()
+    recorded = sent(case, 200)
+    chunks = harm.sent(recorded.sensor, recorded.pieces, [], np.random.default_rng(1))
+    framer = recorded.sensor.framer()
 
     runs, losses = made.through(framer, chunks)
 
-    found = [one.numbers[row] for row in made.rows(made.decoded(one.sensor, runs))]
-    assert found == list(range(found[0], found[-1] + 1)) and len(found) >= 198
+    numbers = [recorded.numbers[row] for row in made.rows(made.decoded(recorded.sensor, runs))]
+    assert numbers == list(range(numbers[0], numbers[-1] + 1)) and len(numbers) >= 198
     assert framer.account.lost == sum(loss.bytes for loss in losses)
     assert framer.account.pending == 0
     assert {loss.cause for loss in losses} <= {"start", "unconfirmed", "cut"}
@@ -160,20 +160,20 @@ def test_clean_frames_come_through_but_for_those_at_both_ends(case: str) -> None
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_fault_gives_a_sample_that_nobody_sent_and_none_is_lost_unsaid(case: str) -> None:
-    one = sent(case, COUNT)
+    recorded = sent(case, COUNT)
     rng = np.random.default_rng(0)
-    faults = list(harm.harms(one.sensor, one.pieces, rng))
-    framer = one.sensor.framer()
+    faults = list(harm.harms(recorded.sensor, recorded.pieces, rng))
+    framer = recorded.sensor.framer()
 
-    runs, losses = made.through(framer, harm.sent(one.sensor, one.pieces, faults, rng))
+    runs, losses = made.through(framer, harm.sent(recorded.sensor, recorded.pieces, faults, rng))
 
-    outcomes = [harm.outcome(one.sensor, one.pieces, fault) for fault in faults]
-    rows = made.rows(made.decoded(one.sensor, runs))
-    found = [one.numbers[row] for row in rows if row in one.numbers]
+    outcomes = [harm.outcome(recorded.sensor, recorded.pieces, fault) for fault in faults]
+    rows = made.rows(made.decoded(recorded.sensor, runs))
+    numbers = [recorded.numbers[row] for row in rows if row in recorded.numbers]
     unseen = Counter(fault.fault for fault, result in zip(faults, outcomes, strict=True) if result.other)
-    assert {row for row in rows if row not in one.numbers} <= {row for result in outcomes for row in result.other}
+    assert {row for row in rows if row not in recorded.numbers} <= {row for result in outcomes for row in result.other}
     assert sum(unseen.values()) <= UNSEEN_AT_MOST.get(CASES[case][0], len(faults))
-    assert found == sorted(set(found))
+    assert numbers == sorted(set(numbers))
     assert framer.account.received == framer.account.framed + framer.account.lost
     assert framer.account.lost == sum(loss.bytes for loss in losses)
     silent = [
@@ -186,32 +186,34 @@ def test_no_fault_gives_a_sample_that_nobody_sent_and_none_is_lost_unsaid(case: 
 
 @pytest.mark.parametrize("case", CASES)
 def test_frames_are_found_again_within_two(case: str) -> None:
-    one = sent(case, COUNT)
+    recorded = sent(case, COUNT)
     rng = np.random.default_rng(2)
-    faults = list(harm.harms(one.sensor, one.pieces, rng))
+    faults = list(harm.harms(recorded.sensor, recorded.pieces, rng))
 
-    runs, _ = made.through(one.sensor.framer(), harm.sent(one.sensor, one.pieces, faults, rng))
+    runs, _ = made.through(recorded.sensor.framer(), harm.sent(recorded.sensor, recorded.pieces, faults, rng))
 
-    found = {one.numbers.get(row) for row in made.rows(made.decoded(one.sensor, runs))}
+    numbers = {recorded.numbers.get(row) for row in made.rows(made.decoded(recorded.sensor, runs))}
     ends = [*(fault.row for fault in faults[1:]), COUNT - 1]
     late = [
         (fault.row, fault.fault)
         for fault, end in zip(faults, ends, strict=True)
-        if not found.issuperset(range(fault.row + FOUND_AGAIN, end - 1))
-        and not harm.outcome(one.sensor, one.pieces, fault).other  # one that no check sees may last, as a state does
+        if not numbers.issuperset(range(fault.row + FOUND_AGAIN, end - 1))
+        and not harm.outcome(
+            recorded.sensor, recorded.pieces, fault
+        ).other  # one that no check sees may last, as a state does
     ]
     assert late == []
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: str) -> None:
-    one = sent(case, 100)
+    recorded = sent(case, 100)
     rng = np.random.default_rng(3)
-    chunks = harm.sent(one.sensor, one.pieces, list(harm.harms(one.sensor, one.pieces, rng)), rng)
+    chunks = harm.sent(recorded.sensor, recorded.pieces, list(harm.harms(recorded.sensor, recorded.pieces, rng)), rng)
 
-    results = [made.through(one.sensor.framer(), chunks, at_once=at_once)[0] for at_once in (1, 7, 1000)]
+    results = [made.through(recorded.sensor.framer(), chunks, at_once=at_once)[0] for at_once in (1, 7, 1000)]
 
-    rows = [made.rows(made.decoded(one.sensor, runs)) for runs in results]
+    rows = [made.rows(made.decoded(recorded.sensor, runs)) for runs in results]
     assert rows[0] == rows[1] == rows[2]
     stamps = [np.concatenate([run.t_ns for run in runs]).tolist() for runs in results]
     assert stamps[0] == stamps[1] == stamps[2]

@@ -17,7 +17,7 @@ from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream
 SMALL = FlexiTac(rows=4, columns=5)
 
 
-def made(sensor: FlexiTac, count: int, seed: int) -> Bytes:
+def random_taxels(sensor: FlexiTac, count: int, seed: int) -> Bytes:
     return np.random.default_rng(seed).integers(0, 256, (count, sensor.rows * sensor.columns), dtype=np.uint8)
 
 
@@ -33,56 +33,57 @@ def test_a_frame_by_hand_is_read_row_by_row() -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(1, 100), min_size=1, max_size=4))
 def test_what_was_encoded_is_decoded_but_for_the_last_that_nothing_confirms(seed: int, sizes: list[int]) -> None:
-    taxels = made(SMALL, 20, seed)
-    found, losses = read(SMALL, stream(SMALL.encode(Samples((taxels,)))), sizes)
-    assert rows_of(found) == [row.tobytes() for row in taxels[:-1]]
+    taxels = random_taxels(SMALL, 20, seed)
+    batches, losses = read(SMALL, stream(SMALL.encode(Samples((taxels,)))), sizes)
+    assert rows_of(batches) == [row.tobytes() for row in taxels[:-1]]
     assert [loss.cause for loss in losses] == ["unconfirmed"]
 
 
 def test_the_vendor_reads_the_same_values() -> None:
     sensor = FlexiTac()
-    taxels = made(sensor, 40, 1)
+    taxels = random_taxels(sensor, 40, 1)
     client = flexitac.FlexiTacSensor("nowhere", baseline=0.0)
-    client._serial = FakeSerial(stream(sensor.encode(Samples((taxels,)))), most=386)
+    client._serial = FakeSerial(stream(sensor.encode(Samples((taxels,)))), read_limit=386)
     frames = [client.read() for _ in range(40)]
     assert np.array_equal(np.stack([frame.raw.ravel() for frame in frames]), taxels)
 
 
 def test_a_mark_among_the_taxels_misleads_the_vendor_and_not_us() -> None:
-    taxels = made(SMALL, 20, 2)
+    taxels = random_taxels(SMALL, 20, 2)
     taxels[:, 3:5] = 0xAA, 0x55
     data = stream(SMALL.encode(Samples((taxels,))))[3:]  # recording began within a frame
     client = flexitac.FlexiTacSensor("nowhere", rows=4, cols=5, baseline=0.0)
-    client._serial = FakeSerial(data, most=22)
+    client._serial = FakeSerial(data, read_limit=22)
 
     assert not np.array_equal(client.read().raw.ravel(), taxels[0])
-    found, _ = read(SMALL, data)
-    assert rows_of(found) == [row.tobytes() for row in taxels[1:-1]] or not found  # nothing, rather than what is wrong
+    batches, _ = read(SMALL, data)
+    # Nothing is better than wrong taxels.
+    assert rows_of(batches) == [row.tobytes() for row in taxels[1:-1]] or not batches
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), at=st.integers(3, 15), cut=st.integers(1, 21))
 def test_after_a_cut_nothing_is_read_that_was_not_sent(seed: int, at: int, cut: int) -> None:
-    taxels = made(SMALL, 20, seed)
+    taxels = random_taxels(SMALL, 20, seed)
     frames = [bytes(frame) for frame in SMALL.encode(Samples((taxels,)))]
     frames[at] = frames[at][:-cut]
-    found, _ = read(SMALL, b"".join(frames))
-    rows, sent = rows_of(found), [row.tobytes() for row in taxels]
+    batches, _ = read(SMALL, b"".join(frames))
+    rows, sent = rows_of(batches), [row.tobytes() for row in taxels]
     assert set(rows) <= set(sent) and len(rows) >= 16
 
 
 def test_two_marks_as_far_apart_as_frames_are_make_none() -> None:
-    taxels = made(SMALL, 20, 4)
+    taxels = random_taxels(SMALL, 20, 4)
     noise = 2 * (b"\xaa\x55" + bytes(range(1, 21))) + b"boot\r\n"
-    found, losses = read(SMALL, noise + stream(SMALL.encode(Samples((taxels,)))))
-    assert rows_of(found) == [row.tobytes() for row in taxels[:-1]]
+    batches, losses = read(SMALL, noise + stream(SMALL.encode(Samples((taxels,)))))
+    assert rows_of(batches) == [row.tobytes() for row in taxels[:-1]]
     assert (losses[0].cause, losses[0].bytes) == ("start", len(noise))
 
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     sensor = FlexiTac(rows=16, columns=16)
-    taxels = made(sensor, 200, 3)
+    taxels = random_taxels(sensor, 200, 3)
     frames = sensor.encode(Samples((taxels,)))
     with (
         served(sensor.device(), lambda number: bytes(frames[number % 200])) as port,

@@ -43,7 +43,7 @@ ENCLOSED = Framing(marker=b"\x55\x66\x77\x88", tail=b"\xaa\xbb\xcc\xdd", most=20
 KINDS = {"plain": PLAIN, "summed": SUMMED, "strong": STRONG, "tailed": TAILED, "told": TOLD, "enclosed": ENCLOSED}
 
 
-def made(kind: str, count: int, seed: int) -> list[bytes]:
+def numbered_frames(kind: str, count: int, seed: int) -> list[bytes]:
     """Return frames of random content, the number of each in its first free bytes."""
     rng = np.random.default_rng(seed)
     frames = []
@@ -76,11 +76,11 @@ def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[Run
     place, step = 0, 0
     while place < len(data):
         piece = data[place : place + sizes[step % len(sizes)]]
-        found, lost = framer.feed(Chunks.of([(step, piece)]))
-        runs, losses = runs + found, losses + lost
+        new_runs, lost = framer.feed(Chunks.of([(step, piece)]))
+        runs, losses = runs + new_runs, losses + lost
         place, step = place + len(piece), step + 1
-    found, lost = framer.flush()
-    return runs + found, losses + lost
+    new_runs, lost = framer.flush()
+    return runs + new_runs, losses + lost
 
 
 def frames_of(runs: list[Run]) -> list[bytes]:
@@ -90,12 +90,12 @@ def frames_of(runs: list[Run]) -> list[bytes]:
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(1, 300), min_size=1, max_size=5))
 def test_clean_bytes_are_given_out_whole_however_they_are_cut(kind: str, seed: int, sizes: list[int]) -> None:
-    sent = made(kind, 30, seed)
+    sent = numbered_frames(kind, 30, seed)
     framer = ByteFramer(KINDS[kind])
 
     runs, losses = fed(framer, b"".join(sent), sizes)
 
-    head = int(kind == "tailed")  # where it begins is only known behind a tail
+    head = int(kind == "tailed")  # Its start is only known after a tail.
     last = KINDS[kind].confirm if KINDS[kind].check is None else 0
     assert frames_of(runs) == sent[head : len(sent) - last]
     assert framer.account.pending == 0
@@ -113,7 +113,7 @@ def test_clean_bytes_are_given_out_whole_however_they_are_cut(kind: str, seed: i
 def test_after_noise_cuts_and_bursts_no_frame_is_wrong_and_few_are_lost(
     kind: str, seed: int, sizes: list[int], faults: list[tuple[int, str, int]]
 ) -> None:
-    sent = made(kind, 100, seed)
+    sent = numbered_frames(kind, 100, seed)
     rng = np.random.default_rng(seed)
     pieces, harmed = list(sent), set()
     for row, fault, size in faults:
@@ -131,18 +131,18 @@ def test_after_noise_cuts_and_bursts_no_frame_is_wrong_and_few_are_lost(
 
     runs, losses = fed(framer, data, sizes)
 
-    found = frames_of(runs)
-    assert set(found) <= set(sent)  # nothing that was not sent
-    assert [sent.index(frame) for frame in found] == sorted(sent.index(frame) for frame in found)
+    frames = frames_of(runs)
+    assert set(frames) <= set(sent)  # nothing that was not sent
+    assert [sent.index(frame) for frame in frames] == sorted(sent.index(frame) for frame in frames)
     assert framer.account.framed + framer.account.lost == len(data) == framer.account.received
     assert sum(loss.bytes for loss in losses) == framer.account.lost
-    assert len(found) >= len(sent) - 2 - len(harmed) - 4 * len(faults)
+    assert len(frames) >= len(sent) - 2 - len(harmed) - 4 * len(faults)
 
 
 @st.composite
 def mixtures(draw: st.DrawFn, kind: str) -> bytes:
     """Draw a stream of frames in which anything stands between them, whole frames, parts of frames and marks included."""
-    sent = made(kind, 30, draw(st.integers(0, 1000)))
+    sent = numbered_frames(kind, 30, draw(st.integers(0, 1000)))
     framing = KINDS[kind]
     parts = st.tuples(st.integers(0, 29), st.integers(0, 60), st.integers(0, 60))
     between = (
@@ -167,13 +167,13 @@ def test_after_every_piece_each_byte_is_framed_lost_or_pending_and_frames_stand_
     framer = ByteFramer(framing)
     runs: list[Run] = []
     losses: list[Loss] = []
-    ends: list[int] = []  # of each piece, whose number is the time at which it came
+    ends: list[int] = []  # End of each piece, whose number is its arrival time.
     for step in range(len(stream) + 1):
         start = ends[-1] if ends else 0
         piece = stream[start : start + sizes[step % len(sizes)]]
         ends.append(start + len(piece))
-        found, lost = framer.feed(Chunks.of([(step, piece)])) if piece else framer.flush()
-        runs, losses = runs + found, losses + lost
+        new_runs, lost = framer.feed(Chunks.of([(step, piece)])) if piece else framer.flush()
+        runs, losses = runs + new_runs, losses + lost
         assert framer.account.received == ends[-1]
         assert framer.account.framed == sum(map(len, frames_of(runs)))
         assert framer.account.lost == sum(loss.bytes for loss in losses)
@@ -197,30 +197,30 @@ def test_how_a_harmed_stream_is_cut_into_pieces_changes_no_frame(
     kind: str, data: st.DataObject, sizes: list[int]
 ) -> None:
     stream = data.draw(mixtures(kind))
-    found = [frames_of(fed(ByteFramer(KINDS[kind]), stream, pieces)[0]) for pieces in (sizes, [1], [len(stream)])]
-    assert found[0] == found[1] == found[2]
+    frame_lists = [frames_of(fed(ByteFramer(KINDS[kind]), stream, pieces)[0]) for pieces in (sizes, [1], [len(stream)])]
+    assert frame_lists[0] == frame_lists[1] == frame_lists[2]
 
 
 @given(st.lists(st.binary(max_size=20) | st.sampled_from([b"\n", b"12\n", b"\r\n", b"x\n"])), sizes_of_pieces)
 def test_lines_too_account_for_every_byte_and_are_the_same_however_they_are_cut(
     pieces: list[bytes], sizes: list[int]
 ) -> None:
-    stream, found = b"".join(pieces), []
+    stream, line_lists = b"".join(pieces), []
     for cut in (sizes, [1], [max(1, len(stream))]):
         framer = LineFramer(lambda line: line.isdigit())
         runs, losses = fed(framer, stream, cut)
         assert framer.account.pending == 0 and framer.account.received == len(stream)
         assert framer.account.lost == sum(loss.bytes for loss in losses)
-        found.append([line for run in runs for line in run.frames])
-    whole = [line.strip() for line in stream.split(b"\n")[1:-1]]
-    assert found == [[line for line in whole if line.isdigit()]] * 3
+        line_lists.append([line for run in runs for line in run.frames])
+    complete_lines = [line.strip() for line in stream.split(b"\n")[1:-1]]
+    assert line_lists == [[line for line in complete_lines if line.isdigit()]] * 3
 
 
-@given(st.lists(st.binary(max_size=20) | st.integers(0, 9).map(lambda row: made("strong", 10, 0)[row])))
+@given(st.lists(st.binary(max_size=20) | st.integers(0, 9).map(lambda row: numbered_frames("strong", 10, 0)[row])))
 def test_packets_are_frames_or_losses_one_for_one(packets: list[bytes]) -> None:
     framer = PacketFramer([16], sum16_is_right)
     runs, losses = framer.feed(Chunks.of(list(enumerate(packets))))
-    good = [number for number, packet in enumerate(packets) if packet in made("strong", 10, 0)]
+    good = [number for number, packet in enumerate(packets) if packet in numbered_frames("strong", 10, 0)]
     assert [t_ns for run in runs for t_ns in run.t_ns.tolist()] == good
     assert frames_of(runs) == [packets[number] for number in good]
     bad = [(number, len(packet)) for number, packet in enumerate(packets) if number not in good]
@@ -232,18 +232,18 @@ def test_packets_are_frames_or_losses_one_for_one(packets: list[bytes]) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_first_two_frames_after_a_disturbance_are_given_out(kind: str) -> None:
-    sent = made(kind, 40, 3)
+    sent = numbered_frames(kind, 40, 3)
     framer = ByteFramer(KINDS[kind])
 
     runs, _ = fed(framer, b"".join(sent[:20]) + b"\x17" * 77 + b"".join(sent[20:]), [11])
 
-    found = frames_of(runs)
+    frames = frames_of(runs)
     lag = int(kind == "tailed")  # its first frame begins behind bytes of which nobody knows that they end there
-    assert sent[20 + lag] in found and sent[21] in found
+    assert sent[20 + lag] in frames and sent[21] in frames
 
 
 def test_a_garbled_frame_is_told_from_noise_and_from_a_cut() -> None:
-    sent = made("strong", 30, 0)
+    sent = numbered_frames("strong", 30, 0)
     flipped = sent[10][:8] + bytes([sent[10][8] ^ 4]) + sent[10][9:]
     stream = b"".join([*sent[:10], flipped, *sent[11:15], b"\x01\x02\x03", *sent[15:20], sent[20][:9], *sent[21:]])
 
@@ -257,7 +257,7 @@ def test_a_garbled_frame_is_told_from_noise_and_from_a_cut() -> None:
 
 
 def test_a_frame_arrives_when_its_last_byte_does() -> None:
-    sent = made("strong", 3, 0)
+    sent = numbered_frames("strong", 3, 0)
     data = b"".join(sent)
 
     runs, _ = ByteFramer(STRONG).feed(
@@ -268,15 +268,15 @@ def test_a_frame_arrives_when_its_last_byte_does() -> None:
 
 
 def test_marks_in_a_payload_that_holds_still_give_nothing_until_it_moves() -> None:
-    still = [b"\xaa\x55" + bytes([number]) + b"\xaa\x55" * 15 + b"\x00" for number in range(20)]
-    moving = made("plain", 30, 0)
+    repeating = [b"\xaa\x55" + bytes([number]) + b"\xaa\x55" * 15 + b"\x00" for number in range(20)]
+    moving = numbered_frames("plain", 30, 0)
     framer = ByteFramer(PLAIN)
 
-    quiet, _ = framer.feed(Chunks.of([(0, still[0][7:] + b"".join(still[1:]))]))
+    quiet, _ = framer.feed(Chunks.of([(0, repeating[0][7:] + b"".join(repeating[1:]))]))
     runs, losses = fed(framer, b"".join(moving), [50])
 
     assert not quiet
-    assert frames_of(runs) == still[1:] + moving[:-1]
+    assert frames_of(runs) == repeating[1:] + moving[:-1]
     assert [loss.cause for loss in losses] == [framing.START, framing.UNCONFIRMED]
 
 
@@ -291,7 +291,7 @@ def test_garbage_without_end_is_thrown_away_and_not_kept() -> None:
 
 
 def test_packets_of_another_size_or_sum_are_malformed() -> None:
-    good = made("strong", 4, 0)
+    good = numbered_frames("strong", 4, 0)
     framer = PacketFramer([16], sum16_is_right)
     bad = good[1][:-1] + b"\x00"
 
@@ -313,7 +313,7 @@ def test_a_line_that_is_none_is_lost_and_the_others_stay() -> None:
 
 
 def test_a_lock_needs_as_many_frames_as_the_framing_says() -> None:
-    sent = made("plain", 3, 0)
+    sent = numbered_frames("plain", 3, 0)
     eager, careful = ByteFramer(replace(PLAIN, lock=2)), ByteFramer(replace(PLAIN, lock=4))
 
     assert frames_of(eager.feed(Chunks.of([(0, b"".join(sent))]))[0]) == sent[:2]

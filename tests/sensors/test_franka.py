@@ -27,9 +27,9 @@ def state(number: int = 1234, pose: np.ndarray | None = None, success_rate: floa
     floats = np.zeros(320, "<f4")
     floats[:16] = columns.T.ravel()
     floats[BEFORE_JOINTS : BEFORE_JOINTS + 7] = np.arange(1, 8)  # tau_J
-    floats[BEFORE_JOINTS + 21 : BEFORE_JOINTS + 28] = np.arange(11, 18)  # q, behind tau_J_d and dtau_J
-    floats[BEFORE_JOINTS + 35 : BEFORE_JOINTS + 42] = np.arange(21, 28)  # dq, behind q_d
-    outside = BEFORE_JOINTS + 56 + 26  # behind eight vectors of joints, and contacts and collisions
+    floats[BEFORE_JOINTS + 21 : BEFORE_JOINTS + 28] = np.arange(11, 18)  # q, after tau_J_d and dtau_J
+    floats[BEFORE_JOINTS + 35 : BEFORE_JOINTS + 42] = np.arange(21, 28)  # dq, after q_d
+    outside = BEFORE_JOINTS + 56 + 26  # External torques, after eight vectors of joints, contacts and collisions.
     floats[outside : outside + 7] = np.arange(31, 38)
     floats[outside + 7 : outside + 13] = np.arange(41, 47)  # O_F_ext
     errors, last_errors = bytearray(41), bytearray(41)
@@ -52,9 +52,9 @@ def test_a_state_by_hand_gives_its_numbers() -> None:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turned.as_matrix(), (0.4, -0.1, 0.5)
 
-    found = sensor.decode(frames(state(pose=pose)))
+    samples = sensor.decode(frames(state(pose=pose)))
 
-    columns = np.hstack([block.astype(object) for block in found.values])[0]
+    columns = np.hstack([block.astype(object) for block in samples.values])[0]
     row = dict(zip((field.name for field in sensor.fields()), columns, strict=True))
     assert [row[f"position_{axis}_m"] for axis in "xyz"] == pytest.approx([0.4, -0.1, 0.5], abs=1e-7)
     assert [row[f"orientation_{part}"] for part in "xyzw"] == pytest.approx(turned.as_quat().tolist(), abs=1e-6)
@@ -149,17 +149,17 @@ def test_what_is_encoded_is_decoded_to_the_width_of_a_float32(seed: int, rows: i
     sensor = Franka()
 
     encoded = sensor.encode(Samples(values, seq=seq, t_device_ns=seq * 1_000_000))
-    found = sensor.decode(encoded)
+    decoded = sensor.decode(encoded)
 
     assert not sensor.framer().feed(Chunks.of([(row, frame.tobytes()) for row, frame in enumerate(encoded)]))[1]
     np.testing.assert_array_equal(
-        np.delete(found.values[0], range(3, 7), axis=1), np.delete(values[0], range(3, 7), axis=1)
+        np.delete(decoded.values[0], range(3, 7), axis=1), np.delete(values[0], range(3, 7), axis=1)
     )
-    np.testing.assert_allclose(np.abs((found.values[0][:, 3:7] * turned).sum(axis=1)), 1, atol=1e-6)
-    for block, expected in zip(found.values[1:], values[1:], strict=True):
+    np.testing.assert_allclose(np.abs((decoded.values[0][:, 3:7] * turned).sum(axis=1)), 1, atol=1e-6)
+    for block, expected in zip(decoded.values[1:], values[1:], strict=True):
         np.testing.assert_array_equal(block, expected)
         assert block.dtype == expected.dtype
-    np.testing.assert_array_equal(found.seq, seq)
+    np.testing.assert_array_equal(decoded.seq, seq)
 
 
 def test_another_rate_than_the_arms_is_refused() -> None:

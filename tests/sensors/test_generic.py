@@ -1,4 +1,4 @@
-"""A board that only the rig file describes is read as it should be, and a wrong description is told in a sentence."""
+"""A board that only the rig file describes is read correctly, and a wrong description is reported in a sentence."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.generic import Generic
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import held, read, rows_of, stream, streams, values
+from tests.sensors.serial_lab import hold_dialogue, read, rows_of, stream, streams, values
 
 BOARD = """
 [[stream]]
@@ -43,7 +43,7 @@ sequence = { number = "count", modulus = 1000 }
 clock = { number = "micros", unit = "us" }
 sum = { kind = "sum8", number = "check", begin = 2 }
 """
-DAQ = {  # of OptoForce, three axes
+DAQ = {  # An OptoForce frame, three axes.
     "rate_hz": 1000,
     "marker": "AA 07 08 0A",
     "order": "big",
@@ -60,9 +60,9 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f3
 
 
 def board(**options: Any) -> Generic:
-    made = rig.build_sensor("generic", {"rate_hz": 100, "marker": "AA", **options}, "rig")
-    assert isinstance(made, Generic)
-    return made
+    sensor = rig.build_sensor("generic", {"rate_hz": 100, "marker": "AA", **options}, "rig")
+    assert isinstance(sensor, Generic)
+    return sensor
 
 
 def by_hand(count: int, micros: int, taxels: list[int], load: float) -> bytes:
@@ -73,13 +73,13 @@ def by_hand(count: int, micros: int, taxels: list[int], load: float) -> bytes:
 def test_a_board_of_a_rig_file_is_read() -> None:
     sensor = rig.parse(BOARD).streams["skin"].sensor
     sent = by_hand(998, 5_000_000, [1, -2, 3, -4, 5, -32768], 0.5) + by_hand(999, 5_002_000, [0] * 6, -1.5)
-    found, losses = read(sensor, sent + by_hand(0, 5_004_000, [0] * 6, 0), (11,))
+    batches, losses = read(sensor, sent + by_hand(0, 5_004_000, [0] * 6, 0), (11,))
 
-    taxels, load = values(found)
+    taxels, load = values(batches)
     assert taxels[:2].tolist() == [[1, -2, 3, -4, 5, -32768], [0] * 6] and load[:2, 0].tolist() == [0.5, -1.5]
     assert not losses and sensor.counter == 1000
-    assert [int(n) for each in found for n in each.seq] == [998, 999, 0]  # type: ignore[union-attr]
-    assert [int(t) for each in found for t in each.t_device_ns] == [5_000_000_000, 5_002_000_000, 5_004_000_000]  # type: ignore[union-attr]
+    assert [int(n) for batch in batches for n in batch.seq] == [998, 999, 0]  # type: ignore[union-attr]
+    assert [int(t) for batch in batches for t in batch.t_device_ns] == [5_000_000_000, 5_002_000_000, 5_004_000_000]  # type: ignore[union-attr]
     fields = sensor.fields()
     assert [field.name for field in fields] == [f"taxel0{n}_{axis}" for n in (1, 2) for axis in "xyz"] + ["load"]
     assert [str(field.type) for field in fields] == ["int16"] * 6 + ["float"]
@@ -130,19 +130,30 @@ NUMBERS = st.lists(
     order=st.sampled_from(["little", "big"]),
     kind=st.sampled_from([None, *layout.SUMS]),
     tail=st.sampled_from(["", "0D 0A"]),
-    told=st.booleans(),
+    has_length=st.booleans(),
     seed=st.integers(0, 1000),
 )
 def test_decode_undoes_encode_whatever_is_described(
-    numbers: list[tuple[str, int, str, str | None]], order: str, kind: str | None, tail: str, told: bool, seed: int
+    numbers: list[tuple[str, int, str, str | None]],
+    order: str,
+    kind: str | None,
+    tail: str,
+    has_length: bool,
+    seed: int,
 ) -> None:
     tables: list[dict[str, Any]] = [{"name": "n", "type": "u8"}, {"name": "ticks", "type": "u32"}]
-    for number, (type_, count, axes, own) in enumerate(numbers):
+    for number, (type_, count, axes, column_order) in enumerate(numbers):
         tables.append(
-            {"name": f"c{number}_", "type": type_, "count": count, "axes": axes, **({"order": own} if own else {})}
+            {
+                "name": f"c{number}_",
+                "type": type_,
+                "count": count,
+                "axes": axes,
+                **({"order": column_order} if column_order else {}),
+            }
         )
     options: dict[str, Any] = {"sequence": {"number": "n"}, "clock": {"number": "ticks", "unit": "ms"}}
-    if told:
+    if has_length:
         tables.insert(0, {"name": "size", "type": "u16"})
         options["length"] = {"number": "size", "plus": 3}
     if kind:
@@ -155,23 +166,23 @@ def test_decode_undoes_encode_whatever_is_described(
         if not blocks or blocks[-1][0] != field.type:
             blocks.append([field.type, 0])
         blocks[-1][1] += 1
-    made = []
+    values_by_block = []
     for type_of, width in blocks:
         dtype = np.dtype(type_of.to_pandas_dtype())
         limits = (-100, 100) if dtype.kind in "if" else (0, 100)
-        made.append(rng.integers(*limits, (5, width)).astype(dtype))
-    samples = Samples(tuple(made), seq=np.arange(254, 259) % 256, t_device_ns=np.arange(5) * 1_000_000)
+        values_by_block.append(rng.integers(*limits, (5, width)).astype(dtype))
+    samples = Samples(tuple(values_by_block), seq=np.arange(254, 259) % 256, t_device_ns=np.arange(5) * 1_000_000)
 
     frames = sensor.encode(samples)
-    again = sensor.decode(frames)
+    decoded = sensor.decode(frames)
 
     assert frames.shape == (5, sensor.size)
     assert all(
         np.array_equal(ours, theirs) and ours.dtype == theirs.dtype
-        for ours, theirs in zip(again.values, made, strict=True)
+        for ours, theirs in zip(decoded.values, values_by_block, strict=True)
     )
-    assert again.seq is not None and again.seq.tolist() == [254, 255, 0, 1, 2]
-    assert again.t_device_ns is not None and again.t_device_ns.tolist() == (np.arange(5) * 1_000_000).tolist()
+    assert decoded.seq is not None and decoded.seq.tolist() == [254, 255, 0, 1, 2]
+    assert decoded.t_device_ns is not None and decoded.t_device_ns.tolist() == (np.arange(5) * 1_000_000).tolist()
     assume(kind is not None and layout.SUMS[kind][1] > 1)
     assert rows_of(read(sensor, frames.tobytes())[0]) == rows_of([samples])
 
@@ -192,20 +203,20 @@ def test_frames_of_another_size_hold_no_sample_and_disturb_nothing() -> None:
         return body + zlib.crc32(body).to_bytes(4, "little")
 
     frames = [sent(b"abcd"), sent(b"a longer message"), sent(b"efgh"), sent(b"."), sent(b"ijkl")]
-    found, losses = read(sensor, b"".join(frames), (9,))
-    assert rows_of(found) == [b"abcd", b"efgh", b"ijkl"] and not losses
+    batches, losses = read(sensor, b"".join(frames), (9,))
+    assert rows_of(batches) == [b"abcd", b"efgh", b"ijkl"] and not losses
 
 
 def test_marks_in_a_payload_that_holds_still_give_nothing_until_it_moves_though_a_constant_stands_behind_them() -> None:
     sensor = board(
         marker="AA 55", numbers=[{"name": "id", "type": "u8", "equals": 3}, {"name": "v", "type": "u8", "count": 7}]
     )
-    still = bytes.fromhex("AA 55 03 09 08 AA 55 03 01 02")
+    repeating = bytes.fromhex("AA 55 03 09 08 AA 55 03 01 02")
     moving = [bytes.fromhex("AA 55 03") + bytes([number]) * 7 for number in range(10)]
     framer = sensor.framer()
-    assert framer.feed(Chunks.of([(0, still[5:] + 20 * still)])) == ([], [])
+    assert framer.feed(Chunks.of([(0, repeating[5:] + 20 * repeating)])) == ([], [])
     runs, _ = framer.feed(Chunks.of([(1, b"".join(moving))]))
-    assert stream(frame for run in runs for frame in run.frames) == 20 * still + b"".join(moving[:-1])
+    assert stream(frame for run in runs for frame in run.frames) == 20 * repeating + b"".join(moving[:-1])
 
 
 def test_each_packet_is_a_frame_where_the_link_has_packets() -> None:
@@ -221,12 +232,12 @@ def test_a_board_is_started_and_stopped_where_the_file_says_how() -> None:
     sensor = board(numbers=[{"name": "v", "type": "u16"}], start="67 6F 0A", stop="0A 6F 67")
     device = sensor.device()
     assert not streams(device)
-    assert held(sensor.opening({}), device) == [b"go\n"] and streams(device)
+    assert hold_dialogue(sensor.opening({}), device) == [b"go\n"] and streams(device)
     device.hear(sensor.closing()[:2])
     device.hear(sensor.closing()[2:])
     assert not streams(device)
     silent = board(numbers=[{"name": "v", "type": "u16"}])
-    assert not held(silent.opening({}), silent.device()) and streams(silent.device()) and not silent.closing()
+    assert not hold_dialogue(silent.opening({}), silent.device()) and streams(silent.device()) and not silent.closing()
 
 
 V = {"name": "v", "type": "u16"}

@@ -39,17 +39,19 @@ def timed(sent: list[list[bytes]], period_ns: int = 20 * MS) -> list[tuple[int, 
     ]
 
 
-def found(chunks: list[tuple[int, bytes]], at_once: int, sensor: IcubSkin = PATCH) -> tuple[list[bytes], list[Loss]]:
+def feed_in_batches(
+    chunks: list[tuple[int, bytes]], at_once: int, sensor: IcubSkin = PATCH
+) -> tuple[list[bytes], list[Loss]]:
     framer = sensor.framer()
     runs: list[Run] = []
     losses: list[Loss] = []
     for start in range(0, len(chunks), at_once):
-        more, lost = framer.feed(Chunks.of(chunks[start : start + at_once]))
-        runs, losses = runs + more, losses + lost
-    more, lost = framer.flush()
+        new_runs, lost = framer.feed(Chunks.of(chunks[start : start + at_once]))
+        runs, losses = runs + new_runs, losses + lost
+    new_runs, lost = framer.flush()
     assert framer.account.pending == 0
     assert sum(loss.bytes for loss in losses + lost) == framer.account.lost
-    return [bytes(frame) for run in runs + more for frame in run.frames], losses + lost
+    return [bytes(frame) for run in runs + new_runs for frame in run.frames], losses + lost
 
 
 def test_a_scan_by_hand_is_decoded() -> None:
@@ -93,7 +95,7 @@ def test_scans_are_whole_however_they_are_cut(at_once: int, first: int) -> None:
     sent = scans(10)
     chunks = timed(sent)[first:]
 
-    frames, losses = found(chunks, at_once)
+    frames, losses = feed_in_batches(chunks, at_once)
 
     assert frames == [b"".join(scan) for scan in sent[first > 0 :]]
     assert {loss.cause for loss in losses} <= {"start"} and sum(loss.bytes for loss in losses) == CAN * (
@@ -103,16 +105,16 @@ def test_scans_are_whole_however_they_are_cut(at_once: int, first: int) -> None:
 
 @given(
     lost=st.sets(st.integers(0, 12 * 6 - 1), max_size=20),
-    twice=st.sets(st.integers(0, 12 * 6 - 1), max_size=4),
+    doubled=st.sets(st.integers(0, 12 * 6 - 1), max_size=4),
     at_once=st.integers(1, 40),
 )
-def test_torn_scans_are_lost_and_never_mixed(lost: set[int], twice: set[int], at_once: int) -> None:
+def test_torn_scans_are_lost_and_never_mixed(lost: set[int], doubled: set[int], at_once: int) -> None:
     sent = scans(12)
-    chunks = [entry for row, entry in enumerate(timed(sent)) if row not in lost for _ in range(1 + (row in twice))]
+    chunks = [entry for row, entry in enumerate(timed(sent)) if row not in lost for _ in range(1 + (row in doubled))]
 
-    frames, losses = found(chunks, at_once)
+    frames, losses = feed_in_batches(chunks, at_once)
 
-    harmed = {row // 6 for row in lost | twice}
+    harmed = {row // 6 for row in lost | doubled}
     untouched = [b"".join(scan) for row, scan in enumerate(sent) if row not in harmed]
     assert set(frames) <= {b"".join(scan) for scan in sent}
     assert [frame for frame in frames if frame in untouched] == untouched
@@ -122,9 +124,9 @@ def test_torn_scans_are_lost_and_never_mixed(lost: set[int], twice: set[int], at
 def test_a_loss_as_long_as_a_scan_does_not_join_two_halves() -> None:
     sent = scans(4)
     flat = timed(sent)
-    chunks = flat[:8] + flat[14:]  # from the second scan's third CAN frame to the third scan's second
+    chunks = flat[:8] + flat[14:]  # The gap runs from the second scan's third CAN frame to the third scan's second.
 
-    frames, losses = found(chunks, 100)
+    frames, losses = feed_in_batches(chunks, 100)
 
     assert frames == [b"".join(sent[0]), b"".join(sent[3])]
     assert [(loss.cause, loss.bytes) for loss in losses] == [("torn", 6 * CAN)]
@@ -134,18 +136,18 @@ def test_a_loss_as_long_as_a_scan_does_not_join_two_halves() -> None:
 def test_each_torn_scan_counts_once(at_once: int) -> None:
     sent = scans(6)
     flat = timed(sent)
-    chunks = [entry for row, entry in enumerate(flat) if row not in (8, 20, 21)]  # of scans 1 and 3
+    chunks = [entry for row, entry in enumerate(flat) if row not in (8, 20, 21)]  # Arrival times of scans 1 and 3.
 
-    _, losses = found(chunks, at_once)
+    _, losses = feed_in_batches(chunks, at_once)
 
     assert sum(loss.frames for loss in losses) == 2
 
 
 def test_other_boards_on_the_bus_are_left_out_and_do_not_tear() -> None:
-    sent, other = scans(4), timed(scans(4, IcubSkin(board=10, triangles=(0, 1, 5))))
-    chunks = sorted(timed(sent) + other + [(5, can_frame(0x209, b"\x07\x00"))], key=lambda entry: entry[0])
+    sent, other_boards = scans(4), timed(scans(4, IcubSkin(board=10, triangles=(0, 1, 5))))
+    chunks = sorted(timed(sent) + other_boards + [(5, can_frame(0x209, b"\x07\x00"))], key=lambda entry: entry[0])
 
-    frames, losses = found(chunks, 7)
+    frames, losses = feed_in_batches(chunks, 7)
 
     assert frames == [b"".join(scan) for scan in sent] and losses == []
 
@@ -158,14 +160,14 @@ def test_other_boards_on_the_bus_are_left_out_and_do_not_tear() -> None:
 def test_a_can_frame_that_is_none_of_a_scan_tears_it(harmed: bytes) -> None:
     chunks = timed([SCAN, [*SCAN[:2], harmed, *SCAN[3:]], SCAN])
 
-    frames, losses = found(chunks, 100)
+    frames, losses = feed_in_batches(chunks, 100)
 
     assert frames == [b"".join(SCAN)] * 2
     assert {loss.cause for loss in losses} == {"malformed", "torn"}
 
 
 def test_several_can_frames_of_one_adapter_s_packet_are_taken_one_by_one() -> None:
-    frames, losses = found([(0, b"".join(SCAN)), (20 * MS, b"".join(SCAN))], 1)
+    frames, losses = feed_in_batches([(0, b"".join(SCAN)), (20 * MS, b"".join(SCAN))], 1)
     assert frames == [b"".join(SCAN)] * 2 and losses == []
 
 
@@ -173,9 +175,9 @@ def test_the_board_is_told_what_the_published_driver_tells_it() -> None:
     sensor = IcubSkin(board=9)
     device = sensor.device()
 
-    written = described.hold(sensor.opening({}), device)
+    messages = described.hold(sensor.opening({}), device)
 
-    assert written == [
+    assert messages == [
         can_frame(0x209, bytes.fromhex("4D 00 14 F0")),  # type 0, 20 ms, no load 240
         can_frame(0x209, bytes.fromhex("50 00 0F 02 01 00 22")),  # triangles 0 to 15, shift 2, on, offset 0x2200
         can_frame(0x209, bytes.fromhex("07 00")),
@@ -189,9 +191,9 @@ def test_a_board_of_the_older_configuration_streams_once_it_is_configured() -> N
     sensor = IcubSkin(board=9, old=True)
     device = sensor.device()
 
-    written = described.hold(sensor.opening({}), device)
+    messages = described.hold(sensor.opening({}), device)
 
-    assert written == [
+    assert messages == [
         can_frame(0x209, bytes.fromhex("4C 01 01 01 00 22 00 00")),
         can_frame(0x209, bytes.fromhex("4E 02 22 F0 00 FF FF 0A")),
     ]

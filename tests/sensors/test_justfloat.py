@@ -14,7 +14,7 @@ from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.sensors.justfloat import JustFloat
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import held, read, rows_of, stream, streams
+from tests.sensors.serial_lab import hold_dialogue, read, rows_of, stream, streams
 
 FLOATS = arrays.arrays(
     np.float32,
@@ -46,8 +46,8 @@ def test_what_was_encoded_is_read_but_for_the_first_of_which_nobody_knows_the_be
     seed: int, sizes: list[int]
 ) -> None:
     floats = np.random.default_rng(seed).normal(0, 10, (20, 3)).astype(np.float32)
-    found, losses = read(ANY, stream(ANY.encode(Samples((floats,)))), sizes)
-    assert rows_of(found) == [row.tobytes() for row in floats[1:]]
+    batches, losses = read(ANY, stream(ANY.encode(Samples((floats,)))), sizes)
+    assert rows_of(batches) == [row.tobytes() for row in floats[1:]]
     assert [loss.cause for loss in losses] == ["start"]
 
 
@@ -57,16 +57,16 @@ def test_after_a_cut_no_number_is_read_that_was_not_sent(seed: int, at: int, cut
     floats = np.random.default_rng(seed).normal(0, 10, (20, 3)).astype(np.float32)
     frames = [bytes(frame) for frame in ANY.encode(Samples((floats,)))]
     frames[at] = frames[at][:-cut]
-    found, _ = read(ANY, b"".join(frames))
-    rows = rows_of(found)
+    batches, _ = read(ANY, b"".join(frames))
+    rows = rows_of(batches)
     assert set(rows) <= {row.tobytes() for row in floats} and len(rows) >= 14
 
 
 def test_a_frame_that_is_not_finite_is_lost() -> None:
     floats = np.random.default_rng(0).normal(0, 10, (20, 3)).astype(np.float32)
     floats[9, 1] = np.nan
-    found, losses = read(ANY, stream(ANY.encode(Samples((floats,)))))
-    assert len(rows_of(found)) == 18 and losses[-1].cause == "garbled"
+    batches, losses = read(ANY, stream(ANY.encode(Samples((floats,)))))
+    assert len(rows_of(batches)) == 18 and losses[-1].cause == "garbled"
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_fulai_is_switched_on_and_off_and_tells_what_it_is() -> None:
     sensor = JustFloat(model="fulai-3.1")
     device = sensor.device()
     assert not streams(device)
-    assert held(sensor.opening({}), device) == [b"vofa on\r\n"]
+    assert hold_dialogue(sensor.opening({}), device) == [b"vofa on\r\n"]
     assert streams(device)
     (reply,) = device.hear(b"bridge in") + device.hear(b"fo get\r\n")
     assert reply.startswith(b"OK BRIDGE MODEL=") and b" HW=V3.1 " in reply and reply.endswith(b"\r\n")
@@ -96,7 +96,7 @@ def test_a_fulai_is_switched_on_and_off_and_tells_what_it_is() -> None:
 
 
 def test_any_other_board_is_told_nothing() -> None:
-    assert not held(ANY.opening({}), ANY.device()) and not ANY.closing() and streams(ANY.device())
+    assert not hold_dialogue(ANY.opening({}), ANY.device()) and not ANY.closing() and streams(ANY.device())
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ TEXT = (
 EVERY = ("RIst", "RSol", "AIPos", "ASPos", "MACur", "Delay.D", "Tech.C11", "DiL")
 
 
-def made(rows: int, seed: int) -> Samples:
+def random_samples(rows: int, seed: int) -> Samples:
     """Return samples of `EVERY` output, numbers that four digits hold in mm and degrees."""
     rng = np.random.default_rng(seed)
     blocks = []
@@ -44,16 +44,16 @@ def made(rows: int, seed: int) -> Samples:
 def test_a_controllers_text_is_read_in_metres_and_rad() -> None:
     sensor = KukaRsi(outputs=("RIst", "AIPos", "Delay.D", "Tech.C11", "DiL", "Ok"))
 
-    found = sensor.decode([TEXT % 4208163634])
+    samples = sensor.decode([TEXT % 4208163634])
 
     turned = Rotation.from_euler("ZYX", [30.0, -20.0, 170.0], degrees=True).as_quat()
-    pose = found.values[0][0]
+    pose = samples.values[0][0]
     assert pose[:3].tolist() == pytest.approx([1.6200008, -0.0105, 1.91])
     assert abs(pose[3:] @ turned) == pytest.approx(1)
-    np.testing.assert_allclose(np.degrees(found.values[1][0]), [0, -90, 90, 45, 180, -1])
-    assert [block[0, 0] for block in found.values[2:]] == [2, 1.5, 7, 1]
-    assert found.seq is not None and found.t_device_ns is not None
-    assert (found.seq.tolist(), found.t_device_ns.tolist()) == ([4208163634], [4208163634 * 1_000_000])
+    np.testing.assert_allclose(np.degrees(samples.values[1][0]), [0, -90, 90, 45, 180, -1])
+    assert [block[0, 0] for block in samples.values[2:]] == [2, 1.5, 7, 1]
+    assert samples.seq is not None and samples.t_device_ns is not None
+    assert (samples.seq.tolist(), samples.t_device_ns.tolist()) == ([4208163634], [4208163634 * 1_000_000])
     names = [field.name for field in sensor.fields()]
     assert (names[0], names[7], names[13:]) == ("position_x_m", "joint1_rad", ["delay_d", "tech_c11", "dil", "ok"])
 
@@ -131,13 +131,13 @@ def test_rsipis_server_takes_our_answers_and_we_read_its_texts(rsipi: Any) -> No
     server.state["RIst"]["X"], server.state["AIPos"]["A3"] = 1234.5, 45.0
     reading = Reading(sensor)
 
-    taken = []
+    accepted = []
     for number in range(20):
         server.send_once()
-        taken.append(server.process_reply(sensor.answer(sent[-1]).decode()))
+        accepted.append(server.process_reply(sensor.answer(sent[-1]).decode()))
         batch = reading.feed(Chunks.of([(4_000_000 * number, sent[-1])]))
 
-    assert taken == [True] * 20
+    assert accepted == [True] * 20
     assert server.faulty_packets == 0
     assert reading.lost == reading.account.lost == 0
     assert batch.values[0][0, 0] == pytest.approx(1.2345)
@@ -146,36 +146,38 @@ def test_rsipis_server_takes_our_answers_and_we_read_its_texts(rsipi: Any) -> No
 
 def test_rsipis_parser_reads_what_we_encode() -> None:
     xml_handler = pytest.importorskip("RSIPI.xml_handler", reason="rsipi is not installed")
-    sensor, samples = KukaRsi(outputs=EVERY), made(5, 0)
+    sensor, samples = KukaRsi(outputs=EVERY), random_samples(5, 0)
     blank: dict[str, Any] = {name: dict.fromkeys("XYZABC", 0.0) for name in ("RIst", "RSol")}
     blank |= {name: {f"A{axis}": 0.0 for axis in range(1, 7)} for name in ("AIPos", "ASPos", "MACur")}
     blank |= {"Delay": {"D": 0.0}, "Tech": {"C11": 0.0}, "DiL": "", "IPOC": 0}
 
     for row, frame in enumerate(sensor.encode(samples)):
-        told: dict[str, Any] = {
+        parsed: dict[str, Any] = {
             name: dict(value) if isinstance(value, dict) else value for name, value in blank.items()
         }
-        xml_handler.FastXMLParser(blank).parse(frame.decode(), told)
+        xml_handler.FastXMLParser(blank).parse(frame.decode(), parsed)
 
-        assert told["IPOC"] == samples.seq[row]  # type: ignore[index]
-        np.testing.assert_allclose([told["RIst"][axis] for axis in "XYZ"], samples.values[0][row, :3] * 1000, atol=1e-4)
+        assert parsed["IPOC"] == samples.seq[row]  # type: ignore[index]
+        np.testing.assert_allclose(
+            [parsed["RIst"][axis] for axis in "XYZ"], samples.values[0][row, :3] * 1000, atol=1e-4
+        )
         angles = Rotation.from_quat(samples.values[0][row, 3:]).as_euler("ZYX", degrees=True)
-        np.testing.assert_allclose([told["RIst"][axis] for axis in "ABC"], angles, atol=1e-3)
-        np.testing.assert_allclose(list(told["AIPos"].values()), np.degrees(samples.values[2][row]), atol=1e-4)
-        assert float(told["DiL"]) == pytest.approx(samples.values[7][row, 0], abs=1e-4)
+        np.testing.assert_allclose([parsed["RIst"][axis] for axis in "ABC"], angles, atol=1e-3)
+        np.testing.assert_allclose(list(parsed["AIPos"].values()), np.degrees(samples.values[2][row]), atol=1e-4)
+        assert float(parsed["DiL"]) == pytest.approx(samples.values[7][row, 0], abs=1e-4)
 
 
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 8))
 def test_what_is_encoded_is_decoded_to_the_four_digits_of_a_controller(seed: int, rows: int) -> None:
-    sensor, samples = KukaRsi(outputs=EVERY), made(rows, seed)
+    sensor, samples = KukaRsi(outputs=EVERY), random_samples(rows, seed)
 
     frames = sensor.encode(samples)
-    found = sensor.decode(frames)
+    decoded = sensor.decode(frames)
 
     assert not sensor.framer().feed(Chunks.of(list(enumerate(frames))))[1]
-    np.testing.assert_array_equal(found.seq, samples.seq)
-    for name, block, expected in zip(EVERY, found.values, samples.values, strict=True):
+    np.testing.assert_array_equal(decoded.seq, samples.seq)
+    for name, block, expected in zip(EVERY, decoded.values, samples.values, strict=True):
         if name in ("RIst", "RSol"):
             np.testing.assert_allclose(block[:, :3], expected[:, :3], atol=1e-7)
             np.testing.assert_allclose(np.abs((block[:, 3:] * expected[:, 3:]).sum(axis=1)), 1, atol=1e-9)

@@ -30,9 +30,9 @@ ARDUINO = """count,millis,taxel1,taxel2,tilt
 
 
 def lines(**options: Any) -> Lines:
-    made = rig.build_sensor("lines", {"rate_hz": 100, **options}, "test")
-    assert isinstance(made, Lines)
-    return made
+    sensor = rig.build_sensor("lines", {"rate_hz": 100, **options}, "test")
+    assert isinstance(sensor, Lines)
+    return sensor
 
 
 def given_out(sensor: Lines, text: str) -> list[list[Any]]:
@@ -63,13 +63,13 @@ def test_a_boards_lines_by_hand_are_its_samples_with_counter_and_clock() -> None
         sequence={"column": "count"},
         clock={"column": "millis", "unit": "ms"},
     )
-    found = sensor.decode([line.encode() for line in ARDUINO.split("\n")[1:-1]])
-    assert [block.tolist() for block in found.values] == [
+    samples = sensor.decode([line.encode() for line in ARDUINO.split("\n")[1:-1]])
+    assert [block.tolist() for block in samples.values] == [
         [[12, 4095], [13, 4094], [14, 4093]],
         [[-1.5], [-1.25], [1e-3]],
     ]
-    assert found.seq is not None and found.seq.tolist() == [0, 1, 2]
-    assert found.t_device_ns is not None and found.t_device_ns.tolist() == [10**9, 1010 * 10**6, 1020 * 10**6]
+    assert samples.seq is not None and samples.seq.tolist() == [0, 1, 2]
+    assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [10**9, 1010 * 10**6, 1020 * 10**6]
     assert (sensor.counter, sensor.device_wrap_ns) == (256, (1 << 32) * 10**6)
     fields = {field.name: field.metadata for field in sensor.fields()}
     assert fields["taxel02"] == {b"unit": b"count", b"quantity": b"tactile", b"taxel": b"2"}
@@ -159,7 +159,7 @@ def test_labels_stand_before_their_numbers() -> None:
 def test_the_sum_of_a_published_nmea_sentence_is_right_and_a_flipped_digit_is_seen() -> None:
     columns = [{"name": f"c{place}", "skip": place not in (1, 3)} for place in range(1, 7)]
     sensor = lines(columns=columns, prefix="$GPGLL,", sum={"kind": "xor8", "begin": "$"})
-    sentence = "$GPGLL,5057.970,N,00146.110,E,142451,A*27\n"  # of the description of NMEA 0183
+    sentence = "$GPGLL,5057.970,N,00146.110,E,142451,A*27\n"  # Example from the description of NMEA 0183.
     assert given_out(sensor, sentence) == [[np.float32(5057.970), np.float32(146.110)]]
     assert given_out(sensor, sentence.replace("5057", "5056")) == []
 
@@ -199,17 +199,17 @@ def test_lines_read_together_are_what_each_is_by_itself(rows: list[list[str]], s
     )
     texts = [separator.join(words).strip().encode() for words in rows]
     singly = [sensor.decode([text]) for text in texts if sensor._is_frame(text)]
-    text = b"x\n" + b"".join(one + b"\n" for one in texts)
+    text = b"x\n" + b"".join(line + b"\n" for line in texts)
 
     runs, losses = sensor.framer().feed(Chunks.of([(0, text)]))
 
-    together = [sensor.decode(run.frames) for run in runs]
-    assert [len(one) for one in together] == ([sum(map(len, singly))] if singly else [])
-    expected = [np.concatenate(blocks) for blocks in zip(*(one.values for one in singly), strict=True)]
+    joint_batches = [sensor.decode(run.frames) for run in runs]
+    assert [len(batch) for batch in joint_batches] == ([sum(map(len, singly))] if singly else [])
+    expected = [np.concatenate(blocks) for blocks in zip(*(batch.values for batch in singly), strict=True)]
     assert all(
-        np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-        for found in together
-        for one, other in zip(found.values, expected, strict=True)
+        np.array_equal(block, expected_block, equal_nan=block.dtype.kind == "f")
+        for batch in joint_batches
+        for block, expected_block in zip(batch.values, expected, strict=True)
     )
     assert len(losses) == 1 + len(texts) - len(singly)
 
@@ -288,17 +288,17 @@ def test_a_guess_finds_the_options_that_wrote_the_lines(board: str) -> None:
     encoded = sensor.encode(Samples(values, seq=count, t_device_ns=count * 10**7))
     data = Chunks.of([(int(row) * 10**7, line + b"\r\n") for row, line in zip(count, encoded, strict=True)])
 
-    (found,) = lines_guess.of(data)
+    (guessed,) = lines_guess.of(data)
 
-    assert found == options | {"columns": [{"type": "f32", **column} for column in options["columns"]]}
-    assert lines(**found) == sensor
+    assert guessed == options | {"columns": [{"type": "f32", **column} for column in options["columns"]]}
+    assert lines(**guessed) == sensor
 
 
 def test_a_header_that_the_board_prints_names_the_columns() -> None:
     text = "boot\n# n, Fx (N), fy\n" + "".join(f"{row},{row / 7:.3f},{row / 3:.2f}\n" for row in range(40))
-    (found,) = lines_guess.of(Chunks.of([(row, part.encode() + b"\n") for row, part in enumerate(text.split("\n"))]))
-    assert [column["name"] for column in found["columns"]] == ["n", "fx_n", "fy"]
-    assert found["comments"] == ["#"]
+    (guessed,) = lines_guess.of(Chunks.of([(row, part.encode() + b"\n") for row, part in enumerate(text.split("\n"))]))
+    assert [column["name"] for column in guessed["columns"]] == ["n", "fx_n", "fy"]
+    assert guessed["comments"] == ["#"]
 
 
 @pytest.mark.parametrize(
@@ -318,6 +318,6 @@ def test_what_a_probe_prints_is_a_rig_file_that_reads_the_board_and_says_what_is
     text = sensors._text(Report("serial:/dev/ttyACM0", recognise(data, "serial"), 9600, heard=len(data.data)))
 
     stanza = text[text.index("[[stream]]") :]
-    found = rig.parse(stanza).streams["lines"]
-    assert found.sensor == dataclasses.replace(board, baud=9600)
+    stream = rig.parse(stanza).streams["lines"]
+    assert stream.sensor == dataclasses.replace(board, baud=9600)
     assert [line.split("=")[0].strip() for line in stanza.split("\n") if "# a guess" in line] == ["sequence", "clock"]

@@ -15,7 +15,7 @@ from tacpipe.arrays import Counts
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.modbus_tactile import ModbusTactile, with_crc
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import FakeSerial, held, read, rows_of, served, stream
+from tests.sensors.serial_lab import FakeSerial, hold_dialogue, read, rows_of, served, stream
 
 SENSOR = ModbusTactile()
 TAXELS = arrays.arrays(np.uint16, st.tuples(st.integers(1, 12), st.just(60)))
@@ -27,7 +27,7 @@ class Transport(FakeSerial):
     is_open, timeout = True, 0.1
 
 
-def made(count: int, seed: int) -> Counts:
+def random_taxels(count: int, seed: int) -> Counts:
     return np.random.default_rng(seed).integers(0, 1 << 16, (count, 60), dtype=np.uint16)
 
 
@@ -49,29 +49,29 @@ def test_it_is_asked_with_the_vendors_request() -> None:
 @settings(deadline=None, max_examples=50)
 @given(TAXELS, st.lists(st.integers(20, 300), min_size=1, max_size=4))
 def test_what_was_encoded_is_decoded_however_it_is_cut(taxels: Counts, sizes: list[int]) -> None:
-    found, losses = read(SENSOR, stream(SENSOR.encode(Samples((taxels,)))), sizes)
-    assert rows_of(found) == [row.tobytes() for row in taxels] and not losses
+    batches, losses = read(SENSOR, stream(SENSOR.encode(Samples((taxels,)))), sizes)
+    assert rows_of(batches) == [row.tobytes() for row in taxels] and not losses
 
 
 def test_the_vendor_reads_the_same_values() -> None:
-    taxels = made(30, 1)
-    client = ModbusRTU(Transport(stream(SENSOR.encode(Samples((taxels,)))), most=126))
+    taxels = random_taxels(30, 1)
+    client = ModbusRTU(Transport(stream(SENSOR.encode(Samples((taxels,)))), read_limit=126))
     assert [client.read_all_pressure_values_fast(1) for _ in range(30)] == taxels.tolist()
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), bit=st.integers(0, 20 * 126 * 8 - 1))
 def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(seed: int, bit: int) -> None:
-    taxels = made(20, seed)
+    taxels = random_taxels(20, seed)
     data = bytearray(stream(SENSOR.encode(Samples((taxels,)))))
     data[bit // 8] ^= 1 << bit % 8
-    found, _ = read(SENSOR, bytes(data))
-    assert len(rows_of(found)) >= 18 and set(rows_of(found)) <= {row.tobytes() for row in taxels}
+    batches, _ = read(SENSOR, bytes(data))
+    assert len(rows_of(batches)) >= 18 and set(rows_of(batches)) <= {row.tobytes() for row in taxels}
 
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    taxels, device = made(50, 2), SENSOR.device()
+    taxels, device = random_taxels(50, 2), SENSOR.device()
     frames = SENSOR.encode(Samples((taxels,)))
     with (
         served(device, lambda number: bytes(frames[number % 50])) as port,
@@ -83,7 +83,7 @@ def test_the_vendors_client_is_served() -> None:
         assert client.config.get_pressure_value_type() == 0
         client.config.set_auto_upload_frequency(150)
         assert client.config.get_auto_upload_frequency() == 150
-        assert client.config.get_auto_zero_enable() is None  # which is its word for a register that cannot be read
+        assert client.config.get_auto_zero_enable() is None  # This is its code for a register that cannot be read.
         assert client.pressure.read_all().values == taxels[0].tolist()
         assert client.pressure.read_fast() == taxels[1].tolist()
         client.config.trigger_dynamic_zero()
@@ -91,9 +91,9 @@ def test_the_vendors_client_is_served() -> None:
 
 def test_the_device_is_opened_tared_and_asked_though_something_else_came_first() -> None:
     device = SENSOR.device()
-    written = held(SENSOR.opening({}), device, between=b"\x01\x42\x00" + bytes(30) + b"\x01\x03\x02")
-    assert [message[1:6].hex(" ") for message in written] == ["06 00 0b 00 00", "03 00 0f 00 01", "06 00 0d 00 01"]
-    held(SENSOR.taring(), device)
+    messages = hold_dialogue(SENSOR.opening({}), device, between=b"\x01\x42\x00" + bytes(30) + b"\x01\x03\x02")
+    assert [message[1:6].hex(" ") for message in messages] == ["06 00 0b 00 00", "03 00 0f 00 01", "06 00 0d 00 01"]
+    hold_dialogue(SENSOR.taring(), device)
     device.hear(SENSOR.request()[:2])
     device.hear(SENSOR.request()[2:] + SENSOR.request())
     assert (device.polled(), device.polled()) == (2, 0)
@@ -101,7 +101,7 @@ def test_the_device_is_opened_tared_and_asked_though_something_else_came_first()
 
 def test_another_number_of_taxels_is_told() -> None:
     with pytest.raises(DeviceError, match=r"60 taxels.*48.*= 60"):
-        held(ModbusTactile(points=48).opening({}), SENSOR.device())
+        hold_dialogue(ModbusTactile(points=48).opening({}), SENSOR.device())
 
 
 def test_a_refusal_is_told() -> None:

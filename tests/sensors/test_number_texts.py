@@ -35,16 +35,16 @@ def read(words: Sequence[bytes]) -> list[float] | None:
     st.lists(st.lists(WRITTEN, min_size=1, max_size=4), min_size=1, max_size=5),
     st.lists(st.sampled_from([" ", "\t", "  ", " \t"]), min_size=1, max_size=3),
 )
-def test_numbers_of_lines_are_those_that_python_reads_in_each(rows: list[list[str]], apart: list[str]) -> None:
-    lines = [apart[row % len(apart)].join(words).strip().encode() for row, words in enumerate(rows)]
+def test_numbers_of_lines_are_those_that_python_reads_in_each(rows: list[list[str]], separators: list[str]) -> None:
+    lines = [separators[row % len(separators)].join(words).strip().encode() for row, words in enumerate(rows)]
     wide = max(1, len(lines[0].split()))
     expected = [read(line.split()) for line in lines]
 
-    found = number_texts.of_lines(lines, wide)
+    numbers = number_texts.of_lines(lines, wide)
 
-    if found is not None and np.isfinite(found).all():
-        assert found.tolist() == expected
-    elif found is None:
+    if numbers is not None and np.isfinite(numbers).all():
+        assert numbers.tolist() == expected
+    elif numbers is None:
         plain = [re.fullmatch(rb"-?\d+(\.\d+)?", word) for line in lines for word in line.split()]
         assert not all(plain) or any(len(line.split()) != wide for line in lines)
 
@@ -60,12 +60,12 @@ def test_numbers_of_texts_are_those_that_python_reads_between_the_same_marks(row
     pattern = number_texts.pattern(TEXT % (b"1", b"2.5", b"-3"))
     assert pattern is not None
 
-    written = pattern.written(texts)
+    words = pattern.written(texts)
 
-    assert written is not None
-    assert written.to_pylist() == [word for row in rows for word in row]
-    found, expected = number_texts.floats(written), read([word.encode() for row in rows for word in row])
-    assert found is None or not np.isfinite(found).all() or found.tolist() == expected
+    assert words is not None
+    assert words.to_pylist() == [word for row in rows for word in row]
+    numbers, expected = number_texts.floats(words), read([word.encode() for row in rows for word in row])
+    assert numbers is None or not np.isfinite(numbers).all() or numbers.tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_whole_numbers_are_told_from_others() -> None:
     assert pattern is not None
 
     for text, expected in [(b"4208163634", [4208163634]), (b"1.5", None), (b"1e3", None), (b"", None)]:
-        found = number_texts.wholes(pattern.written([b"<n>%b</n>" % text]))
-        assert (found is None and expected is None) or (found is not None and found.tolist() == expected)
+        numbers = number_texts.wholes(pattern.written([b"<n>%b</n>" % text]))
+        assert (numbers is None and expected is None) or (numbers is not None and numbers.tolist() == expected)
 
 
 @given(st.lists(st.sampled_from([b"12", b"x"]), max_size=60))
@@ -103,9 +103,12 @@ def test_looking_at_many_texts_at_once_finds_the_frames_that_looking_at_each_doe
     lines = Chunks.of([(0, b"\n" + b"".join(text + b"\n" for text in texts))])
 
     for kind, chunks in ((TextFramer, packets), (LineFramer, lines)):
-        single, many = kind(bytes.isdigit), kind(bytes.isdigit, every=lambda some: all(map(bytes.isdigit, some)))
-        (one, lost), (other, lost_too) = single.feed(chunks), many.feed(chunks)
-        assert [run.frames for run in one] == [run.frames for run in other]
-        assert [run.frames for run in one] == ([[b"12"] * texts.count(b"12")] if b"12" in texts else [])
-        assert lost == lost_too and math.fsum(loss.frames for loss in lost) == texts.count(b"x")
-        assert single.account == many.account
+        single, batched = (
+            kind(bytes.isdigit),
+            kind(bytes.isdigit, every=lambda candidates: all(map(bytes.isdigit, candidates))),
+        )
+        (single_runs, single_losses), (batched_runs, batched_losses) = single.feed(chunks), batched.feed(chunks)
+        assert [run.frames for run in single_runs] == [run.frames for run in batched_runs]
+        assert [run.frames for run in single_runs] == ([[b"12"] * texts.count(b"12")] if b"12" in texts else [])
+        assert single_losses == batched_losses and math.fsum(loss.frames for loss in single_losses) == texts.count(b"x")
+        assert single.account == batched.account

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import FakeSerial, held, read, rows_of, served, stream, streams, values
+from tests.sensors.serial_lab import FakeSerial, hold_dialogue, read, rows_of, served, stream, streams, values
 
 VENDORS = {3: optoforce.OptoForce16, 6: optoforce.OptoForce22, 12: optoforce.OptoForce34}
 AXES = pytest.mark.parametrize("axes", [3, 6, 12])
 
 
-def made(axes: int, count: int, seed: int) -> Samples:
+def random_samples(axes: int, count: int, seed: int) -> Samples:
     rng = np.random.default_rng(seed)
     status = rng.integers(0, 1 << 16, (count, 1), dtype=np.uint16)
     counts = rng.integers(-(1 << 15), 1 << 15, (count, axes), dtype=np.int16)
@@ -38,15 +38,15 @@ def test_a_frame_by_hand_is_read() -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(1, 200), min_size=1, max_size=4))
 def test_what_was_encoded_is_decoded_however_it_is_cut(axes: int, seed: int, sizes: list[int]) -> None:
-    sensor, samples = OptoForce(axes=axes), made(axes, 20, seed)
-    found, losses = read(sensor, stream(sensor.encode(samples)), sizes)
-    assert rows_of(found) == rows_of([samples]) and not losses
-    assert np.concatenate([each.seq for each in found if each.seq is not None]).tolist() == samples.seq.tolist()  # type: ignore[union-attr]
+    sensor, samples = OptoForce(axes=axes), random_samples(axes, 20, seed)
+    batches, losses = read(sensor, stream(sensor.encode(samples)), sizes)
+    assert rows_of(batches) == rows_of([samples]) and not losses
+    assert np.concatenate([batch.seq for batch in batches if batch.seq is not None]).tolist() == samples.seq.tolist()  # type: ignore[union-attr]
 
 
 @AXES
 def test_the_vendor_reads_the_same_values(axes: int) -> None:
-    sensor, samples = OptoForce(axes=axes), made(axes, 30, 1)
+    sensor, samples = OptoForce(axes=axes), random_samples(axes, 30, 1)
     client = VENDORS[axes]("nowhere")
     client.opt_ser = FakeSerial(stream(sensor.encode(samples)))
     client.close = lambda: None
@@ -63,16 +63,16 @@ def test_the_vendor_reads_the_same_values(axes: int) -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), bit=st.integers(0, 20 * 16 * 8 - 1))
 def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(axes: int, seed: int, bit: int) -> None:
-    sensor, samples = OptoForce(axes=axes), made(axes, 20, seed)
+    sensor, samples = OptoForce(axes=axes), random_samples(axes, 20, seed)
     data = bytearray(stream(sensor.encode(samples)))
     data[bit // 8] ^= 1 << bit % 8
-    found, _ = read(sensor, bytes(data))
-    assert set(rows_of(found)) < set(rows_of([samples]))
+    batches, _ = read(sensor, bytes(data))
+    assert set(rows_of(batches)) < set(rows_of([samples]))
 
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served_and_sets_rate_and_filter() -> None:
-    sensor, samples = OptoForce(axes=3), made(3, 500, 2)
+    sensor, samples = OptoForce(axes=3), random_samples(3, 500, 2)
     frames, device = sensor.encode(samples), sensor.device()
     assert not streams(device)
     with served(device, lambda number: bytes(frames[number % 500])) as port, warnings.catch_warnings():
@@ -80,16 +80,16 @@ def test_the_vendors_client_is_served_and_sets_rate_and_filter() -> None:
         with client:
             readings = [client.read(only_latest_data=False) for _ in range(20)]
     assert streams(device) and device.rate_hz == 333
-    known = {(int(seq), int(status)) for seq, status in zip(samples.seq, samples.values[0][:, 0], strict=True)}  # type: ignore[arg-type]
-    assert all(reading.valid_checksum and (reading.count, reading.status) in known for reading in readings)
+    sent_readings = {(int(seq), int(status)) for seq, status in zip(samples.seq, samples.values[0][:, 0], strict=True)}  # type: ignore[arg-type]
+    assert all(reading.valid_checksum and (reading.count, reading.status) in sent_readings for reading in readings)
 
 
 def test_the_device_is_opened_tared_and_stopped() -> None:
     sensor = OptoForce(axes=6, rate_hz=1000, filter_hz=15)
     device = sensor.device()
-    assert held(sensor.opening({}), device) == [bytes.fromhex("AA 00 32 03 01 04 00 00 E4")]
+    assert hold_dialogue(sensor.opening({}), device) == [bytes.fromhex("AA 00 32 03 01 04 00 00 E4")]
     assert streams(device) and device.rate_hz == 1000
-    held(sensor.taring(), device)
+    hold_dialogue(sensor.taring(), device)
     device.hear(sensor.closing())
     assert not streams(device)
 
@@ -98,7 +98,7 @@ def test_fields_stand_for_what_is_decoded() -> None:
     for axes in (3, 6, 12):
         sensor = OptoForce(axes=axes)
         kinds = [field.type.to_pandas_dtype() for field in sensor.fields()]
-        blocks = values([made(axes, 2, 0)])
+        blocks = values([random_samples(axes, 2, 0)])
         assert kinds == [block.dtype for block in blocks for _ in range(block.shape[1])]
 
 

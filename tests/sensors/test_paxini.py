@@ -1,4 +1,4 @@
-"""What a Paxini board pushes is read as the package paxini-sdk reads it, and its dialogue holds amid an old stream."""
+"""Pushed frames of a Paxini board are read as paxini-sdk reads them, and its dialogue works amid an old stream."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tacpipe.sensors.paxini import SLOTS, VARIANTS, Paxini, pushed
 from tacpipe.sensors.paxini_board import REPLY, message, write
 from tacpipe.sensors.paxini_board import read as asked
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import held, read, rows_of, served, stream, streams
+from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
 
 HAND = Paxini(
     modules=("thumb_tip", "index_tip", "palm1"), variants=("DP-S2015-Elite", "DP-S1813-Elite", "MC-M2020-Elite")
@@ -25,7 +25,7 @@ DONE = b"\xaa\x56\x00\x01\x00"  # the reply to the order to push, before its err
 DATA = pytest.mark.parametrize("data", ["both", "resultant", "distributed"])
 
 
-def made(sensor: Paxini, count: int, seed: int) -> Samples:
+def random_samples(sensor: Paxini, count: int, seed: int) -> Samples:
     rng = np.random.default_rng(seed)
     kinds = [str(field.type) for field in sensor.fields()]
     signed, unsigned = kinds.count("int8"), kinds.count("uint8") - 1
@@ -43,9 +43,9 @@ def test_a_frame_by_hand_is_read() -> None:
     payload = bytes([0xFF, 0, 2, 0, 250, 0]) + bytes([0x80, 1, 200]) + bytes(24)
     frame = b"\xaa\x56\x00" + (len(payload) + 1).to_bytes(2, "little") + b"\x07" + payload
     frame += bytes([protocol.lrc(frame)])
-    found, losses = read(sensor, 2 * frame)
+    batches, losses = read(sensor, 2 * frame)
     names = [field.name for field in sensor.fields()]
-    row = np.concatenate([block[0].astype(int) for block in found[0].values]).tolist()
+    row = np.concatenate([block[0].astype(int) for block in batches[0].values]).tolist()
     assert dict(zip(names, row, strict=True)) | {"status": 7} == {
         **dict.fromkeys(names, 0),
         "status": 7,
@@ -61,7 +61,9 @@ def test_a_frame_by_hand_is_read() -> None:
 
 def test_modules_and_variants_are_those_of_the_vendor() -> None:
     assert [name.lower().replace("-", "_").replace("palm_", "palm") for name in registers.MODULE_NAMES] == list(SLOTS)
-    vendors = {each.sensor_model.removeprefix("PX6AX-GEN3-"): each.n_points for each in sensor_registry.list_sensors()}
+    vendors = {
+        model.sensor_model.removeprefix("PX6AX-GEN3-"): model.n_points for model in sensor_registry.list_sensors()
+    }
     assert vendors == VARIANTS
 
 
@@ -70,15 +72,15 @@ def test_modules_and_variants_are_those_of_the_vendor() -> None:
 @given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(40, 300), min_size=1, max_size=4))
 def test_what_was_encoded_is_decoded_however_it_is_cut(data: Any, seed: int, sizes: list[int]) -> None:
     sensor = Paxini(modules=HAND.modules, variants=HAND.variants, data=data)
-    samples = made(sensor, 10, seed)
-    found, losses = read(sensor, stream(sensor.encode(samples)), sizes)
-    assert rows_of(found) == rows_of([samples]) and not losses
+    samples = random_samples(sensor, 10, seed)
+    batches, losses = read(sensor, stream(sensor.encode(samples)), sizes)
+    assert rows_of(batches) == rows_of([samples]) and not losses
 
 
 @DATA
 def test_the_vendor_reads_the_same_values(data: Any) -> None:
     sensor = Paxini(modules=HAND.modules, variants=HAND.variants, data=data)
-    samples = made(sensor, 20, 1)
+    samples = random_samples(sensor, 20, 1)
     names = [field.name for field in sensor.fields()]
     slots = {SLOTS.index(module): count for module, count in sensor.points.items()}
     config = AutoPushConfig(list(slots), data != "distributed", data != "resultant", slots)
@@ -102,21 +104,21 @@ def test_the_vendor_reads_the_same_values(data: Any) -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), bit=st.integers(0, 2000))
 def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(seed: int, bit: int) -> None:
-    samples = made(HAND, 10, seed)
+    samples = random_samples(HAND, 10, seed)
     data = bytearray(stream(HAND.encode(samples)))
     data[bit // 8] ^= 1 << bit % 8
-    found, _ = read(HAND, bytes(data))
-    assert set(rows_of(found)) < set(rows_of([samples]))
+    batches, _ = read(HAND, bytes(data))
+    assert set(rows_of(batches)) < set(rows_of([samples]))
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), size=st.integers(30, 500))
 def test_the_board_is_opened_though_an_earlier_session_still_streams(seed: int, size: int) -> None:
     device = HAND.device()
-    stale = stream(HAND.encode(made(HAND, 3, seed)))[5:]
-    stale += b"\xaa\x55\x00\x03\x10\x00\x04\x00"  # which begins as a reply does
-    written = held(HAND.opening({}), device, between=stale, size=size)
-    assert [told.hex(" ") for told in written] == [
+    stale = stream(HAND.encode(random_samples(HAND, 3, seed)))[5:]
+    stale += b"\xaa\x55\x00\x03\x10\x00\x04\x00"  # These bytes begin as a reply does.
+    messages = hold_dialogue(HAND.opening({}), device, between=stale, size=size)
+    assert [sent_bytes.hex(" ") for sent_bytes in messages] == [
         "55 aa 00 10 17 00 01 00 00 d9",
         "55 aa 00 03 00 00 0f 00 ef",
         "55 aa 00 03 10 00 04 00 ea",
@@ -132,14 +134,14 @@ def test_the_board_is_opened_though_an_earlier_session_still_streams(seed: int, 
 def test_requests_are_those_of_the_vendor() -> None:
     assert asked(0x30, 56) == protocol.build_simple_request(protocol.FUNC_READ_SIMPLE, 0x30, data_len=56)
     assert write(0x17, b"\x01") == protocol.build_simple_request(protocol.FUNC_WRITE_SIMPLE, 0x17, data=b"\x01")
-    (told,) = held(HAND.taring(), HAND.device())
-    assert told == bytes.fromhex("55AA00170200010001E6")
+    (sent_bytes,) = hold_dialogue(HAND.taring(), HAND.device())
+    assert sent_bytes == bytes.fromhex("55AA00170200010001E6")
 
 
 def test_other_modules_than_in_the_rig_file_are_told_with_what_to_write() -> None:
     sensor = Paxini(modules=("index_tip",), variants=("DP-S2015-Elite",))
     with pytest.raises(DeviceError) as caught:
-        held(sensor.opening({}), HAND.device())
+        hold_dialogue(sensor.opening({}), HAND.device())
     assert str(caught.value) == (
         "The board (PX-HS V1.0.0) has thumb_tip of 52 points, index_tip of 31 points, palm1 of 9 points; the rig file "
         "states "
@@ -167,18 +169,18 @@ def test_a_refusal_and_a_write_without_data_are_understood() -> None:
 
 
 def test_the_first_forces_that_are_pushed_are_looked_at_and_stay_a_sample() -> None:
-    frame = stream(HAND.encode(made(HAND, 1, 6)))
-    done, error = (head + bytes([protocol.lrc(head)]) for head in (DONE + b"\x00", DONE + b"\x05"))
+    frame = stream(HAND.encode(random_samples(HAND, 1, 6)))
+    success, error = (head + bytes([protocol.lrc(head)]) for head in (DONE + b"\x00", DONE + b"\x05"))
     assert pushed(frame[:-1]) == 0
     assert pushed(frame) == (0, 0)
-    assert pushed(frame[9:] + done + frame) == (len(frame) - 9, len(frame) - 9 + len(done))
+    assert pushed(frame[9:] + success + frame) == (len(frame) - 9, len(frame) - 9 + len(success))
     with pytest.raises(DeviceError, match="error 5"):
         pushed(error)
 
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    samples, device = made(HAND, 100, 3), HAND.device()
+    samples, device = random_samples(HAND, 100, 3), HAND.device()
     frames = HAND.encode(samples)
     device.streaming = True  # an earlier session left it so
     with served(device, lambda number: bytes(frames[number % 100]), 0.011) as port, HighSpeedHandBoard(port) as board:

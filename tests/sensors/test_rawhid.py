@@ -18,10 +18,10 @@ BY_HAND = bytes.fromhex(
 def test_a_report_by_hand_is_decoded() -> None:
     runs, losses = made.through(RawHid().framer(), [BY_HAND])
 
-    found = made.decoded(RawHid(), runs)
+    samples = made.decoded(RawHid(), runs)
 
-    assert found.values[0].tolist() == [[1, 515, 1023, 0, 65535, 4660, 5, 6, 7, 8, 9, 1024]]
-    assert found.seq is not None and found.seq.tolist() == [0xBEEF]
+    assert samples.values[0].tolist() == [[1, 515, 1023, 0, 65535, 4660, 5, 6, 7, 8, 9, 1024]]
+    assert samples.seq is not None and samples.seq.tolist() == [0xBEEF]
     assert losses == []
 
 

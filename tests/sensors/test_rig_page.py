@@ -36,8 +36,8 @@ def table() -> dict[str, list[str]]:
 
 
 def built_in() -> dict[str, Any]:
-    found = {name: target for name, target in registry.sensors().items() if target.startswith("tacpipe.sensors.")}
-    return {name: registry.load_sensor(name) for name in found}
+    targets = {name: target for name, target in registry.sensors().items() if target.startswith("tacpipe.sensors.")}
+    return {name: registry.load_sensor(name) for name in targets}
 
 
 def test_the_table_has_every_sensor_once_in_order() -> None:

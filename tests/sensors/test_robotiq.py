@@ -16,7 +16,7 @@ from pyrobotiqtactile.protocol import PacketParser
 from tacpipe.errors import UsageError
 from tacpipe.sensors.robotiq import KINDS, Robotiq, command
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import held, read, rows_of, served, stream, streams
+from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
 
 BOTH = Robotiq()
 FINGER = bytes.fromhex(
@@ -24,7 +24,7 @@ FINGER = bytes.fromhex(
 )  # a dynamic 0, an acceleration 1, a temperature 0
 
 
-def made(sensor: Robotiq, count: int, seed: int) -> Samples:
+def random_samples(sensor: Robotiq, count: int, seed: int) -> Samples:
     rng = np.random.default_rng(seed)
     widths: dict[str, int] = {}
     for field in sensor.fields():
@@ -47,7 +47,7 @@ def test_a_packet_by_hand_is_read_and_one_without_all_parts_holds_no_sample() ->
 
 
 def test_a_whole_packet_has_the_size_that_the_protocol_tells() -> None:
-    frames = BOTH.encode(made(BOTH, 1, 0))
+    frames = BOTH.encode(random_samples(BOTH, 1, 0))
     assert frames.shape == (1, 4 + 186)
     assert frames[0, :4].tolist() == [0x9A, 0, 0x58, 186]
 
@@ -55,13 +55,13 @@ def test_a_whole_packet_has_the_size_that_the_protocol_tells() -> None:
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(30, 300), min_size=1, max_size=4))
 def test_what_was_encoded_is_decoded_however_it_is_cut(seed: int, sizes: list[int]) -> None:
-    samples = made(BOTH, 12, seed)
-    found, _ = read(BOTH, stream(BOTH.encode(samples)), sizes)
-    assert rows_of(found) == rows_of([samples])
+    samples = random_samples(BOTH, 12, seed)
+    batches, _ = read(BOTH, stream(BOTH.encode(samples)), sizes)
+    assert rows_of(batches) == rows_of([samples])
 
 
 def test_the_vendor_reads_the_same_values() -> None:
-    samples = made(BOTH, 30, 1)
+    samples = random_samples(BOTH, 30, 1)
     parser = PacketParser()
     packets = parser.feed(stream(BOTH.encode(samples)))
     assert len(packets) == 30
@@ -78,35 +78,35 @@ def test_the_vendor_reads_the_same_values() -> None:
 def test_fields_may_come_in_any_order_and_packets_of_several_kinds_in_between() -> None:
     sensor = Robotiq(fingers=2, parts=("dynamic",))
     first = command(0x58, struct.pack(">BhBh", 0x20, 1, 0x24, -1))
-    other = command(0x58, struct.pack(">BhBh", 0x24, -2, 0x20, 2))
-    frames = np.frombuffer(first + other + first + command(0xE3, bytes(6)), np.uint8).reshape(4, -1)
+    second = command(0x58, struct.pack(">BhBh", 0x24, -2, 0x20, 2))
+    frames = np.frombuffer(first + second + first + command(0xE3, bytes(6)), np.uint8).reshape(4, -1)
     samples = sensor.decode(frames)
     assert samples.values[0].tolist() == [[1, -1], [2, -2], [1, -1]]
     assert samples.rows is not None and samples.rows.tolist() == [0, 1, 2]
-    found, _ = read(sensor, 3 * (first + command(0xE3, b"\x01") + other + FINGER + first), (13,))
-    assert np.concatenate([each.values[0] for each in found]).tolist() == 3 * [[1, -1], [2, -2], [1, -1]]
+    batches, _ = read(sensor, 3 * (first + command(0xE3, b"\x01") + second + FINGER + first), (13,))
+    assert np.concatenate([batch.values[0] for batch in batches]).tolist() == 3 * [[1, -1], [2, -2], [1, -1]]
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), at=st.integers(2, 15), cut=st.integers(1, 189))
 def test_after_a_cut_nothing_is_read_that_was_not_sent(seed: int, at: int, cut: int) -> None:
-    samples = made(BOTH, 20, seed)
+    samples = random_samples(BOTH, 20, seed)
     frames = [bytes(frame) for frame in BOTH.encode(samples)]
     frames[at] = frames[at][:-cut]
-    found, _ = read(BOTH, b"".join(frames))
-    rows = rows_of(found)
+    batches, _ = read(BOTH, b"".join(frames))
+    rows = rows_of(batches)
     assert set(rows) <= set(rows_of([samples])) and len(rows) >= 16
 
 
 @pytest.mark.parametrize("field", [0x00, 0x80, 0x18, 0x24], ids=["no kind", "another", "a third finger", "twice"])
 def test_a_packet_with_a_field_that_cannot_be_is_lost(field: int) -> None:
-    samples = made(BOTH, 20, 4)
+    samples = random_samples(BOTH, 20, 4)
     frames = BOTH.encode(samples).copy()
     assert frames[10, 4] == 0x10 and frames[10, 4 + 57] == 0x20
     frames[10, 4 + (57 if field == 0x24 else 0)] = field
-    found, losses = read(BOTH, stream(frames))
+    batches, losses = read(BOTH, stream(frames))
     assert sum(loss.frames for loss in losses) >= 1
-    assert set(rows_of(found)) <= set(rows_of([samples])[:10] + rows_of([samples])[11:])
+    assert set(rows_of(batches)) <= set(rows_of([samples])[:10] + rows_of([samples])[11:])
 
 
 def test_the_clock_is_time_once_its_tick_is_known() -> None:
@@ -118,7 +118,7 @@ def test_the_clock_is_time_once_its_tick_is_known() -> None:
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    samples, device = made(BOTH, 100, 3), BOTH.device()
+    samples, device = random_samples(BOTH, 100, 3), BOTH.device()
     frames = BOTH.encode(samples)
     with served(device, lambda number: bytes(frames[number % 100])) as port:
         client = RobotiqTactileSensor(serial.Serial(port, 115_200, timeout=0.5))
@@ -135,7 +135,7 @@ def test_the_vendors_client_is_served() -> None:
 def test_the_device_is_opened_and_asked() -> None:
     device = BOTH.device()
     assert not streams(device)
-    assert held(BOTH.opening({}), device) == [bytes.fromhex("9A 00 58 01 0A")]
+    assert hold_dialogue(BOTH.opening({}), device) == [bytes.fromhex("9A 00 58 01 0A")]
     assert streams(device) and device.rate_hz == 100
     assert device.polled() == 0
     device.hear(bytes.fromhex("9A 00 61 00 9A 00 61 00"))

@@ -23,8 +23,8 @@ BATTERY = bytes.fromhex("17 5A")
 
 def rows(reports: list[bytes], at_once: int = 64) -> list[tuple[Any, ...]]:
     runs, _ = made.through(SpaceMouse().framer(), reports, at_once=at_once)
-    found = made.decoded(SpaceMouse(), runs)
-    return [(*axes, *buttons) for axes, buttons in zip(*(block.tolist() for block in found.values), strict=True)]
+    samples = made.decoded(SpaceMouse(), runs)
+    return [(*axes, *buttons) for axes, buttons in zip(*(block.tolist() for block in samples.values), strict=True)]
 
 
 def test_reports_by_hand_lead_from_state_to_state() -> None:

@@ -35,18 +35,18 @@ def malformed(sensor: Tap, packet: bytes) -> bool:
 def test_told_keys_become_numbers_and_the_whole_record_stays_as_text() -> None:
     sent = line(width_m=0.031, pose={"x": 4}, q=[1.0, 2.5], closed=True, phase="lift")
 
-    found = NUMBERS.decode([sent])
+    samples = NUMBERS.decode([sent])
 
-    assert found.values[1].tolist() == [[0.031, 4.0, 2.5, 1.0]]
-    assert found.values[0].tolist() == [["", sent.decode()]]
+    assert samples.values[1].tolist() == [[0.031, 4.0, 2.5, 1.0]]
+    assert samples.values[0].tolist() == [["", sent.decode()]]
     fields = {field.name: (field.metadata or {})[b"unit"] for field in NUMBERS.fields()}
     assert fields == {"event": b"1", "json": b"1", "width_m": b"m", "pose_x": b"1", "q_1": b"rad", "closed": b"1"}
 
 
 def test_a_key_that_is_missing_is_nan() -> None:
-    found = NUMBERS.decode([line(width_m=None, q=[1.0])]).values[1]
+    samples = NUMBERS.decode([line(width_m=None, q=[1.0])]).values[1]
 
-    assert np.isnan(found).all()
+    assert np.isnan(samples).all()
 
 
 def test_a_packet_of_several_lines_holds_as_many_records_with_its_stamp() -> None:
@@ -60,9 +60,9 @@ def test_a_packet_of_several_lines_holds_as_many_records_with_its_stamp() -> Non
 
 
 def test_an_event_stands_in_a_column_of_its_own() -> None:
-    found = Tap().decode([line(event="start"), line(event="label", name="phase", value="lift")])
+    samples = Tap().decode([line(event="start"), line(event="label", name="phase", value="lift")])
 
-    assert found.values[0][:, 0].tolist() == ["start", "label"]
+    assert samples.values[0][:, 0].tolist() == ["start", "label"]
 
 
 def test_a_counted_program_shows_what_was_lost_and_its_clock_is_kept() -> None:
@@ -106,12 +106,12 @@ def test_a_grasp_becomes_the_columns_that_grasps_are_read_from() -> None:
     import pyarrow as pa
 
     sensor = Tap(grasp="wrist")
-    found = sensor.decode([line(phase="approach"), line(grasp=GRASP)])
+    samples = sensor.decode([line(phase="approach"), line(grasp=GRASP)])
 
-    columns = [pa.array(column) for block in found.values for column in block.T]
+    columns = [pa.array(column) for block in samples.values for column in block.T]
     table = pa.Table.from_arrays([pa.array([9]), *columns], names=["t_ns", *(field.name for field in sensor.fields())])
     grasp = Grasp.of(table)
-    assert found.rows is not None and found.rows.tolist() == [1]
+    assert samples.rows is not None and samples.rows.tolist() == [1]
     assert grasp.g1_m.tolist() == GRASP["g1"]
     assert grasp.g2_m.tolist() == GRASP["g2"]
     assert grasp.wrist is not None and grasp.wrist.tolist() == TURNED
@@ -149,16 +149,16 @@ def test_what_is_encoded_is_decoded(seed: int, rows: int, counted: bool, timed: 
     texts = np.column_stack([events, np.full(rows, "", dtype=object)])
     first = Samples((texts, numbers), seq=seq, t_device_ns=t_ns, rows=np.arange(rows))
 
-    found = sensor.decode(sensor.encode(first))
-    again = sensor.decode(sensor.encode(found))
+    decoded = sensor.decode(sensor.encode(first))
+    decoded_twice = sensor.decode(sensor.encode(decoded))
 
-    for one in (found, again):
-        np.testing.assert_array_equal(one.values[1], numbers)
-        assert one.values[0][:, 0].tolist() == events.tolist()
-        np.testing.assert_array_equal(one.rows, np.arange(rows))
+    for samples in (decoded, decoded_twice):
+        np.testing.assert_array_equal(samples.values[1], numbers)
+        assert samples.values[0][:, 0].tolist() == events.tolist()
+        np.testing.assert_array_equal(samples.rows, np.arange(rows))
         for name in ("seq", "t_device_ns"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(first, name))
-    assert again.values[0].tolist() == found.values[0].tolist()
+            np.testing.assert_array_equal(getattr(samples, name), getattr(first, name))
+    assert decoded_twice.values[0].tolist() == decoded.values[0].tolist()
 
 
 @settings(deadline=None)
@@ -167,9 +167,9 @@ def test_grasps_that_are_encoded_are_decoded(seed: int, kind: Any) -> None:
     rows = np.random.default_rng(seed).normal(size=(3, 15 if kind == "wrist" else 6))
     sensor = Tap(grasp=kind)
 
-    found = sensor.decode(sensor.encode(Samples((rows,))))
+    decoded = sensor.decode(sensor.encode(Samples((rows,))))
 
-    np.testing.assert_array_equal(found.values[0], rows)
+    np.testing.assert_array_equal(decoded.values[0], rows)
 
 
 @pytest.mark.parametrize("numbers", [("seq",), ("a", "a:m"), ("a.b", "a_b"), ("a:",), ("",), ("0",), ("json",)])

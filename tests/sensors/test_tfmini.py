@@ -29,9 +29,9 @@ def test_the_original_sends_its_mode_instead_of_a_temperature() -> None:
     sensor = TfMini(model="original")
     runs, _ = made.through(sensor.framer(), [ORIGINAL, ORIGINAL])
 
-    words, rest = made.decoded(sensor, runs).values
+    words, mode_and_spare = made.decoded(sensor, runs).values
 
-    assert words.tolist() == [[121, 20]] * 2 and rest.tolist() == [[2, 0]] * 2
+    assert words.tolist() == [[121, 20]] * 2 and mode_and_spare.tolist() == [[2, 0]] * 2
     assert [field.name for field in sensor.fields()] == ["distance", "strength", "mode", "spare"]
 
 
@@ -66,16 +66,17 @@ def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
     sensor = TfMini(rate_hz=500, unit="mm")
     device = sensor.device()
 
-    written = described.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
+    messages = described.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
 
-    assert written == [command(5, b"\x06"), command(3, b"\xf4\x01"), command(0x11), command(7, b"\x01")]
+    assert messages == [command(5, b"\x06"), command(3, b"\xf4\x01"), command(0x11), command(7, b"\x01")]
     assert device.rate_hz == 500 and device.streaming
 
 
 def test_a_save_that_failed_is_an_error() -> None:
     ask = next(ask for ask in TfMini().opening({}) if ask.send == command(0x11))
     assert ask.found(PLUS + bytes.fromhex("5A 05 11 00 70") + PLUS) == (9, 14)
-    assert ask.found(bytes.fromhex("5A 05 11 01 70")) is None  # by chance, in a frame
+    # The sum is wrong: these bytes occur in a frame by chance.
+    assert ask.found(bytes.fromhex("5A 05 11 01 70")) is None
     with pytest.raises(DeviceError):
         ask.found(bytes.fromhex("5A 05 11 01 71"))
 

@@ -32,7 +32,7 @@ ALL_KINDS = (
     "payload_cog",
 )
 TEXT = struct.pack(">HB", 3 + 1 + 5 + 1 + 5 + 1, ord("M")) + b"\x05hello\x05robot\x01"
-HOST = "127.0.0.77"  # of this computer, and no other program's
+HOST = "127.0.0.77"  # A loopback address that no other program uses.
 CLIENT = """
 import json, sys
 from rtde_receive import RTDEReceiveInterface
@@ -51,7 +51,7 @@ def package(time_s: float, *values: float) -> bytes:
     return struct.pack(f">HBBd{len(values)}d", 12 + 8 * len(values), ord("U"), 1, time_s, *values)
 
 
-def made(sensor: UrRtde, rows: int, seed: int) -> Samples:
+def random_samples(sensor: UrRtde, rows: int, seed: int) -> Samples:
     """Return samples of every kind that the sensor's outputs have."""
     rng = np.random.default_rng(seed)
     blocks = []
@@ -75,12 +75,12 @@ def test_a_package_of_the_guide_is_read() -> None:
     half = np.pi / 2
     data = package(12.5, *range(1, 7), 0.1, 0.2, 0.3, 0, half, 0, 0.75)
 
-    found = sensor.decode(np.frombuffer(data, np.uint8)[None])
+    samples = sensor.decode(np.frombuffer(data, np.uint8)[None])
 
-    assert found.values[0].tolist() == [[1, 2, 3, 4, 5, 6]]
-    np.testing.assert_allclose(found.values[1], [[0.1, 0.2, 0.3, 0, np.sqrt(0.5), 0, np.sqrt(0.5)]])
-    assert found.values[2].tolist() == [[0.75]]
-    assert found.t_device_ns is not None and found.t_device_ns.tolist() == [12_500_000_000]
+    assert samples.values[0].tolist() == [[1, 2, 3, 4, 5, 6]]
+    np.testing.assert_allclose(samples.values[1], [[0.1, 0.2, 0.3, 0, np.sqrt(0.5), 0, np.sqrt(0.5)]])
+    assert samples.values[2].tolist() == [[0.75]]
+    assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [12_500_000_000]
     assert [field.name for field in sensor.fields()][5:8] == ["joint6_rad", "position_x_m", "position_y_m"]
 
 
@@ -90,14 +90,14 @@ def test_texts_among_the_data_are_frames_without_samples_however_the_bytes_are_c
     sensor = UrRtde(outputs=("actual_q",))
     sent = [package(0.002 * number, *([number] * 6)) for number in range(1, 9)]
     data = b"".join([TEXT, *sent[:3], TEXT, *sent[3:]])
-    reading, place, step, seen = Reading(sensor), 0, 0, []
+    reading, place, step, batches = Reading(sensor), 0, 0, []
     while place < len(data):
         size = sizes[step % len(sizes)]
-        seen.append(reading.feed(Chunks.of([(step, data[place : place + size])])))
+        batches.append(reading.feed(Chunks.of([(step, data[place : place + size])])))
         place, step = place + size, step + 1
-    seen.append(reading.finish())
+    batches.append(reading.finish())
 
-    values = [row[0] for batch in seen if len(batch) for row in batch.values[0].tolist()]
+    values = [row[0] for batch in batches if len(batch) for row in batch.values[0].tolist()]
 
     assert values == list(range(1, 9))
     assert reading.account.lost == 0
@@ -119,9 +119,9 @@ def test_a_package_with_a_wrong_size_is_none_and_those_after_it_are_found() -> N
     sent[5] = sent[5][:-8]
     reading = Reading(sensor)
 
-    batch, rest = reading.feed(Chunks.of([(1, b"".join(sent))])), reading.finish()
+    batch, last_batch = reading.feed(Chunks.of([(1, b"".join(sent))])), reading.finish()
 
-    values = [row[0] for part in (batch, rest) if len(part) for row in part.values[0].tolist()]
+    values = [row[0] for part in (batch, last_batch) if len(part) for row in part.values[0].tolist()]
     assert set(values) <= set(range(1, 20)) - {6}
     assert len(values) >= 16
 
@@ -130,11 +130,11 @@ def test_version_outputs_and_start_are_asked_for_in_the_words_of_the_guide() -> 
     sensor = UrRtde(outputs=("actual_q",), rate_hz=125)
     dialogue = sensor.opening({})
 
-    asked = [next(dialogue).send]
-    asked.append(dialogue.send(bytes.fromhex("0004 56 01")).send)
-    asked.append(dialogue.send(struct.pack(">HBB", 19, ord("O"), 3) + b"DOUBLE,VECTOR6D").send)
+    questions = [next(dialogue).send]
+    questions.append(dialogue.send(bytes.fromhex("0004 56 01")).send)
+    questions.append(dialogue.send(struct.pack(">HBB", 19, ord("O"), 3) + b"DOUBLE,VECTOR6D").send)
 
-    assert asked == [
+    assert questions == [
         bytes.fromhex("0005 56 0002"),
         struct.pack(">HBd", 29, ord("O"), 125.0) + b"timestamp,actual_q",
         bytes.fromhex("0003 53"),
@@ -167,8 +167,8 @@ def test_a_controller_that_refuses_is_told_in_a_sentence(replies: list[str], sen
     ask = next(dialogue)
 
     with pytest.raises(DeviceError, match=sentence):
-        for told in replies:
-            reply = bytes.fromhex(told)
+        for reply_hex in replies:
+            reply = bytes.fromhex(reply_hex)
             if b"DOUBLE" in reply:
                 reply = struct.pack(">HB", 3 + len(reply), ord("O")) + reply
             ask = dialogue.send(reply_of(ask, reply))
@@ -178,7 +178,7 @@ def test_a_controller_that_refuses_is_told_in_a_sentence(replies: list[str], sen
 def test_the_client_of_ur_rtde_reads_what_our_controller_sends() -> None:
     pytest.importorskip("rtde_receive")
     sensor = UrRtde()
-    samples = made(sensor, 1, 5)
+    samples = random_samples(sensor, 1, 5)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -204,36 +204,36 @@ def test_the_client_of_ur_rtde_reads_what_our_controller_sends() -> None:
     server = threading.Thread(target=serve, daemon=True)
     server.start()
     names = ",".join(["timestamp", *sensor.outputs])
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", CLIENT, HOST, names], capture_output=True, text=True, timeout=60, check=False
     )
     listener.close()
     server.join(timeout=10)
 
-    assert done.returncode == 0, done.stderr
-    told = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))
+    assert process.returncode == 0, process.stderr
+    received = json.loads(next(line for line in process.stdout.splitlines() if line.startswith("{")))
     assert samples.t_device_ns is not None
-    assert told["time"] == pytest.approx(samples.t_device_ns[0] / 1e9, abs=1e-9)
+    assert received["time"] == pytest.approx(samples.t_device_ns[0] / 1e9, abs=1e-9)
     pose = samples.values[2][0]
     expected = [block[0].tolist() for block in samples.values]
     expected[2] = [*pose[:3], *Rotation.from_quat(pose[3:]).as_rotvec()]
-    for found, right in zip(told["told"], expected, strict=True):
-        assert found == pytest.approx(right, abs=1e-9)
+    for value, right in zip(received["told"], expected, strict=True):
+        assert value == pytest.approx(right, abs=1e-9)
 
 
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 10))
 def test_what_is_encoded_is_decoded(seed: int, rows: int) -> None:
     sensor = UrRtde(outputs=ALL_KINDS)
-    samples = made(sensor, rows, seed)
+    samples = random_samples(sensor, rows, seed)
 
-    found = sensor.decode(sensor.encode(samples))
+    decoded = sensor.decode(sensor.encode(samples))
 
-    for field, block in zip(ALL_KINDS, zip(found.values, samples.values, strict=True), strict=True):
+    for field, block in zip(ALL_KINDS, zip(decoded.values, samples.values, strict=True), strict=True):
         np.testing.assert_allclose(*block, atol=1e-12 if field == "actual_TCP_pose" else 0)
         assert block[0].dtype == block[1].dtype
-    np.testing.assert_array_equal(found.t_device_ns, samples.t_device_ns)
-    assert len(sensor.fields()) == sum(block.shape[1] for block in found.values)
+    np.testing.assert_array_equal(decoded.t_device_ns, samples.t_device_ns)
+    assert len(sensor.fields()) == sum(block.shape[1] for block in decoded.values)
 
 
 @pytest.mark.parametrize("outputs", [(), ("q",), ("timestamp",), ("actual_q", "actual_q"), ("output_int_register_48",)])

@@ -1,4 +1,4 @@
-"""WTS messages have the published sum, frames come back from run lengths, replies are told from frames."""
+"""WTS messages have the published sum, frames come back from run lengths, replies are separated from frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tacpipe.sensors.weiss_wts import WeissWts, message, messages, run_lengths
 from tests.sensors import described, made
 
 SMALL = WeissWts(rows=2, columns=3)
-PLAIN = message(0, bytes.fromhex("10270000 00" + "0100 0200 0300 FF0F 0000 0500".replace(" ", "")))  # at 0.1 s
+PLAIN = message(0, bytes.fromhex("10270000 00" + "0100 0200 0300 FF0F 0000 0500".replace(" ", "")))  # A frame at 0.1 s.
 CODED = message(0, bytes.fromhex("20270000 01" + "0150 FF1F".replace(" ", "")))  # five cells of 1, one of 4095
 
 
@@ -23,10 +23,10 @@ def test_the_message_of_the_published_driver_has_this_sum() -> None:
 def test_frames_by_hand_are_decoded_plain_and_run_length_coded() -> None:
     runs, losses = made.through(SMALL.framer(), [PLAIN, CODED])
 
-    found = made.decoded(SMALL, runs)
+    samples = made.decoded(SMALL, runs)
 
-    assert found.values[0].tolist() == [[1, 2, 3, 4095, 0, 5], [1, 1, 1, 1, 1, 4095]]
-    assert found.t_device_ns is not None and found.t_device_ns.tolist() == [100_000_000, 100_160_000]
+    assert samples.values[0].tolist() == [[1, 2, 3, 4095, 0, 5], [1, 1, 1, 1, 1, 4095]]
+    assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [100_000_000, 100_160_000]
     assert losses == []
 
 
@@ -45,7 +45,7 @@ def test_run_lengths_tell_the_cells(stretches: list[tuple[int, int]]) -> None:
 def test_what_is_encoded_is_decoded(compress: bool, seed: int, levels: int) -> None:
     sensor = WeissWts(compress=compress)
     sent = made.samples("weiss-wts", sensor, 12, seed)
-    sent.values[0][:] %= levels * 3  # with long runs, as of a pad that little touches
+    sent.values[0][:] %= levels * 3  # Few levels give long runs, as on a pad with little contact.
 
     runs, losses = made.through(sensor.framer(), sensor.encode(sent))
 
@@ -59,10 +59,10 @@ def test_replies_among_frames_have_no_sample() -> None:
 
 
 @pytest.mark.parametrize(
-    "said", ["10270000 00 0100", "10270000 01 0140", "10270000 01 0150 FF2F", "10270000", "10270000 00 " + "00" * 13]
+    "payload", ["10270000 00 0100", "10270000 01 0140", "10270000 01 0150 FF2F", "10270000", "10270000 00 " + "00" * 13]
 )
-def test_a_frame_with_another_number_of_cells_is_lost(said: str) -> None:
-    runs, losses = made.through(SMALL.framer(), [PLAIN, PLAIN, message(0, bytes.fromhex(said)), PLAIN, PLAIN])
+def test_a_frame_with_another_number_of_cells_is_lost(payload: str) -> None:
+    runs, losses = made.through(SMALL.framer(), [PLAIN, PLAIN, message(0, bytes.fromhex(payload)), PLAIN, PLAIN])
 
     assert len(made.decoded(SMALL, runs)) == 4
     assert len(losses) == 1 and losses[0].frames <= 1
@@ -72,9 +72,9 @@ def test_the_device_answers_the_opening_while_it_still_streams() -> None:
     device = SMALL.device()
     device.streaming = True
 
-    written = described.hold(SMALL.opening({}), device, before=PLAIN + PLAIN[:9])
+    sent_messages = described.hold(SMALL.opening({}), device, before=PLAIN + PLAIN[:9])
 
-    assert [next(messages(one))[0] for one in written] == [0x22, 0x30, 0x21]
+    assert [next(messages(sent_message))[0] for sent_message in sent_messages] == [0x22, 0x30, 0x21]
     assert device.streaming and device.rate_hz == 100
 
 

@@ -20,27 +20,27 @@ COUNTS = [0x7F00 + number for number in range(48)]
 
 def text(number: int = 17, sensors: tuple[int, ...] = (1,), **changed: object) -> bytes:
     """Return a server's text by hand; sensor n shows counts that are n higher."""
-    found: dict[str, object] = {"message": number, "time": 1700000000.25, "sensors": len(sensors)}
+    record: dict[str, object] = {"message": number, "time": 1700000000.25, "sensors": len(sensors)}
     for sensor in sensors:
         data = ",".join(f"{count + sensor:X}" for count in COUNTS)
-        found[str(sensor)] = {
+        record[str(sensor)] = {
             "sensor": str(sensor),
             "model": "XR1944",
             "time": 1700000000.123456,
             "data": data,
             **changed,
         }
-    return json.dumps(found).encode()
+    return json.dumps(record).encode()
 
 
 def test_the_counts_of_the_sensor_asked_for_are_read_taxel_by_taxel() -> None:
-    found = Xela(sensor=2).decode([text(sensors=(1, 2))])
+    samples = Xela(sensor=2).decode([text(sensors=(1, 2))])
 
-    assert found.values[0].tolist() == [[count + 2 for count in COUNTS]]
-    assert found.values[0].dtype == np.uint16
+    assert samples.values[0].tolist() == [[count + 2 for count in COUNTS]]
+    assert samples.values[0].dtype == np.uint16
     assert [field.name for field in Xela().fields()][:4] == ["taxel01_x", "taxel01_y", "taxel01_z", "taxel02_x"]
-    assert found.seq is not None and found.seq.tolist() == [17]
-    assert found.t_device_ns is not None and found.t_device_ns.tolist() == [1_700_000_000_123_456_000]
+    assert samples.seq is not None and samples.seq.tolist() == [17]
+    assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [1_700_000_000_123_456_000]
 
 
 def test_counts_without_leading_zeros_are_read_as_the_vendors_node_reads_them() -> None:
@@ -55,10 +55,10 @@ def test_counts_without_leading_zeros_are_read_as_the_vendors_node_reads_them() 
 def test_forces_are_nan_where_the_server_sends_none() -> None:
     forces = [0.5 * number for number in range(48)]
 
-    found = Xela(forces=True).decode([text(calibrated=forces), text()]).values[1]
+    newtons = Xela(forces=True).decode([text(calibrated=forces), text()]).values[1]
 
-    assert found[0].tolist() == forces
-    assert np.isnan(found[1]).all()
+    assert newtons[0].tolist() == forces
+    assert np.isnan(newtons[1]).all()
 
 
 def test_the_welcome_and_texts_of_other_sensors_hold_no_sample_and_are_no_loss() -> None:
@@ -116,18 +116,18 @@ def test_what_is_encoded_is_decoded(seed: int, rows: int, forces: bool, taxels: 
         newtons[: rows // 2] = np.nan
         values += (newtons,)
     t_ns = rng.integers(0, 2**31 * 10**6, rows) * 1000  # up to 2038
-    given_ = Samples(values, seq=rng.integers(0, 1 << 53, rows), t_device_ns=t_ns, rows=np.arange(rows))
+    original = Samples(values, seq=rng.integers(0, 1 << 53, rows), t_device_ns=t_ns, rows=np.arange(rows))
 
-    frames = sensor.encode(given_)
-    found = sensor.decode(frames)
+    frames = sensor.encode(original)
+    decoded = sensor.decode(frames)
 
     _, losses = sensor.framer().feed(Chunks.of([(row, frame) for row, frame in enumerate(frames)]))
     assert not losses
-    for block, expected in zip(found.values, values, strict=True):
+    for block, expected in zip(decoded.values, values, strict=True):
         np.testing.assert_array_equal(block, expected)
         assert block.dtype == expected.dtype
     for name in ("seq", "t_device_ns", "rows"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(given_, name))
+        np.testing.assert_array_equal(getattr(decoded, name), getattr(original, name))
 
 
 @pytest.mark.parametrize("options", [{"sensor": 0}, {"taxels": 0}, {"taxels": 100}])

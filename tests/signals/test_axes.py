@@ -1,4 +1,4 @@
-"""Which axis is time: against numpy's correlation, and on arrays that are made to have one."""
+"""The time axis of an array: against numpy's correlation, and on arrays that are made to have one."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def walk(seed: int, channels: int = 12, frames: int = 80) -> np.ndarray:
 def test_the_autocorrelation_is_that_of_neighbours_as_numpy_has_it(axis: int) -> None:
     values = np.cumsum(np.random.default_rng(0).normal(size=(4, 5, 6)), axis=axis)
     moved = np.moveaxis(values, axis, 0)
-    wanted = np.corrcoef(moved[:-1].ravel(), moved[1:].ravel())[0, 1]
-    assert lag_one(values, axis) == pytest.approx(wanted)
-    assert lag_one(values, axis - 3) == pytest.approx(wanted)
+    expected = np.corrcoef(moved[:-1].ravel(), moved[1:].ravel())[0, 1]
+    assert lag_one(values, axis) == pytest.approx(expected)
+    assert lag_one(values, axis - 3) == pytest.approx(expected)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 100), st.floats(-1000, 1000))

@@ -21,7 +21,7 @@ def measured(count: int, drift: float, noise_ns: float = 0.0, start_ns: int = 0)
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -200e-6])
 def test_the_line_is_the_true_one_within_the_noise_of_its_measurements(drift: float) -> None:
     device_ns, offset_ns = measured(200, drift, noise_ns=200_000)
-    offset_ns[[20, 77, 150]] += [40_000_000, -90_000_000, 300_000_000]  # which were held up on their way
+    offset_ns[[20, 77, 150]] += [40_000_000, -90_000_000, 300_000_000]  # Three measurements were held up on their way
 
     lines = fit_offsets(device_ns, offset_ns)
 

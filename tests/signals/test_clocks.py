@@ -66,7 +66,7 @@ def test_a_device_that_restarts_has_a_line_before_and_one_after() -> None:
     taken_ns, device_ns, arrival_ns = link(400, 20, 0.5, stalls=3)
     device_ns[5000:] -= device_ns[5000] - 1000
     fit = fit_clock(device_ns, arrival_ns)
-    assert [(one.start, one.stop) for one in fit.segments] == [(0, 5000), (5000, 8000)]
+    assert [(segment.start, segment.stop) for segment in fit.segments] == [(0, 5000), (5000, 8000)]
     assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns).max() < 0.05 * MS
 
 
@@ -77,7 +77,7 @@ def test_arrivals_that_are_not_certain_move_nothing_and_their_rows_are_mapped_al
     late[[*range(1000, 4990), *range(5200, 7900)]] = True
     delayed_ns = np.where(late, arrival_ns + np.arange(len(late)) * 100_000, arrival_ns)
     fit = fit_clock(device_ns, delayed_ns, ~late)
-    assert [(one.start, one.stop) for one in fit.segments] == [(0, 5000), (5000, 8000)]
+    assert [(segment.start, segment.stop) for segment in fit.segments] == [(0, 5000), (5000, 8000)]
     assert np.abs(host_times(fit, device_ns, delayed_ns) - taken_ns).max() < 0.1 * MS
     assert fit_clock(device_ns, delayed_ns, late & ~late) == fit_clock(device_ns, delayed_ns)
 
@@ -86,17 +86,17 @@ def test_after_a_restart_too_short_to_show_a_drift_that_of_the_long_segment_hold
     taken_ns, device_ns, arrival_ns = link(50, 60, 1.0, ppm=200.0)
     device_ns[-20:] -= device_ns[-20]
     fit = fit_clock(device_ns, arrival_ns)
-    assert [one.stop - one.start for one in fit.segments] == [2980, 20]
+    assert [segment.stop - segment.start for segment in fit.segments] == [2980, 20]
     assert fit.segments[1].drift == fit.segments[0].drift
     assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns)[-20:].max() < 1.0 * MS
 
 
 def test_stalls_gaps_and_packets_out_of_order_are_no_steps() -> None:
     _, device_ns, arrival_ns = link(50, 60, 2.0, stalls=10)
-    kept = np.r_[0:500, 1200:3000]  # fourteen seconds are missing in both clocks
-    device_ns = device_ns[kept]
+    rows = np.r_[0:500, 1200:3000]  # fourteen seconds are missing in both clocks
+    device_ns = device_ns[rows]
     device_ns[[100, 101]] = device_ns[[101, 100]]
-    assert clock_steps(device_ns, arrival_ns[kept]) == []
+    assert clock_steps(device_ns, arrival_ns[rows]) == []
 
 
 def test_a_few_wrong_stamps_move_neither_the_line_nor_what_follows_them() -> None:
@@ -104,11 +104,11 @@ def test_a_few_wrong_stamps_move_neither_the_line_nor_what_follows_them() -> Non
     device_ns[[300, 1500]] += 3600 * S
     device_ns[[700, 2200]] -= 3600 * S
     fit = fit_clock(device_ns, arrival_ns)
-    found = host_times(fit, device_ns, arrival_ns)
+    times_ns = host_times(fit, device_ns, arrival_ns)
     assert len(fit.segments) == 1
-    assert np.abs(np.delete(found - taken_ns, [300, 700, 1500, 2200])).max() < 25 * MS
-    assert np.median(np.abs(found - taken_ns)) < 0.2 * MS
-    assert np.array_equal(found[[300, 1500]], arrival_ns[[300, 1500]])
+    assert np.abs(np.delete(times_ns - taken_ns, [300, 700, 1500, 2200])).max() < 25 * MS
+    assert np.median(np.abs(times_ns - taken_ns)) < 0.2 * MS
+    assert np.array_equal(times_ns[[300, 1500]], arrival_ns[[300, 1500]])
 
 
 @settings(deadline=None, max_examples=60)
@@ -119,12 +119,12 @@ def test_mapped_times_never_run_backwards_nor_far_ahead_of_their_arrival(steps: 
     if len(steps) > 1 and not np.any(device_ns != device_ns[0]):
         return
     try:
-        found = host_times(fit_clock(device_ns, arrival_ns), device_ns, arrival_ns)
+        times_ns = host_times(fit_clock(device_ns, arrival_ns), device_ns, arrival_ns)
     except TacpipeError:
         return  # a clock that is none
-    assert found.dtype == np.int64
-    assert (np.diff(found) >= 0).all()
-    assert (found - arrival_ns <= STEP_NS).all()
+    assert times_ns.dtype == np.int64
+    assert (np.diff(times_ns) >= 0).all()
+    assert (times_ns - arrival_ns <= STEP_NS).all()
 
 
 @given(st.integers(-(10**18), 10**18), st.integers(-(10**18), 10**18))
@@ -135,7 +135,7 @@ def test_where_the_two_clocks_begin_changes_nothing_but_the_offset(host_ns: int,
     assert moved.drift_ppm == fit.drift_ppm
 
 
-DELAYS: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {  # in the mean one
+DELAYS: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {  # The mean delay is one, except for none
     "none": lambda rng, count: np.zeros(count),
     "exponential": lambda rng, count: rng.exponential(1.0, count),
     "uniform": lambda rng, count: rng.uniform(0.0, 2.0, count),
@@ -168,14 +168,14 @@ def test_whatever_the_drift_the_delays_and_the_restarts_times_are_right_within_a
 ) -> None:
     (taken_ns, device_ns, arrival_ns), restarts, ppm, delay_ns = drawn
     fit = fit_clock(device_ns, arrival_ns)
-    assert [one.start for one in fit.segments] == [0, *restarts]
-    found = host_times(fit, device_ns, arrival_ns)
+    assert [segment.start for segment in fit.segments] == [0, *restarts]
+    times_ns = host_times(fit, device_ns, arrival_ns)
     longest = fit.longest
-    assert np.abs(found - taken_ns).max() <= 4 * delay_ns + 2
+    assert np.abs(times_ns - taken_ns).max() <= 4 * delay_ns + 2
     span_ns = taken_ns[longest.stop - 1] - taken_ns[longest.start]
     assert abs(fit.drift_ppm + ppm) <= 0.5 + 1e6 * 4 * delay_ns / span_ns  # half a ppm: 1 / (1 + x) is not 1 - x
     assert (
-        found <= arrival_ns + delay_ns
+        times_ns <= arrival_ns + delay_ns
     ).all()  # nothing is felt before it happens, but for stamps held for wrong ones
 
 

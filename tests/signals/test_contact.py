@@ -17,10 +17,10 @@ loads = hnp.arrays(np.float64, st.integers(1, 80), elements=st.floats(0, 10))
 
 
 def intervals(values: list[float], **params: float) -> list[list[int]]:
-    given = {"on": 5.0, "off": 3.0, "min_s": 0.0, "merge_s": 0.0, "pad_s": 0.0} | params
+    arguments = {"on": 5.0, "off": 3.0, "min_s": 0.0, "merge_s": 0.0, "pad_s": 0.0} | params
     t_ns = np.arange(len(values)) * 10 * MS
-    found: list[list[int]] = contact_intervals(np.array(values, dtype=np.float64), t_ns, **given).tolist()
-    return found
+    spans: list[list[int]] = contact_intervals(np.array(values, dtype=np.float64), t_ns, **arguments).tolist()
+    return spans
 
 
 def test_one_bad_frame_does_not_shift_the_rest_level() -> None:
@@ -80,12 +80,12 @@ def test_intervals_are_sorted_disjoint_and_hold_every_row_at_or_above_on(
     values: np.ndarray, merge_s: float, pad_s: float
 ) -> None:
     t_ns = np.arange(len(values)) * 10 * MS
-    found = contact_intervals(values, t_ns, 5.0, 3.0, 0.0, merge_s, pad_s)
-    flat = found.ravel()
+    spans = contact_intervals(values, t_ns, 5.0, 3.0, 0.0, merge_s, pad_s)
+    flat = spans.ravel()
     assert (np.diff(flat) >= 0).all()
-    assert (found[:, 1] > found[:, 0]).all()
+    assert (spans[:, 1] > spans[:, 0]).all()
     inside = np.zeros(len(values), dtype=bool)
-    for start, stop in found:
+    for start, stop in spans:
         inside[start:stop] = True
     assert inside[values >= 5.0].all()
 
@@ -105,25 +105,25 @@ def thresholds(values: np.ndarray, t_ns: np.ndarray) -> tuple[float, float]:
 @pytest.mark.parametrize("scale", [1e-6, 0.004, 1.0, 5000.0])
 def test_thresholds_of_the_noise_follow_the_unit(scale: float) -> None:
     values, t_ns = touched(400, 500.0, 1.0)
-    one, scaled = thresholds(values, t_ns), thresholds(scale * values, t_ns)
-    assert np.allclose(scaled, np.array(one) * scale, rtol=1e-9)
-    assert 40 < one[0] < 125 and one[1] == pytest.approx(one[0] * 2 / 3)
+    unscaled, scaled = thresholds(values, t_ns), thresholds(scale * values, t_ns)
+    assert np.allclose(scaled, np.array(unscaled) * scale, rtol=1e-9)
+    assert 40 < unscaled[0] < 125 and unscaled[1] == pytest.approx(unscaled[0] * 2 / 3)
 
 
 @pytest.mark.parametrize(
-    ("peak", "noise", "least", "most"),
+    ("peak", "noise", "lowest", "highest"),
     [
         (20.0, 1.0, 10.0, 20.0),  # little more than noise: found all the same, above ten times the noise
-        (500.0, 0.0, 24.0, 26.0),  # without noise a twentieth of the largest load
+        (500.0, 0.0, 24.0, 26.0),  # A twentieth of the largest load where there is no noise
         (0.0, 1.0, 10.0, 25.0),  # noise alone does not reach it
     ],
 )
 def test_thresholds_of_the_noise_lie_between_noise_and_load(
-    peak: float, noise: float, least: float, most: float
+    peak: float, noise: float, lowest: float, highest: float
 ) -> None:
     values, t_ns = touched(400, peak, noise)
     on, _ = thresholds(values, t_ns)
-    assert least < on < most
+    assert lowest < on < highest
     distance = load(values, rest_level(values, t_ns, 0.2))
     assert (distance[:200] < on).all() and (distance[200:] >= on).all() == (peak > 0)
 
@@ -147,7 +147,7 @@ def test_sensors_of_unlike_units_have_thresholds_of_their_own() -> None:
     t_ns = np.arange(10) * 10_000_000
     loads = np.zeros((2, 10))
     loads[0, 2:4], loads[1, 7:9] = 150.0, 0.3
-    found = contact_intervals(loads, t_ns, np.array([120.0, 0.2]), np.array([80.0, 0.1]), 0.0, 0.0, 0.0)
-    assert found.tolist() == [[2, 4], [7, 9]]
+    spans = contact_intervals(loads, t_ns, np.array([120.0, 0.2]), np.array([80.0, 0.1]), 0.0, 0.0, 0.0)
+    assert spans.tolist() == [[2, 4], [7, 9]]
     loads[1, 2] = np.nan
     assert contact_intervals(loads, t_ns, 120.0, 80.0, 0.0, 0.0, 0.0).tolist() == [[3, 4]]

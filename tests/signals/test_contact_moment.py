@@ -35,8 +35,8 @@ def test_contact_is_where_the_later_finger_leaves_rest() -> None:
 def test_a_finger_that_was_knocked_at_rest_still_touches_where_it_presses() -> None:
     pressure, t_ns = closing()
     pressure[10:30, 1] += 180.0  # three times the noise that this makes is more than the grasp's own rise
-    found = contact_row(pressure, t_ns, LIMITS)
-    assert 160 <= found <= 164
+    row = contact_row(pressure, t_ns, LIMITS)
+    assert 160 <= row <= 164
 
 
 @settings(max_examples=50, deadline=None)
@@ -67,16 +67,16 @@ def test_a_touch_that_is_let_go_is_no_contact() -> None:
 
 def test_the_reading_begins_where_both_pressures_rest() -> None:
     pressure, t_ns = closing(150, 160, ramp=40)
-    found = settled_rows(pressure, t_ns, 161, LIMITS)
-    assert found == slice(200, 220)
+    settled = settled_rows(pressure, t_ns, 161, LIMITS)
+    assert settled == slice(200, 220)
     assert settled_rows(pressure, t_ns, 161, replace(LIMITS, settled_count=10.0)) == slice(198, 218)  # 5 counts a row
     assert settled_rows(pressure, t_ns, 250, LIMITS) == slice(250, 270)
 
 
 def test_the_rows_of_a_reading_follow_from_the_rate() -> None:
     pressure, t_ns = closing()
-    found = settled_rows(pressure, 5 * t_ns, 161, LIMITS)
-    assert found.stop - found.start == 4
+    settled = settled_rows(pressure, 5 * t_ns, 161, LIMITS)
+    assert settled.stop - settled.start == 4
 
 
 def test_a_finger_that_never_presses_is_told_with_its_rise() -> None:

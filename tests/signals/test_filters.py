@@ -18,29 +18,29 @@ signals = hnp.arrays(np.float64, st.integers(10, 120), elements=st.floats(-1e4, 
 @pytest.mark.parametrize(("cutoff_hz", "rate_hz"), [(5.0, 50.0), (24.9, 50.0), (0.01, 1000.0)])
 def test_the_coefficients_are_those_of_scipy(cutoff_hz: float, rate_hz: float) -> None:
     b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
-    found = butterworth(cutoff_hz, rate_hz)
-    np.testing.assert_allclose(found.b, b, rtol=1e-9)
-    np.testing.assert_allclose((1.0, *found.a), a, rtol=1e-9)
+    coefficients = butterworth(cutoff_hz, rate_hz)
+    np.testing.assert_allclose(coefficients.b, b, rtol=1e-9)
+    np.testing.assert_allclose((1.0, *coefficients.a), a, rtol=1e-9)
 
 
 @given(signals)
 def test_forwards_it_is_lfilter_that_starts_from_a_constant(values: np.ndarray) -> None:
     b, a = signal.butter(2, 5.0, fs=50.0)
-    wanted, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
-    np.testing.assert_allclose(butterworth(5.0, 50.0).causal(values), wanted, atol=1e-8)
+    expected, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
+    np.testing.assert_allclose(butterworth(5.0, 50.0).causal(values), expected, atol=1e-8)
 
 
 @given(signals)
 def test_both_ways_it_is_filtfilt(values: np.ndarray) -> None:
-    wanted = signal.filtfilt(*signal.butter(2, 5.0, fs=50.0), values)
-    np.testing.assert_allclose(butterworth(5.0, 50.0).both_ways(values), wanted, atol=1e-7)
+    expected = signal.filtfilt(*signal.butter(2, 5.0, fs=50.0), values)
+    np.testing.assert_allclose(butterworth(5.0, 50.0).both_ways(values), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2, 5])
 def test_few_rows_that_are_alike_stay_as_they_are(rows: int) -> None:
     filtered = butterworth(5.0, 50.0)
-    for found in (filtered.causal(np.full(rows, 3.0)), filtered.both_ways(np.full(rows, 3.0))):
-        np.testing.assert_allclose(found, np.full(rows, 3.0))
+    for smoothed in (filtered.causal(np.full(rows, 3.0)), filtered.both_ways(np.full(rows, 3.0))):
+        np.testing.assert_allclose(smoothed, np.full(rows, 3.0))
 
 
 @given(signals, st.sampled_from([1, 3, 5, 9]))

@@ -10,7 +10,7 @@ from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import IIWA14, PANDA, Chain
 
-TOOL = np.array([0.01, -0.02, 0.2])  # of the hand in the last link's frame, m
+TOOL = np.array([0.01, -0.02, 0.2])  # Position of the hand in the last link's frame, m
 STEP_S = 1e-4
 
 
@@ -24,28 +24,28 @@ def joints(rows: int = 200) -> tuple[AnyFloats, AnyFloats]:
 def elementary(joint_rad: AnyFloats, chain: Chain = PANDA) -> list[AnyFloats]:
     """The frames of one row as Craig has them: turn and shift along x, then turn and shift along z."""
     reached: AnyFloats = np.eye(4)
-    found: list[AnyFloats] = []
+    frames: list[AnyFloats] = []
     for angle, length, offset, twist in zip(joint_rad, chain.length_m, chain.offset_m, chain.twist_rad, strict=True):
         for axis, turn, shift in (("x", twist, [length, 0, 0]), ("z", angle, [0, 0, offset])):
             step = np.eye(4)
             step[:3, :3], step[:3, 3] = Rotation.from_euler(axis, turn).as_matrix(), shift
             reached = reached @ step
-        found.append(reached)
-    return found
+        frames.append(reached)
+    return frames
 
 
 def hand(joint_rad: AnyFloats) -> AnyFloats:
     last = kinematics.joint_frames(PANDA, joint_rad)[:, -1]
-    found: AnyFloats = last[:, :3, :3] @ TOOL + last[:, :3, 3]
-    return found
+    position: AnyFloats = last[:, :3, :3] @ TOOL + last[:, :3, 3]
+    return position
 
 
 @pytest.mark.parametrize("chain", [PANDA, IIWA14])
 def test_frames_are_the_product_of_elementary_motions(chain: Chain) -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (20, 7))
-    found = kinematics.joint_frames(chain, angles)
-    assert found.shape == (20, 7, 4, 4)
-    assert np.allclose(found, [elementary(row, chain) for row in angles], atol=1e-12)
+    frames = kinematics.joint_frames(chain, angles)
+    assert frames.shape == (20, 7, 4, 4)
+    assert np.allclose(frames, [elementary(row, chain) for row in angles], atol=1e-12)
 
 
 def test_a_panda_that_stands_upright_is_as_long_as_its_data_sheet_says() -> None:
@@ -66,13 +66,13 @@ def test_an_iiwa_is_as_long_as_its_data_sheet_says_upright_and_stretched_out() -
 def test_velocity_is_what_differences_of_the_hand_s_path_tell() -> None:
     angles, speeds = joints()
     place = hand(angles)
-    found = kinematics.hand_velocity(PANDA, angles, speeds, place)
+    velocity = kinematics.hand_velocity(PANDA, angles, speeds, place)
     linear = (place[2:] - place[:-2]) / (2 * STEP_S)
     turned = Rotation.from_matrix(kinematics.joint_frames(PANDA, angles)[:, -1, :3, :3])
     angular = (turned[2:] * turned[:-2].inv()).as_rotvec() / (2 * STEP_S)
-    assert np.abs(found[:, :3]).max() > 0.5
-    assert np.allclose(found[1:-1, :3], linear, atol=1e-4)
-    assert np.allclose(found[1:-1, 3:], angular, atol=1e-4)
+    assert np.abs(velocity[:, :3]).max() > 0.5
+    assert np.allclose(velocity[1:-1, :3], linear, atol=1e-4)
+    assert np.allclose(velocity[1:-1, 3:], angular, atol=1e-4)
 
 
 def test_a_rigid_tool_is_carried_and_another_arm_is_told_apart() -> None:
@@ -109,10 +109,10 @@ def test_differences_of_steady_motion_are_its_velocity(steps_ms: AnyArray) -> No
     velocity, turning = np.array([0.1, -0.2, 0.05]), np.array([0.3, 0.6, -0.9])
     start = Rotation.from_rotvec([0.2, -0.4, 1.0])
     quaternions = (Rotation.from_rotvec(time_s * turning) * start).as_quat()
-    found = kinematics.differences(t_ns, 1.0 + time_s * velocity, quaternions)
-    assert not found[0].any()
-    assert np.allclose(found[1:, :3], velocity)
-    assert np.allclose(found[1:, 3:], turning, rtol=1e-4)  # the sine of a small half angle for the angle
+    velocities = kinematics.differences(t_ns, 1.0 + time_s * velocity, quaternions)
+    assert not velocities[0].any()
+    assert np.allclose(velocities[1:, :3], velocity)
+    assert np.allclose(velocities[1:, 3:], turning, rtol=1e-4)  # the sine of a small half angle for the angle
 
 
 def test_differences_read_no_later_row() -> None:
@@ -127,6 +127,6 @@ def test_differences_read_no_later_row() -> None:
 
 
 def test_rows_of_the_same_time_have_no_velocity_instead_of_an_infinite_one() -> None:
-    found = kinematics.differences(np.array([0, 0, 10]), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
-    assert np.isfinite(found).all()
-    assert not found[1].any()
+    velocities = kinematics.differences(np.array([0, 0, 10]), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
+    assert np.isfinite(velocities).all()
+    assert not velocities[1].any()

@@ -38,15 +38,15 @@ def test_a_rate_that_is_not_positive_gives_no_grid(rate_hz: float) -> None:
 def test_linear_agrees_with_numpy_interp(t_ns: np.ndarray, data: st.DataObject) -> None:
     values = data.draw(hnp.arrays(np.float64, (len(t_ns), 3), elements=st.floats(-1e6, 1e6)))
     grid_ns = np.array(data.draw(st.lists(st.integers(-10, int(t_ns[-1]) + 10), min_size=1)))
-    found = resampling.linear(EPOCH_NS + t_ns, values, EPOCH_NS + grid_ns)
-    wanted = np.column_stack([np.interp(grid_ns, t_ns, channel) for channel in values.T])
-    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-6)
+    resampled = resampling.linear(EPOCH_NS + t_ns, values, EPOCH_NS + grid_ns)
+    expected = np.column_stack([np.interp(grid_ns, t_ns, channel) for channel in values.T])
+    np.testing.assert_allclose(resampled, expected, rtol=1e-9, atol=1e-6)
 
 
 def test_linear_does_not_lose_nanoseconds_of_today() -> None:
     t_ns = EPOCH_NS + np.array([0, 100])
-    found = resampling.linear(t_ns, np.array([[0.0], [100.0]]), EPOCH_NS + np.arange(101))
-    np.testing.assert_allclose(found[:, 0], np.arange(101), atol=1e-12)
+    resampled = resampling.linear(t_ns, np.array([[0.0], [100.0]]), EPOCH_NS + np.arange(101))
+    np.testing.assert_allclose(resampled[:, 0], np.arange(101), atol=1e-12)
 
 
 @given(stamps, st.data())
@@ -55,20 +55,20 @@ def test_the_bracketing_rows_are_all_that_interpolation_looks_at(t_ns: np.ndarra
     values = np.random.default_rng(0).normal(size=(len(t_ns), 2))
     grid_ns = np.array(data.draw(st.lists(st.integers(-10, int(t_ns[-1]) + 10), min_size=1)))
     used = resampling.bracketing_rows(t_ns, grid_ns)
-    wanted = resampling.linear(t_ns, values, grid_ns)
-    np.testing.assert_array_equal(resampling.linear(t_ns[used], values[used], grid_ns), wanted)
+    expected = resampling.linear(t_ns, values, grid_ns)
+    np.testing.assert_array_equal(resampling.linear(t_ns[used], values[used], grid_ns), expected)
 
 
 def test_of_equal_stamps_the_last_counts() -> None:
     t_ns = np.array([0, 10, 10, 20])
-    found = resampling.linear(t_ns, np.array([[0.0], [1.0], [5.0], [6.0]]), np.array([5, 10, 15]))
-    assert found[:, 0].tolist() == [0.5, 5.0, 5.5]
+    resampled = resampling.linear(t_ns, np.array([[0.0], [1.0], [5.0], [6.0]]), np.array([5, 10, 15]))
+    assert resampled[:, 0].tolist() == [0.5, 5.0, 5.5]
 
 
 def test_a_nan_spreads_to_its_neighbours_and_no_further() -> None:
     t_ns = np.array([0, 10, 20, 30])
-    found = resampling.linear(t_ns, np.array([[0.0], [1.0], [np.nan], [3.0]]), np.array([5, 10, 15, 20, 25, 30]))
-    assert np.isnan(found[:, 0]).tolist() == [False, False, True, True, True, False]
+    resampled = resampling.linear(t_ns, np.array([[0.0], [1.0], [np.nan], [3.0]]), np.array([5, 10, 15, 20, 25, 30]))
+    assert np.isnan(resampled[:, 0]).tolist() == [False, False, True, True, True, False]
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -78,24 +78,24 @@ def test_slerp_agrees_with_scipy(seed: int) -> None:
     turned = Rotation.from_quat(rng.normal(size=(12, 4)))
     grid_ns = rng.integers(t_ns[0], t_ns[-1] + 1, 50)
     scaled = turned.as_quat() * rng.choice([-2.0, 1.0, 0.5], 12)[:, None]
-    found = resampling.slerp(EPOCH_NS + t_ns, scaled, EPOCH_NS + grid_ns)
-    wanted = Slerp(t_ns, turned)(grid_ns)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
-    assert (Rotation.from_quat(found) * wanted.inv()).magnitude().max() < 1e-6
+    resampled = resampling.slerp(EPOCH_NS + t_ns, scaled, EPOCH_NS + grid_ns)
+    expected = Slerp(t_ns, turned)(grid_ns)
+    np.testing.assert_allclose(np.linalg.norm(resampled, axis=1), 1.0, atol=1e-12)
+    assert (Rotation.from_quat(resampled) * expected.inv()).magnitude().max() < 1e-6
 
 
 def test_slerp_of_equal_rotations_stays_there() -> None:
     rotation = np.array([[0.0, 0.6, 0.0, 0.8]])
-    found = resampling.slerp(np.array([0, 10]), np.repeat(rotation, 2, axis=0), np.arange(11))
-    np.testing.assert_allclose(found, np.repeat(rotation, 11, axis=0), atol=1e-15)
+    resampled = resampling.slerp(np.array([0, 10]), np.repeat(rotation, 2, axis=0), np.arange(11))
+    np.testing.assert_allclose(resampled, np.repeat(rotation, 11, axis=0), atol=1e-15)
 
 
 def test_slerp_has_no_jump_of_sign() -> None:
     angles = np.linspace(0, 4 * np.pi, 60)
     quaternions = np.column_stack([np.sin(angles / 2), 0 * angles, 0 * angles, np.cos(angles / 2)])
     quaternions[::3] *= -1
-    found = resampling.slerp(np.arange(60) * 10, quaternions, np.arange(0, 590, 7))
-    assert ((found[1:] * found[:-1]).sum(axis=1) > 0.9).all()
+    resampled = resampling.slerp(np.arange(60) * 10, quaternions, np.arange(0, 590, 7))
+    assert ((resampled[1:] * resampled[:-1]).sum(axis=1) > 0.9).all()
 
 
 @given(stamps, st.data())
@@ -108,9 +108,9 @@ def test_nearest_is_what_a_look_at_every_sample_finds(t_ns: np.ndarray, data: st
 
 def test_nearest_keeps_the_type_and_takes_the_earlier_of_two() -> None:
     values = np.array([1, 2], dtype=np.int8)
-    found = resampling.nearest(np.array([0, 10]), values, np.array([-5, 4, 5, 6, 50]))
-    assert found.dtype == np.int8
-    assert found.tolist() == [1, 1, 1, 2, 2]
+    resampled = resampling.nearest(np.array([0, 10]), values, np.array([-5, 4, 5, 6, 50]))
+    assert resampled.dtype == np.int8
+    assert resampled.tolist() == [1, 1, 1, 2, 2]
 
 
 def test_a_gap_lies_strictly_between_distant_samples_or_outside_all() -> None:
@@ -138,27 +138,27 @@ def test_the_median_around_a_point_is_that_of_all_samples_so_near(t_ns: np.ndarr
     values = np.random.default_rng(0).normal(size=(len(t_ns), 2))
     grid_ns = np.array(data.draw(st.lists(st.integers(-10, int(t_ns[-1]) + 10), min_size=1)))
     half_ns = data.draw(st.integers(0, 2 * 10**9))
-    found = resampling.median_around(EPOCH_NS + t_ns, values, EPOCH_NS + grid_ns, half_ns)
+    medians = resampling.median_around(EPOCH_NS + t_ns, values, EPOCH_NS + grid_ns, half_ns)
     between = resampling.linear(t_ns, values, grid_ns)
-    for point, row, line in zip(grid_ns, found, between, strict=True):
+    for point, row, line in zip(grid_ns, medians, between, strict=True):
         near = np.abs(t_ns - point) <= half_ns
-        wanted = np.median(values[near], axis=0) if near.any() else line
-        np.testing.assert_array_equal(row, wanted)
+        expected = np.median(values[near], axis=0) if near.any() else line
+        np.testing.assert_array_equal(row, expected)
 
 
 @given(stamps, st.lists(st.integers(0, 10**9), min_size=1, max_size=20))
 def test_the_newest_row_is_the_last_that_is_not_after_the_point(t_ns: np.ndarray, points: list[int]) -> None:
     t_ns, grid_ns = EPOCH_NS + np.repeat(t_ns, 2), EPOCH_NS + np.array(points)
     for point, row in zip(grid_ns, resampling.newest_rows(t_ns, grid_ns), strict=True):
-        wanted = [i for i, stamp in enumerate(t_ns) if stamp <= point]
-        assert row == (wanted[-1] if wanted else -1)
+        earlier_rows = [i for i, stamp in enumerate(t_ns) if stamp <= point]
+        assert row == (earlier_rows[-1] if earlier_rows else -1)
 
 
 def test_a_median_of_the_past_has_the_samples_of_its_span_or_the_newest() -> None:
     t_ns = EPOCH_NS + np.array([0, 10, 20, 30, 100])
     values = np.array([[5.0], [1.0], [9.0], [2.0], [4.0]])
-    found = resampling.median_before(t_ns, values, EPOCH_NS + np.array([0, 20, 35, 99, 100]), 20)
-    assert found[:, 0].tolist() == [5.0, 5.0, 5.5, 2.0, 4.0]
+    medians = resampling.median_before(t_ns, values, EPOCH_NS + np.array([0, 20, 35, 99, 100]), 20)
+    assert medians[:, 0].tolist() == [5.0, 5.0, 5.5, 2.0, 4.0]
 
 
 def test_a_stream_is_overdue_once_its_newest_sample_is_older_than_the_gap() -> None:

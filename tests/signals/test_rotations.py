@@ -14,21 +14,23 @@ from tacpipe.signals.rotations import continuous, quaternions_of
 @given(st.integers(0, 2**32 - 1))
 def test_a_matrix_gives_the_quaternion_that_scipy_gives(seed: int) -> None:
     turned = Rotation.from_quat(np.random.default_rng(seed).normal(size=(20, 4)))
-    found = quaternions_of(turned.as_matrix())
-    np.testing.assert_allclose(found, turned.as_quat(canonical=True), atol=1e-12)
+    quaternions = quaternions_of(turned.as_matrix())
+    np.testing.assert_allclose(quaternions, turned.as_quat(canonical=True), atol=1e-12)
 
 
 def test_half_turns_about_each_axis_do_not_divide_by_zero() -> None:
-    found = quaternions_of(np.array([np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1]), np.eye(3)]))
-    np.testing.assert_allclose(np.abs(found), np.eye(4), atol=1e-15)
+    quaternions = quaternions_of(
+        np.array([np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1]), np.eye(3)])
+    )
+    np.testing.assert_allclose(np.abs(quaternions), np.eye(4), atol=1e-15)
 
 
 def test_signs_follow_the_row_before_and_nan_stays_where_it_is() -> None:
     rows = np.array([[0, 0, 0, -2.0], [0, 0, 0, 1.0], [np.nan] * 4, [0, 0, 0.1, 1.0]])
-    found = continuous(rows)
-    assert found[0].tolist() == found[1].tolist() == [0.0, 0.0, 0.0, -1.0]
-    assert np.isnan(found[2]).all()
-    np.testing.assert_allclose(np.linalg.norm(found[3]), 1.0)
+    quaternions = continuous(rows)
+    assert quaternions[0].tolist() == quaternions[1].tolist() == [0.0, 0.0, 0.0, -1.0]
+    assert np.isnan(quaternions[2]).all()
+    np.testing.assert_allclose(np.linalg.norm(quaternions[3]), 1.0)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -46,17 +48,19 @@ def test_a_vector_or_three_angles_give_the_quaternion_that_scipy_gives(seed: int
     values = np.random.default_rng(seed).uniform(-3, 3, size=(20, 3))
     values[0] = 0
 
-    for found, expected in (
+    for quaternions, expected in (
         (rotations.quaternions_of_vectors(values), Rotation.from_rotvec(values)),
         (rotations.quaternions_of_angles(values), Rotation.from_euler("ZYX", values)),
     ):
-        np.testing.assert_allclose(found * np.sign(found[:, 3:] + 1e-300), expected.as_quat(canonical=True), atol=1e-12)
+        np.testing.assert_allclose(
+            quaternions * np.sign(quaternions[:, 3:] + 1e-300), expected.as_quat(canonical=True), atol=1e-12
+        )
 
 
 def test_angles_with_the_second_at_a_right_angle_still_give_the_rotation() -> None:
-    told = np.radians([[30.0, 90.0, 0.0], [30.0, -90.0, 20.0], [170.0, 90.0, -60.0]])
-    turned = rotations.quaternions_of_angles(told)
+    angles_rad = np.radians([[30.0, 90.0, 0.0], [30.0, -90.0, 20.0], [170.0, 90.0, -60.0]])
+    turned = rotations.quaternions_of_angles(angles_rad)
 
-    again = rotations.quaternions_of_angles(rotations.angles_of(turned))
+    restored = rotations.quaternions_of_angles(rotations.angles_of(turned))
 
-    np.testing.assert_allclose(np.abs((again * turned).sum(axis=1)), 1, atol=1e-12)
+    np.testing.assert_allclose(np.abs((restored * turned).sum(axis=1)), 1, atol=1e-12)

@@ -24,23 +24,23 @@ def test_runs_cover_what_is_on_and_nothing_else(state: np.ndarray) -> None:
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans())))
 def test_a_latch_does_what_a_loop_does(rows: list[tuple[bool, bool]]) -> None:
-    state, wanted = False, []
+    state, expected = False, []
     for on, off in rows:
         state = on or (state and not off)
-        wanted.append(state)
+        expected.append(state)
     switches = np.array(rows, dtype=bool).reshape(-1, 2)
-    assert latched(switches[:, 0], switches[:, 1]).tolist() == wanted
+    assert latched(switches[:, 0], switches[:, 1]).tolist() == expected
 
 
 @given(flags, st.integers(1, 6))
 def test_what_lasts_is_told_from_the_rows_so_far(state: np.ndarray, rows: int) -> None:
-    wanted = [i + 1 >= rows and bool(state[i + 1 - rows : i + 1].all()) for i in range(len(state))]
-    assert lasting(state, rows).tolist() == wanted
+    expected = [i + 1 >= rows and bool(state[i + 1 - rows : i + 1].all()) for i in range(len(state))]
+    assert lasting(state, rows).tolist() == expected
 
 
 @given(flags, st.integers(1, 6))
 def test_a_long_run_is_one_that_lasts_with_what_led_up_to_it(state: np.ndarray, rows: int) -> None:
-    wanted = np.zeros(len(state), dtype=bool)
+    expected = np.zeros(len(state), dtype=bool)
     for i in np.flatnonzero(lasting(state, rows)):
-        wanted[i + 1 - rows : i + 1] = True
-    assert in_long_runs(state, rows).tolist() == wanted.tolist()
+        expected[i + 1 - rows : i + 1] = True
+    assert in_long_runs(state, rows).tolist() == expected.tolist()

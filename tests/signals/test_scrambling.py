@@ -15,19 +15,19 @@ slides = hnp.arrays(np.float32, hnp.array_shapes(min_dims=3, max_dims=5, max_sid
 
 @given(slides)
 def test_both_ways_undo_each_other_to_the_bit(given_slides: np.ndarray) -> None:
-    for there, back in ((scramble, unscramble), (unscramble, scramble)):
-        assert back(there(given_slides)).tobytes() == np.ascontiguousarray(given_slides).tobytes()
-        assert there(given_slides).shape == given_slides.shape
+    for forward, backward in ((scramble, unscramble), (unscramble, scramble)):
+        assert backward(forward(given_slides)).tobytes() == np.ascontiguousarray(given_slides).tobytes()
+        assert forward(given_slides).shape == given_slides.shape
 
 
 @given(st.integers(1, 7), st.integers(1, 4), st.integers(1, 9))
 def test_each_reading_goes_where_the_formula_says(triangles: int, taxels: int, frames: int) -> None:
-    whole = np.random.default_rng(0).random((2, triangles, taxels, frames))
-    found = scramble(whole)
+    readings = np.random.default_rng(0).random((2, triangles, taxels, frames))
+    scrambled = scramble(readings)
     for row in range(triangles):
         for place in range(frames):
             turn = frames * row + place
-            assert np.array_equal(found[:, row, :, place], whole[:, turn % triangles, :, turn // triangles])
+            assert np.array_equal(scrambled[:, row, :, place], readings[:, turn % triangles, :, turn // triangles])
 
 
 def test_what_is_scrambled_has_no_time_axis_and_what_is_not_has() -> None:

@@ -1,4 +1,4 @@
-"""Where a slide begins and ends, which of its rows are kept, and what is said of one that is not as it should be."""
+"""The limits of a slide, its retained rows, and the departures of one that is not as it should be."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def test_no_frames_and_unknown_crops_are_refused() -> None:
 
 
 def test_phases_are_minus_one_before_zero_within_and_one_behind() -> None:
-    found = slides.phases(6, (2, 4))
-    assert found.dtype == np.int8
-    assert found.tolist() == [-1, -1, 0, 0, 1, 1]
+    phases = slides.phases(6, (2, 4))
+    assert phases.dtype == np.int8
+    assert phases.tolist() == [-1, -1, 0, 0, 1, 1]
     assert slides.phases(3, (0, 3)).tolist() == [0, 0, 0]
 
 
@@ -86,7 +86,7 @@ def test_a_slide_is_told_by_its_mean_pressure_and_force_and_its_median_speed() -
 
 
 @pytest.mark.parametrize(
-    ("lasts_s", "pressure", "speed_m_s", "told"),
+    ("lasts_s", "pressure", "speed_m_s", "expected"),
     [
         (8.0, 40.0, 0.025, []),
         (8.0, 40.0, None, []),
@@ -98,9 +98,9 @@ def test_a_slide_is_told_by_its_mean_pressure_and_force_and_its_median_speed() -
     ],
 )
 def test_each_way_to_leave_the_protocol_is_told(
-    lasts_s: float, pressure: float, speed_m_s: float | None, told: list[str]
+    lasts_s: float, pressure: float, speed_m_s: float | None, expected: list[str]
 ) -> None:
-    known = {"pressure_mean_count": pressure, **({} if speed_m_s is None else {"speed_m_s": speed_m_s})}
-    found = slides.departures(PROTOCOL, lasts_s, known)
-    assert len(found) == len(told)
-    assert all(one.startswith(wanted) for one, wanted in zip(found, told, strict=True))
+    measures = {"pressure_mean_count": pressure, **({} if speed_m_s is None else {"speed_m_s": speed_m_s})}
+    departures = slides.departures(PROTOCOL, lasts_s, measures)
+    assert len(departures) == len(expected)
+    assert all(departure.startswith(beginning) for departure, beginning in zip(departures, expected, strict=True))

@@ -1,4 +1,4 @@
-"""Slip told from a proximity sensor at 400 Hz, against the relative velocity that made its readings."""
+"""Slip detected from a proximity sensor at 400 Hz, against the relative velocity that made its readings."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ def online(values: np.ndarray) -> np.ndarray:
     return slip.slip_online(values, RATE_HZ, CUTOFF_HZ, STILL, LIMITS)
 
 
-def f1(found: np.ndarray, truth: np.ndarray) -> float:
-    return float(2 * (found & truth).sum() / (found.sum() + truth.sum()))
+def f1(predicted: np.ndarray, truth: np.ndarray) -> float:
+    return float(2 * (predicted & truth).sum() / (predicted.sum() + truth.sum()))
 
 
 @pytest.mark.parametrize(
-    ("noise", "sharp", "least"), [(1, True, 0.95), (1, False, 0.92), (5, True, 0.80), (5, False, 0.80)]
+    ("noise", "sharp", "lowest"), [(1, True, 0.95), (1, False, 0.92), (5, True, 0.80), (5, False, 0.80)]
 )
-def test_slips_are_those_of_the_relative_velocity(noise: int, sharp: bool, least: float) -> None:
+def test_slips_are_those_of_the_relative_velocity(noise: int, sharp: bool, lowest: float) -> None:
     rng = np.random.default_rng(noise)
     trials = [readings(slipping(rng, sharp=sharp), noise * NOISE_COUNT, rng) for _ in range(40)]
     assert (
-        f1(np.concatenate([offline(values) for values, _ in trials]), np.concatenate([t for _, t in trials])) >= least
+        f1(np.concatenate([offline(values) for values, _ in trials]), np.concatenate([t for _, t in trials])) >= lowest
     )
 
 
@@ -83,11 +83,11 @@ def test_the_steps_of_whole_counts_are_no_slip() -> None:
 def test_the_online_label_does_not_know_the_future(seed: int, now: int) -> None:
     rng = np.random.default_rng(seed)
     values, _ = readings(slipping(rng), NOISE_COUNT, rng)
-    other = values.copy()
-    other[now:] += rng.normal(0, 50, len(values) - now).cumsum()
-    assert online(values)[:now].tolist() == online(other)[:now].tolist()
-    lost, other_lost = (slip.dropped_online(one, STILL, 200.0, 544.0) for one in (values, other))
-    assert lost[:now].tolist() == other_lost[:now].tolist()
+    altered = values.copy()
+    altered[now:] += rng.normal(0, 50, len(values) - now).cumsum()
+    assert online(values)[:now].tolist() == online(altered)[:now].tolist()
+    lost, altered_lost = (slip.dropped_online(trial, STILL, 200.0, 544.0) for trial in (values, altered))
+    assert lost[:now].tolist() == altered_lost[:now].tolist()
 
 
 def test_two_slips_that_follow_at_once_are_two() -> None:
@@ -103,7 +103,7 @@ def test_two_slips_that_follow_at_once_are_two() -> None:
 def test_the_online_label_comes_within_a_tenth_of_a_second() -> None:
     rng = np.random.default_rng(3)
     speed = np.zeros(4800)
-    speed[1600:2000] = 20.0  # from 4 s on
+    speed[1600:2000] = 20.0  # The slip starts at 4 s
     values, _ = readings(speed, NOISE_COUNT, rng)
     assert 200 < int(online(values).argmax()) <= 207
     assert not online(values)[:200].any()
@@ -112,15 +112,15 @@ def test_the_online_label_comes_within_a_tenth_of_a_second() -> None:
 @pytest.mark.parametrize("rate_count_s", [-40.0, 300.0])
 def test_a_ramp_has_its_slope_for_a_rate(rate_count_s: float) -> None:
     ramp = 600.0 + rate_count_s / RATE_HZ * np.arange(300, dtype=np.float64)
-    for found in (slip.rate(ramp, RATE_HZ, CUTOFF_HZ), slip.rate_so_far(ramp, RATE_HZ, CUTOFF_HZ)):
-        np.testing.assert_allclose(found[40:-10], rate_count_s, rtol=1e-3)
+    for slope in (slip.rate(ramp, RATE_HZ, CUTOFF_HZ), slip.rate_so_far(ramp, RATE_HZ, CUTOFF_HZ)):
+        np.testing.assert_allclose(slope[40:-10], rate_count_s, rtol=1e-3)
 
 
 def test_an_object_is_lost_beyond_the_patch_or_where_the_sensor_sees_no_more() -> None:
     values = REST_COUNT - np.r_[np.zeros(50), np.arange(0, 220, 5.0), np.full(50, 0.0)]
     lost = slip.dropped(values, STILL, 200.0, 0.0)
     assert int(lost.argmax()) == 50 + 41  # the first of 205 counts
-    assert lost[91:].all()  # what was lost does not come back
+    assert lost[91:].all()  # The lost object does not come back
     assert slip.dropped_online(values, STILL, 200.0, 0.0).argmax() == 50 + 41 + 2  # until a median of five has it
     assert slip.dropped(values, STILL, 1000.0, 640.0).argmax() == 50 + 20
     assert not slip.dropped(values, STILL, 1000.0, 0.0).any()
@@ -135,8 +135,8 @@ def test_a_reading_that_is_missing_is_the_last_one() -> None:
 
 @pytest.mark.parametrize("rows", [0, 1, 2, 5])
 def test_few_rows_slip_nowhere(rows: int) -> None:
-    for found in (offline(np.ones(rows)), online(np.ones(rows)), slip.dropped(np.ones(rows), STILL, 200.0, 0.0)):
-        assert found.tolist() == [False] * rows
+    for labels in (offline(np.ones(rows)), online(np.ones(rows)), slip.dropped(np.ones(rows), STILL, 200.0, 0.0)):
+        assert labels.tolist() == [False] * rows
 
 
 @pytest.mark.parametrize(

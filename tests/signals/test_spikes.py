@@ -14,7 +14,7 @@ from tacpipe.signals.repairs import hampel
 
 
 def spike(values: list[int], row: int, deviations: float, floor: float) -> bool:
-    """Tell by the book whether the row, which is far from both ends, is one among seven."""
+    """Return whether the row, which is far from both ends, is a spike among seven rows by definition."""
     window = values[row - 3 : row + 4]
     middle = statistics.median(window)
     spread = 1.4826 * statistics.median([abs(value - middle) for value in window])
@@ -23,11 +23,11 @@ def spike(values: list[int], row: int, deviations: float, floor: float) -> bool:
 
 @given(hnp.arrays(np.uint16, st.integers(7, 30), elements=st.integers(0, 40)), st.floats(0, 20), st.floats(0.5, 5))
 def test_a_spike_is_one_by_the_book(values: np.ndarray, floor: float, deviations: float) -> None:
-    found, repaired = hampel(values[:, None], 7, deviations, floor)
+    flagged, repaired = hampel(values[:, None], 7, deviations, floor)
     for row in range(3, len(values) - 3):
-        assert found[row, 0] == spike(values.tolist(), row, deviations, floor)
-        wanted = statistics.median(values[row - 3 : row + 4].tolist()) if found[row, 0] else values[row]
-        assert repaired[row, 0] == wanted
+        assert flagged[row, 0] == spike(values.tolist(), row, deviations, floor)
+        expected = statistics.median(values[row - 3 : row + 4].tolist()) if flagged[row, 0] else values[row]
+        assert repaired[row, 0] == expected
 
 
 @pytest.mark.parametrize("row", [0, 1, 15, 29])
@@ -35,12 +35,12 @@ def test_a_glitch_is_mended_wherever_it_stands_and_its_type_stays(row: int) -> N
     values = np.random.default_rng(0).integers(10, 30, (30, 4)).astype(np.uint16)
     broken = values.copy()
     broken[row, 2] = 3425
-    found, repaired = hampel(broken, 7, 5.0, 255.0)
-    assert np.argwhere(found).tolist() == [[row, 2]]
+    flagged, repaired = hampel(broken, 7, 5.0, 255.0)
+    assert np.argwhere(flagged).tolist() == [[row, 2]]
     assert 10 <= repaired[row, 2] < 30
     assert repaired.dtype == np.uint16
     assert np.array_equal(np.delete(repaired.ravel(), row * 4 + 2), np.delete(values.ravel(), row * 4 + 2))
-    assert broken[row, 2] == 3425  # what was given is not changed
+    assert broken[row, 2] == 3425  # The input is not changed
 
 
 def test_steps_of_a_flat_signal_are_none() -> None:
@@ -58,6 +58,6 @@ def test_an_edge_of_a_step_is_no_spike() -> None:
 @pytest.mark.parametrize(("rows", "length"), [(1, 10), (7, 3), (7, 1), (7, 0)])
 def test_without_neighbours_there_is_nothing_to_compare_with(rows: int, length: int) -> None:
     values = np.arange(length, dtype=np.float64)[:, None] * 1000
-    found, repaired = hampel(values, rows, 5.0, 0.0)
-    assert not found.any()
+    flagged, repaired = hampel(values, rows, 5.0, 0.0)
+    assert not flagged.any()
     assert np.array_equal(repaired, values)

@@ -29,12 +29,12 @@ def test_the_windows_are_those_that_a_look_at_every_start_finds(
 ) -> None:
     groups, usable = np.array([row[0] for row in rows]), np.array([row[1] for row in rows], dtype=bool)
     length = context + horizon
-    wanted = [
+    expected = [
         start
         for start in range(len(rows) - length + 1)
         if usable[start : start + length].all() and len(set(groups[start : start + length])) == 1
     ]
-    assert window_starts(groups, usable, context, horizon).tolist() == wanted
+    assert window_starts(groups, usable, context, horizon).tolist() == expected
 
 
 def test_a_window_without_length_is_refused() -> None:

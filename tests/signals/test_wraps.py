@@ -16,9 +16,9 @@ steps = hnp.arrays(np.int32, st.integers(1, 60), elements=st.integers(-32_767, 3
 @given(st.integers(0, 65_535), steps)
 def test_a_walk_that_was_cut_to_16_bits_comes_back(first: int, moved: np.ndarray) -> None:
     walk = first + np.cumsum(moved) - moved[0]
-    found = unwrapped(walk.astype(np.uint16))
-    assert found.tolist() == walk.tolist()
-    np.testing.assert_array_equal(found, np.unwrap((walk % 65_536).astype(np.int64), period=65_536))
+    restored = unwrapped(walk.astype(np.uint16))
+    assert restored.tolist() == walk.tolist()
+    np.testing.assert_array_equal(restored, np.unwrap((walk % 65_536).astype(np.int64), period=65_536))
     signed = unwrapped((walk - 32_768).astype(np.int16))
     np.testing.assert_array_equal(signed, walk - 32_768)
 

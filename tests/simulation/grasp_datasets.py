@@ -26,17 +26,19 @@ class GraspShard(FakeRecording):
 
 
 def grasps(rig: Rig, indices: Iterable[int], *, seed: int = SEED) -> Any:
-    """The trials ``indices`` of a rig that is not raw."""
+    """Return the trials ``indices`` of a rig that is not raw."""
     shards: dict[str, Any] = {}
     for index in indices:
-        made = simulate_trial(seed, index, rig)
+        trial = simulate_trial(seed, index, rig)
         name = f"trial-{index:05d}"
-        shards[name] = GraspShard(made.streams, name, made.attributes)
+        shards[name] = GraspShard(trial.streams, name, trial.attributes)
     return FakeDataset(shards, {})
 
 
-def readings(made: Any, target: str, stream: str = "reading", prefix: str = "") -> Floats:
-    """What was read of a target (grasp, value), counts; with ``truth`` and ``gt_expected_`` what was to be expected."""
+def readings(dataset: Any, target: str, stream: str = "reading", prefix: str = "") -> Floats:
+    """Return the readings of a target in counts (grasp, value); ``truth`` and ``gt_expected_`` select the expected ones."""
     columns = [prefix + column for column in biotac_sp.columns(target)]
-    rows = [[shard.table(stream).column(column)[0].as_py() for column in columns] for shard in made.recordings.values()]
+    rows = [
+        [shard.table(stream).column(column)[0].as_py() for column in columns] for shard in dataset.recordings.values()
+    ]
     return np.array(rows, np.float64)

@@ -13,22 +13,27 @@ SEED = 3
 
 
 def index(sensor: str, material: int, number: int, rig: Rig) -> int:
-    """The trial that is the ``number``-th of a sensor on a material."""
+    """Return the index of the ``number``-th trial of a sensor on a material."""
     return 2 * rig.materials * number + 2 * (material - 1) + SENSORS.index(sensor)
 
 
 def indices(rig: Rig, sensors: Iterable[str], numbers: Iterable[int]) -> list[int]:
-    kept = list(numbers)
-    return [index(one, kind, number, rig) for one in sensors for kind in range(1, rig.materials + 1) for number in kept]
+    number_list = list(numbers)
+    return [
+        index(sensor, kind, number, rig)
+        for sensor in sensors
+        for kind in range(1, rig.materials + 1)
+        for number in number_list
+    ]
 
 
 def slides(rig: Rig, chosen: Iterable[int], *, seed: int = SEED, frames: int = 400) -> Any:
-    """The slides of the trials ``chosen``, as `tacpipe segment slides` gives them."""
+    """Return the slides of the trials ``chosen``, as `tacpipe segment slides` gives them."""
     stage = load("segment.slides")
     shards = []
-    for one in chosen:
-        made = simulate_trial(seed, one, rig)
-        name = f"{made.attributes['sensor']}-{one:05d}"
-        cut = stage(stage.params(frames=frames), Slide(made.streams, name, made.attributes))
-        shards.append(Slide(cut.streams, name, {**made.attributes, **cut.attributes}))
+    for number in chosen:
+        trial = simulate_trial(seed, number, rig)
+        name = f"{trial.attributes['sensor']}-{number:05d}"
+        cut = stage(stage.params(frames=frames), Slide(trial.streams, name, trial.attributes))
+        shards.append(Slide(cut.streams, name, {**trial.attributes, **cut.attributes}))
     return dataset(*shards)

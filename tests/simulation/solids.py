@@ -27,7 +27,7 @@ SHAPES: dict[str, Shape] = {
 
 
 def level(name: str, at_m: Floats) -> Floats:
-    """How far points are outside (point,), in metres or in what grows with them: 0 on the surface, negative within."""
+    """Return how far points are outside (point,), in metres or a monotonic measure: 0 on the surface, negative inside."""
     x, y, z = at_m.T
     if name == "box":
         return np.asarray(np.max(np.abs(at_m) - [0.02, 0.03, 0.045], axis=1))
@@ -37,13 +37,13 @@ def level(name: str, at_m: Floats) -> Floats:
     if name in ("cylinder", "cone"):
         radius, half = (0.03 + 0 * z, 0.04) if name == "cylinder" else (0.03 - 0.2 * z, 0.05)
         return np.asarray(np.maximum(np.hypot(x, y) - radius, np.abs(z) - half))
-    angles = np.linspace(-2.0, 2.0, 4001)  # the bow: balls along its arc
+    angles = np.linspace(-2.0, 2.0, 4001)  # The bow is a union of balls along its arc.
     arc = 0.04 * np.column_stack([np.cos(angles) - np.sin(2.0) / 2.0, np.sin(angles), 0 * angles])
     return np.array([np.sqrt(((arc - point) ** 2).sum(axis=1).min()) for point in at_m]) - 0.012
 
 
 def rays(name: str, count: int, seed: int) -> tuple[Floats, Floats]:
-    """Rays from afar to places in and about a body: origins and directions (ray, xyz), of any length."""
+    """Return rays from afar to places in and around a body: origins and directions (ray, xyz), of any length."""
     rng = np.random.default_rng(seed)
     shape = SHAPES[name]
     origin = rng.normal(size=(count, 3))
@@ -53,7 +53,7 @@ def rays(name: str, count: int, seed: int) -> tuple[Floats, Floats]:
 
 
 def surface(name: str, count: int, seed: int = 0) -> Floats:
-    """Points of a body's surface that rays have found (point, xyz)."""
+    """Return points of a body's surface that rays have found (point, xyz)."""
     origin, direction = rays(name, 8 * count, seed)
     way = SHAPES[name].hit(origin, direction)
     met = np.flatnonzero(np.isfinite(way))[:count]
@@ -61,5 +61,5 @@ def surface(name: str, count: int, seed: int = 0) -> Floats:
 
 
 def second_differences(height: Callable[[float], float], step: float) -> float:
-    """The second derivative of a function at 0."""
+    """Return the second derivative of a function at 0."""
     return (height(step) - 2 * height(0.0) + height(-step)) / step**2

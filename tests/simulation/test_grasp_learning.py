@@ -1,4 +1,4 @@
-"""What models of touch learn on the simulated table, where it is known what can be learned."""
+"""Models of touch are trained on the simulated table, whose irreducible error is known."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ def trained(training: Any, workspace: Path, **changed: Any) -> dict[str, bytes]:
 
 def evaluated(training: Any, tested: Any, workspace: Path, **changed: Any) -> Metrics:
     files = trained(training, workspace, **changed)
-    found: Metrics = json.loads(touch_evaluation.evaluate(files, tested).files["metrics.json"])
-    return found
+    metrics: Metrics = json.loads(touch_evaluation.evaluate(files, tested).files["metrics.json"])
+    return metrics
 
 
 def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_are_moved_together(
     tmp_path: Path,
 ) -> None:
-    made = grasps(Rig(), range(60))
-    strong = TouchModel.load(trained(made, tmp_path, trees=20, leaf=2))
+    dataset = grasps(Rig(), range(60))
+    strong = TouchModel.load(trained(dataset, tmp_path, trees=20, leaf=2))
     rng = np.random.default_rng(0)
-    for shard in list(made.recordings.values())[:12]:
+    for shard in list(dataset.recordings.values())[:12]:
         cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
         moved = Cloud((cloud.points_m @ turn.T + shift_m).astype(np.float32), cloud.colours)
-        one, other = strong.predict(cloud, grasp), strong.predict(moved, grasp.moved(turn, shift_m))
+        reading, moved_reading = strong.predict(cloud, grasp), strong.predict(moved, grasp.moved(turn, shift_m))
         for target in biotac_sp.TARGETS:
-            np.testing.assert_allclose(getattr(other, target), getattr(one, target), rtol=1e-3)
+            np.testing.assert_allclose(getattr(moved_reading, target), getattr(reading, target), rtol=1e-3)
 
 
 @pytest.mark.long
@@ -82,27 +82,26 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
 
 @pytest.mark.long
 def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
-    rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # drift would be learned from time
+    rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # Drift would be learned from time.
     training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))
-    told = evaluated(training, tested, tmp_path, leaf=2)
+    metrics = evaluated(training, tested, tmp_path, leaf=2)
     for target in biotac_sp.TARGETS:
         bound = float(np.sqrt(readings(tested, target, "truth", "gt_variance_").mean()))
-        assert (
-            0.9 * bound <= told["model"]["rmse_counts"][target] <= 1.3 * bound
-        )  # 200 grasps tell the bound to a tenth
-        assert told["model"]["rmse_counts"][target] < told["constant"]["rmse_counts"][target]
+        # 200 grasps determine the bound to a tenth.
+        assert 0.9 * bound <= metrics["model"]["rmse_counts"][target] <= 1.3 * bound
+        assert metrics["model"]["rmse_counts"][target] < metrics["constant"]["rmse_counts"][target]
 
 
 @pytest.fixture
 def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The geometry of a grasp is worked out once, however many models read it."""
-    real, known = geometry.features, dict[bytes, dict[str, float]]()
+    """Compute the geometry of each grasp once, however many models read it."""
+    compute_features, cached_features = geometry.features, dict[bytes, dict[str, float]]()
 
     def features(cloud: Cloud, grasp: Grasp) -> dict[str, float]:
         key = pickle.dumps((cloud, grasp))
-        if key not in known:
-            known[key] = real(cloud, grasp)
-        return dict(known[key])
+        if key not in cached_features:
+            cached_features[key] = compute_features(cloud, grasp)
+        return dict(cached_features[key])
 
     monkeypatch.setattr(geometry, "features", features)
 
@@ -110,12 +109,12 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("remembered")
 def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
-    made = grasps(Rig(drift_count_day=0.0), range(240))
-    names = list(made.recordings)
+    dataset = grasps(Rig(drift_count_day=0.0), range(240))
+    names = list(dataset.recordings)
     gains: dict[str, list[float]] = {target: [] for target in biotac_sp.TARGETS}
     for fold in range(4):
         training, tested = (
-            type(made)({name: made.recordings[name] for name in part}, {}) for part in _parted(names, fold)
+            type(dataset)({name: dataset.recordings[name] for name in part}, {}) for part in _parted(names, fold)
         )
         errors = [
             evaluated(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
@@ -136,16 +135,16 @@ def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and
     small = {**POINTNET, "targets": "e_th,e_mf", "multi_target": True, "points": 32, "epochs": 20}
     errors = {}
     for inputs in ("xyz", "xyzcont"):
-        told = evaluated(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})
-        errors[inputs] = told["model"]["rmse"]
-    mean = told["object_mean"]["rmse"]
+        metrics = evaluated(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})
+        errors[inputs] = metrics["model"]["rmse"]
+    mean = metrics["object_mean"]["rmse"]
     for target in ("e_th", "e_mf"):
         assert errors["xyz"][target] >= 0.95 * mean[target]
         assert errors["xyzcont"][target] < 0.95 * mean[target]
 
 
 def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
-    """Three quarters of the names, and the quarter that the fold tests."""
+    """Return three quarters of the names, and the quarter that the fold tests."""
     tested = names[fold::4]
     return [name for name in names if name not in tested], tested
 
@@ -155,21 +154,21 @@ def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
 def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_were_drawn(
     points: int, tmp_path: Path
 ) -> None:
-    made = grasps(Rig(), range(80))
-    files = trained(made, tmp_path, **{**POINTNET, "points": points, "epochs": 5, "draws": 1, "targets": "pdc_th"})
+    dataset = grasps(Rig(), range(80))
+    files = trained(dataset, tmp_path, **{**POINTNET, "points": points, "epochs": 5, "draws": 1, "targets": "pdc_th"})
     network = TouchModel.load(files)
-    spread = _spread_over_draws(network, made)
+    spread = _spread_over_draws(network, dataset)
     assert spread > 0
-    assert points == 32 or spread < 0.25  # share of what the pressure differs by from grasp to grasp
+    assert points == 32 or spread < 0.25  # Fraction of the pressure's deviation between grasps.
 
 
-def _spread_over_draws(network: Any, made: Any) -> float:
+def _spread_over_draws(network: Any, dataset: Any) -> float:
     from tacpipe.tasks.touch import grasps as grasps_of
     from tacpipe.tasks.touch import members
     from tacpipe.tasks.touch.members import output
 
-    some = grasps_of.read(made)
+    grasp_set = grasps_of.read(dataset)
     (member,) = network.members
-    drawn = members.sources(member.params, some)
-    visits = [output(member.network, drawn.fixed(range(len(some)), visit)).detach().numpy() for visit in range(8)]
-    return float(np.std(visits, axis=0).mean() / np.std(member.scale.apply(some.readings["pdc_th"])))
+    drawn = members.sources(member.params, grasp_set)
+    visits = [output(member.network, drawn.fixed(range(len(grasp_set)), visit)).detach().numpy() for visit in range(8)]
+    return float(np.std(visits, axis=0).mean() / np.std(member.scale.apply(grasp_set.readings["pdc_th"])))

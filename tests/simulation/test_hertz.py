@@ -14,10 +14,10 @@ POSITIVE = st.floats(1e-3, 1e3)
 
 @given(force=POSITIVE, factor=POSITIVE)
 def test_the_contact_grows_with_the_cube_root_of_force_and_of_radius(force: float, factor: float) -> None:
-    one = contact_radius_m(force, 0.005, 1e6)
-    assert contact_radius_m(factor * force, 0.005, 1e6) == pytest.approx(factor ** (1 / 3) * one)
-    assert contact_radius_m(force, 0.005 * factor, 1e6) == pytest.approx(factor ** (1 / 3) * one)
-    assert contact_radius_m(force, 0.005, 1e6 * factor) == pytest.approx(one / factor ** (1 / 3))
+    radius_m = contact_radius_m(force, 0.005, 1e6)
+    assert contact_radius_m(factor * force, 0.005, 1e6) == pytest.approx(factor ** (1 / 3) * radius_m)
+    assert contact_radius_m(force, 0.005 * factor, 1e6) == pytest.approx(factor ** (1 / 3) * radius_m)
+    assert contact_radius_m(force, 0.005, 1e6 * factor) == pytest.approx(radius_m / factor ** (1 / 3))
 
 
 def test_slopes_over_logarithms_are_a_third_for_the_radius_and_two_thirds_for_the_indentation() -> None:

@@ -31,19 +31,19 @@ STUCK = replace(CLEAN, friction_scale=4.0)
 
 
 def aloft(scene: Scene) -> np.ndarray:
-    found: np.ndarray = scene.path.rise_m > 0.01
-    return found
+    in_air: np.ndarray = scene.path.rise_m > 0.01
+    return in_air
 
 
 def tactile(table: pa.Table) -> np.ndarray:
-    """The counts of a stream (time, channel)."""
+    """Return the counts of a stream (time, channel)."""
     names = [name for name in table.column_names if name.startswith("taxel")]
     counts: np.ndarray = np.column_stack([table.column(name).to_numpy() for name in names]).astype(float)
     return counts
 
 
 def decoded(scene: Scene, recording: Any, finger: int) -> np.ndarray:
-    """The force on a finger (time, axis) as its counts give it, with base, gains and cross-talk known."""
+    """Return the force on a finger (time, axis) from its counts, with base, gains and cross-talk known."""
     force = taxels.forces(scene.skins[finger], tactile(recording.streams[f"xela{finger + 1}"]))
     summed: np.ndarray = force.sum(axis=1)
     return summed
@@ -89,12 +89,12 @@ def test_a_contact_that_stays_spans_six_dimensions(seed: int) -> None:
     for finger, skin in enumerate(scene.skins):
         counts = taxels.digitised(skin.base_count + taxels.signal(skin, touch(scene, finger, taken_ns)))
         parts.append(counts.astype(float))
-    both = np.hstack(parts)  # (time, channel)
-    power = np.linalg.svd(both - both.mean(axis=0), compute_uv=False) ** 2
-    left = 1 - np.cumsum(power) / power.sum()
-    assert left[5] < 0.01
-    assert (np.diff(left[:20]) <= 1e-12).all()
-    scaled = (both - both.mean(axis=0)) / np.maximum(both.std(axis=0), 1e-9)
+    counts_of_both = np.hstack(parts)  # (time, channel)
+    power = np.linalg.svd(counts_of_both - counts_of_both.mean(axis=0), compute_uv=False) ** 2
+    unexplained = 1 - np.cumsum(power) / power.sum()
+    assert unexplained[5] < 0.01
+    assert (np.diff(unexplained[:20]) <= 1e-12).all()
+    scaled = (counts_of_both - counts_of_both.mean(axis=0)) / np.maximum(counts_of_both.std(axis=0), 1e-9)
     power = np.linalg.svd(scaled, compute_uv=False) ** 2
     assert power[:6].sum() / power.sum() > 0.99
 
@@ -167,7 +167,7 @@ def test_the_spread_of_the_counts_is_near_the_published_one() -> None:
 
 def test_the_slope_of_the_proximity_is_the_relative_velocity() -> None:
     rig = replace(CLEAN, effort=1.1, protocol="controlled")
-    found = 0
+    slip_rows = 0
     for index in range(6):
         streams = simulate_trial(2, index, rig).streams
         t_ns, counts = column(streams["proximity"], "t_ns"), column(streams["proximity"], "distance").astype(float)
@@ -180,8 +180,8 @@ def test_the_slope_of_the_proximity_is_the_relative_velocity() -> None:
         mean = np.convolve(speed, [0.5, *[1.0] * (step - 1), 0.5], "valid") / step
         inside = (moved[step:] > -0.024) & (moved[:-step] > -0.024)
         assert np.abs(slope - mean)[inside].max() < 0.01  # a count in 20 ms is 6 mm/s
-        found += int(slip.sum())
-    assert found > 50
+        slip_rows += int(slip.sum())
+    assert slip_rows > 50
 
 
 def test_slip_is_when_the_object_moves_and_a_dropped_one_touches_nothing() -> None:
@@ -219,7 +219,7 @@ def test_every_stream_has_its_own_rate_and_the_clocks_of_host_and_device() -> No
         assert abs(skew) <= 50e-6
         period_ns = 1e9 / rate_hz * (1 + skew)
         since_ns = device_ns - device_ns[0] - (seq - seq[0]) * period_ns
-        assert np.abs(since_ns).max() <= 2  # no jitter, and the number tells how many periods went by
+        assert np.abs(since_ns).max() <= 2  # Without jitter, the number gives the count of periods.
         true_ns = (device_ns - offset - truth_ns[0]) / (1 + skew)
         late_ms = (t_ns - truth_ns[0] - true_ns) / 1e6
         assert late_ms.min() > -0.001
@@ -247,14 +247,14 @@ def test_held_frames_repeat_values_and_have_stamps_of_their_own(probability: flo
 
 def test_what_goes_wrong_with_the_log_changes_nothing_of_what_happens() -> None:
     noisy = replace(CLEAN, noise_scale=5.0, drop_probability=0.1, hold_probability=0.75, clock_offset_ms=80.0)
-    clean, other = (simulate_trial(3, 1, rig).streams["truth"] for rig in (CLEAN, noisy))
-    assert clean.equals(other)
+    clean, noisy_truth = (simulate_trial(3, 1, rig).streams["truth"] for rig in (CLEAN, noisy))
+    assert clean.equals(noisy_truth)
 
 
 def test_the_same_seed_and_trial_give_the_same_bytes() -> None:
-    first, again = simulate_trial(5, 2), simulate_trial(5, 2)
-    assert first.attributes == again.attributes
-    assert all(to_parquet(table) == to_parquet(again.streams[name]) for name, table in first.streams.items())
+    first, repeat = simulate_trial(5, 2), simulate_trial(5, 2)
+    assert first.attributes == repeat.attributes
+    assert all(to_parquet(table) == to_parquet(repeat.streams[name]) for name, table in first.streams.items())
     assert not first.streams["truth"].equals(simulate_trial(5, 3).streams["truth"])
     assert not first.streams["truth"].equals(simulate_trial(6, 2).streams["truth"])
 

@@ -19,25 +19,25 @@ NOTHING = Unseen(np.ones((1, 2)), np.full(1, 0.01), np.zeros((1, 2, 2)), np.zero
 MADE = fingertip_sp.sensors(np.random.default_rng(1))
 
 
-def shown(of: Situation, force_n: np.ndarray) -> np.ndarray:
-    """What sensors show without noise under forces (draw, finger): (draw, finger, channel)."""
-    contact, skin = pinch.pressed(of, force_n)
-    centre = np.broadcast_to(pinch.centre(of, NOTHING), (len(force_n), 2, 2))
+def noiseless_readings(situation: Situation, force_n: np.ndarray) -> np.ndarray:
+    """Return noiseless readings (draw, finger, channel) under forces (draw, finger)."""
+    contact, skin = pinch.pressed(situation, force_n)
+    centre = np.broadcast_to(pinch.centre(situation, NOTHING), (len(force_n), 2, 2))
     return fingertip_sp.signal(MADE, force_n, contact, skin, centre)
 
 
 def test_the_pressure_rises_by_140_counts_a_newton_from_that_of_the_untouched_sensors() -> None:
     force = np.random.default_rng(2).uniform(0, 4, (200, 2))
-    pressure = shown(FLAT, force)[:, :, -1]
-    for finger, rest in enumerate((1676, 2779)):
+    pressure = noiseless_readings(FLAT, force)[:, :, -1]
+    for finger, rest_count in enumerate((1676, 2779)):
         slope, offset = np.polyfit(force[:, finger], pressure[:, finger], 1)
         assert slope == pytest.approx(140)
-        assert offset == pytest.approx(rest)
+        assert offset == pytest.approx(rest_count)
 
 
 def test_the_electrode_under_the_contact_falls_with_force_and_those_far_off_rise() -> None:
     force = np.repeat(np.linspace(0, 4, 40)[:, None], 2, axis=1)
-    electrodes = shown(FLAT, force)[:, :, :-1]
+    electrodes = noiseless_readings(FLAT, force)[:, :, :-1]
     way = biotac_sp.unrolled_m()[None] - pinch.centre(FLAT, NOTHING)[0][:, None]
     for finger in (0, 1):
         off = np.linalg.norm(way[finger], axis=1)
@@ -46,7 +46,7 @@ def test_the_electrode_under_the_contact_falls_with_force_and_those_far_off_rise
 
 
 def test_an_untouched_sensor_shows_its_rest() -> None:
-    np.testing.assert_allclose(shown(FLAT, np.zeros((1, 2)))[0], MADE.rest)
+    np.testing.assert_allclose(noiseless_readings(FLAT, np.zeros((1, 2)))[0], MADE.rest)
 
 
 def test_of_what_pressed_electrodes_fall_by_the_others_rise_by_the_share_of_the_bulge() -> None:
@@ -62,11 +62,11 @@ def test_of_what_pressed_electrodes_fall_by_the_others_rise_by_the_share_of_the_
 def test_a_sharper_object_makes_the_contact_smaller_and_deeper_and_presses_fewer_electrodes() -> None:
     sharp = replace(FLAT, curvatures_1_m=np.full((2, 2), 160.0))
     force = np.full((1, 2), 2.0)
-    (wide, shallow), (narrow, deep) = (pinch.pressed(one, force) for one in (FLAT, sharp))
+    (wide, shallow), (narrow, deep) = (pinch.pressed(situation, force) for situation in (FLAT, sharp))
     assert 1e3 * wide[0, 0] == pytest.approx(2.16, abs=0.005)
     assert 1e3 * narrow[0, 0] == pytest.approx(1.69, abs=0.005)
     assert deep[0, 0] > shallow[0, 0]
-    pressed = [(shown(one, force) < MADE.rest - 100).sum() for one in (FLAT, sharp)]
+    pressed = [(noiseless_readings(situation, force) < MADE.rest - 100).sum() for situation in (FLAT, sharp)]
     assert pressed[1] < pressed[0]
 
 
@@ -94,12 +94,12 @@ def test_a_shifted_tip_rolls_on_a_ball_as_two_circles_do_and_not_on_a_plane() ->
     shifted = replace(NOTHING, shift_m=np.full((1, 2, 2), 0.001))
     np.testing.assert_allclose(pinch.centre(FLAT, shifted), pinch.centre(FLAT, NOTHING))
     ball = replace(FLAT, bending_1_m=np.full((2, 2), 1 / 0.03))
-    angle = 0.001 / (0.03 + 0.0067)  # of the line between the centres, which are as far apart as both radii
+    angle = 0.001 / (0.03 + 0.0067)  # Angle of the line between the centres, whose distance is the sum of both radii.
     np.testing.assert_allclose(pinch.centre(ball, shifted) - pinch.centre(ball, NOTHING), 0.0067 * angle)
 
 
 def grasp_of_a_cone() -> tuple[Placed, Grasp]:
-    """A cone gripped off its axis along x; the approach is down, but for a lean."""
+    """Return a cone gripped off its axis along x; the approach is down, but for a lean."""
     placed = Placed(CONE, np.eye(3), np.zeros(3))
     y, z = 0.006, 0.01
     off = np.sqrt((0.03 - 0.2 * z) ** 2 - y**2)
@@ -110,11 +110,11 @@ def grasp_of_a_cone() -> tuple[Placed, Grasp]:
 
 def test_exchanging_the_points_of_a_grasp_exchanges_what_the_fingers_meet() -> None:
     placed, grasp = grasp_of_a_cone()
-    one, other = (pinch.situation(placed, each, 0.0) for each in (grasp, grasp.swapped))
-    np.testing.assert_allclose(other.curvatures_1_m, one.curvatures_1_m[::-1], atol=1e-12)
-    np.testing.assert_allclose(other.bending_1_m, one.bending_1_m[::-1], atol=1e-12)
-    np.testing.assert_allclose(other.lean_rad, one.lean_rad[::-1], atol=1e-12)
-    assert not np.allclose(one.lean_rad[0], one.lean_rad[1])
+    direct, exchanged = (pinch.situation(placed, variant, 0.0) for variant in (grasp, grasp.swapped))
+    np.testing.assert_allclose(exchanged.curvatures_1_m, direct.curvatures_1_m[::-1], atol=1e-12)
+    np.testing.assert_allclose(exchanged.bending_1_m, direct.bending_1_m[::-1], atol=1e-12)
+    np.testing.assert_allclose(exchanged.lean_rad, direct.lean_rad[::-1], atol=1e-12)
+    assert not np.allclose(direct.lean_rad[0], direct.lean_rad[1])
 
 
 def test_a_normal_leans_by_the_angle_that_geometry_gives() -> None:
@@ -123,12 +123,12 @@ def test_a_normal_leans_by_the_angle_that_geometry_gives() -> None:
     x = np.sqrt(0.03**2 - y**2)
     approach = np.array([0, 0, -1.0])
     wrist = np.column_stack([approach, [1.0, 0, 0], np.cross(approach, [1.0, 0, 0])])
-    found = pinch.situation(placed, Grasp(np.array([-x, y, 0]), np.array([x, y, 0]), wrist), 0.0)
-    np.testing.assert_allclose(np.abs(found.lean_rad), [[0, np.arcsin(y / 0.03)]] * 2, atol=1e-12)
-    np.testing.assert_allclose(found.bending_1_m[:, 0], 0, atol=1e-12)  # along the axis
+    situation = pinch.situation(placed, Grasp(np.array([-x, y, 0]), np.array([x, y, 0]), wrist), 0.0)
+    np.testing.assert_allclose(np.abs(situation.lean_rad), [[0, np.arcsin(y / 0.03)]] * 2, atol=1e-12)
+    np.testing.assert_allclose(situation.bending_1_m[:, 0], 0, atol=1e-12)  # along the axis
     # across it: the pad's axis misses the tangent by the lean, so that its normal curvature is less by the cosine squared
-    np.testing.assert_allclose(found.bending_1_m[:, 1], (1 - (y / 0.03) ** 2) / 0.03)
-    np.testing.assert_allclose(found.curvatures_1_m, [[0, 1 / 0.03]] * 2, atol=1e-9)
+    np.testing.assert_allclose(situation.bending_1_m[:, 1], (1 - (y / 0.03) ** 2) / 0.03)
+    np.testing.assert_allclose(situation.curvatures_1_m, [[0, 1 / 0.03]] * 2, atol=1e-9)
 
 
 def test_moving_cloud_grasp_and_object_together_changes_nothing_of_the_touch() -> None:

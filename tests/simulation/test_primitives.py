@@ -65,7 +65,7 @@ def test_curvatures_are_those_of_heights_over_the_tangent_plane(name: str) -> No
     rng = np.random.default_rng(4)
     for point, normal, bending in zip(at, shape.normal(at), shape.bending(at), strict=True):
         if name == "bow" and abs(abs(np.arctan2(*(point + BOW.shift_m)[1::-1])) - 2.0) < 0.05:
-            continue  # where tube and round end meet, curvature jumps
+            continue  # The curvature jumps between the tube and its round end.
         tangent = np.cross(normal, rng.normal(size=3))
         tangent /= np.linalg.norm(tangent)
 
@@ -81,8 +81,8 @@ def test_curvatures_are_those_of_heights_over_the_tangent_plane(name: str) -> No
 
 def test_principal_curvatures_are_those_known_by_hand() -> None:
     def at(shape: object, *point: float) -> list[float]:
-        known = np.array([point])
-        return [float(one) for one in principal_curvatures(shape.bending(known), shape.normal(known))[0]]  # type: ignore[attr-defined]
+        points = np.array([point])
+        return [float(curvature) for curvature in principal_curvatures(shape.bending(points), shape.normal(points))[0]]  # type: ignore[attr-defined]
 
     assert at(BALL, 0, 0.03, 0) == pytest.approx([1 / 0.03, 1 / 0.03])
     assert at(CYLINDER, 0.03, 0, 0.01) == pytest.approx([0, 1 / 0.03], abs=1e-9)
@@ -91,19 +91,19 @@ def test_principal_curvatures_are_those_known_by_hand() -> None:
     assert at(ELLIPSOID, 0.02, 0, 0) == pytest.approx([0.02 / 0.05**2, 0.02 / 0.03**2])
     slant = np.hypot(1, 0.2)
     assert at(CONE, 0.03, 0, 0) == pytest.approx([0, 1 / (0.03 * slant)], abs=1e-9)
-    x = -BOW.shift_m[0]  # of the arc's centre
+    x = -BOW.shift_m[0]  # The arc's centre.
     assert at(BOW, x + 0.052, 0, 0) == pytest.approx([1 / 0.052, 1 / 0.012])  # outside
-    assert at(BOW, x + 0.028, 0, 0) == pytest.approx([-1 / 0.028, 1 / 0.012])  # in the hollow
+    assert at(BOW, x + 0.028, 0, 0) == pytest.approx([-1 / 0.028, 1 / 0.012])  # The inner side.
 
 
 @EVERY
 def test_a_body_at_rest_touches_the_table_and_nothing_of_it_is_below(name: str) -> None:
     at = surface(name, 3000, seed=5)
-    for rest in SHAPES[name].rests():
-        assert np.linalg.norm(rest.up) == pytest.approx(1)
-        lowest = (at @ rest.up).min()
-        assert -rest.height_m - 1e-7 <= lowest
-        assert lowest == pytest.approx(-rest.height_m, abs=0.002)
+    for rest_pose in SHAPES[name].rests():
+        assert np.linalg.norm(rest_pose.up) == pytest.approx(1)
+        lowest = (at @ rest_pose.up).min()
+        assert -rest_pose.height_m - 1e-7 <= lowest
+        assert lowest == pytest.approx(-rest_pose.height_m, abs=0.002)
 
 
 def test_what_is_too_tall_for_its_foot_only_lies() -> None:

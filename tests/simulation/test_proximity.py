@@ -9,10 +9,10 @@ from tacpipe.simulation.proximity import readings
 
 
 def test_a_reading_falls_by_eight_counts_a_millimetre_and_saturates() -> None:
-    found = readings(np.array([0.0, -0.001, -0.010, -0.0245, -0.3]), 0.0, np.random.default_rng(0))
-    assert found.tolist() == [740, 732, 660, 544, 544]
+    counts = readings(np.array([0.0, -0.001, -0.010, -0.0245, -0.3]), 0.0, np.random.default_rng(0))
+    assert counts.tolist() == [740, 732, 660, 544, 544]
 
 
 def test_the_noise_is_the_published_one() -> None:
-    found = readings(np.zeros(100_000), 1.0, np.random.default_rng(0))
-    assert found.std() == pytest.approx(np.hypot(0.8, np.sqrt(1 / 12)), rel=0.02)  # rounding adds 1 / 12
+    counts = readings(np.zeros(100_000), 1.0, np.random.default_rng(0))
+    assert counts.std() == pytest.approx(np.hypot(0.8, np.sqrt(1 / 12)), rel=0.02)  # rounding adds 1 / 12

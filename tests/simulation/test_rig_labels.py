@@ -1,4 +1,4 @@
-"""Clocks, holds and slips of the simulated rig, told from what its streams show, against what truly happened."""
+"""Clocks, holds and slips of the simulated rig, estimated from its streams, against the ground truth."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ contacts, slips = load("segment.contacts"), load("segment.slips")
 
 
 def recorded(trial: int, **rig: Any) -> RecordingOutput:
-    found: RecordingOutput = simulate(simulate.params(**rig), trial)
-    return found
+    recording: RecordingOutput = simulate(simulate.params(**rig), trial)
+    return recording
 
 
 def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
     rows = {"values": "interpolate", **({} if "grid" in params else {"rate_hz": 50.0}), **params}
-    found: RecordingOutput = synchronize(synchronize.params(**rows), FakeRecording(recording.streams))
-    return found
+    synced_recording: RecordingOutput = synchronize(synchronize.params(**rows), FakeRecording(recording.streams))
+    return synced_recording
 
 
 @cache
@@ -43,27 +43,27 @@ def flags(table: pa.Table, name: str) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("rig", "least"),
+    ("rig", "lowest_score"),
     [
         ({"effort": 1.15}, 0.95),
         ({"effort": 0.9, "grip_loss_probability": 1.0, "grip_loss": 0.3}, 0.95),
         ({"effort": 1.15, "noise_scale": 5.0}, 0.80),
     ],
 )
-def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], least: float) -> None:
+def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], lowest_score: float) -> None:
     tables = [labelled(trial, **rig) for trial in range(TRIALS)]
-    found = np.concatenate([flags(table, "slip") for table in tables])
+    predicted = np.concatenate([flags(table, "slip") for table in tables])
     truth = np.concatenate([flags(table, "gt_slip") for table in tables])
-    assert 2 * (found & truth).sum() / (found.sum() + truth.sum()) >= least
+    assert 2 * (predicted & truth).sum() / (predicted.sum() + truth.sum()) >= lowest_score
 
 
 @pytest.mark.long
 def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
     for trial in range(TRIALS):
         table = labelled(trial, effort=1.15)
-        found, truth = flags(table, "dropped"), flags(table, "gt_dropped")
-        assert found.any() == truth.any()
-        assert abs(int(found.argmax()) - int(truth.argmax())) <= 2
+        predicted, truth = flags(table, "dropped"), flags(table, "gt_dropped")
+        assert predicted.any() == truth.any()
+        assert abs(int(predicted.argmax()) - int(truth.argmax())) <= 2
 
 
 @pytest.mark.long
@@ -79,14 +79,14 @@ def test_the_offset_of_each_clock_is_known_to_a_fraction_of_a_sample() -> None:
     half_ms = {"xela1": 10.0, "xela2": 10.0, "robot": 0.5, "proximity": 1.25}
     for trial in range(TRIALS):
         recording = recorded(trial)
-        found = synced(recording).attributes
+        attributes = synced(recording).attributes
         for stream, limit_ms in half_ms.items():
             offset_ms, true_ns = (
-                found[f"{stream}_clock_offset_ms"],
+                attributes[f"{stream}_clock_offset_ms"],
                 recording.attributes[f"gt_{stream}_clock_offset_ns"],
             )
             assert isinstance(offset_ms, float) and isinstance(true_ns, int)
-            assert abs(offset_ms + true_ns / 1e6) < 0.05 * limit_ms  # half a sample is asked for
+            assert abs(offset_ms + true_ns / 1e6) < 0.05 * limit_ms  # The requirement is half a sample.
 
 
 def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -100,8 +100,8 @@ def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
         signal = taxels.signal(skin, pick_and_move.touch(scene, finger, true_ns)).reshape(len(true_ns), -1)
         names = [name for name in table.column_names if name.startswith(f"xela{finger + 1}_taxel")]
         counts = np.column_stack([table.column(name).to_numpy() for name in names])
-        apart = counts - np.asarray(skin.base_count).reshape(1, -1) - signal
-        fingers.append(np.abs(apart).ravel() / (signal - signal[0]).std())
+        residual = counts - np.asarray(skin.base_count).reshape(1, -1) - signal
+        fingers.append(np.abs(residual).ravel() / (signal - signal[0]).std())
     arm = []
     for i, axis in enumerate("xyz"):
         path = np.interp(true_ns, scene.path.t_ns, scene.path.position_m[:, i])
@@ -111,9 +111,12 @@ def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_they_are_not() -> None:
-    found = {clock: [errors(trial, clock) for trial in range(8)] for clock in ("auto", "arrival")}
+    errors_by_clock = {clock: [errors(trial, clock) for trial in range(8)] for clock in ("auto", "arrival")}
     fingers, arms = (
-        {clock: np.percentile(np.concatenate([e for both in of for e in both[i]]), 99) for clock, of in found.items()}
+        {
+            clock: np.percentile(np.concatenate([values for trial_errors in trials for values in trial_errors[i]]), 99)
+            for clock, trials in errors_by_clock.items()
+        }
         for i in (0, 1)
     )
     assert fingers["auto"] < 0.01
@@ -123,19 +126,23 @@ def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_th
 
 
 def test_held_frames_are_found() -> None:
-    hits = found = held = 0
+    hits = marked_rows = repeated_rows = 0
     for trial, probability in ((0, 0.07), (1, 0.07), (2, 0.75)):
         streams = dict(recorded(trial, hold_probability=0.0).streams)
         kinds = [kind for kind in streams["xela1"].schema if "taxel" in kind.name]
         counts = np.column_stack([streams["xela1"].column(kind.name).to_numpy() for kind in kinds])
         counts, repeated = faults.hold(counts, probability, np.random.default_rng(trial))
         first = streams["xela1"].select(["t_ns", "t_device_ns", "seq"])
-        again = schema.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
+        repeated_stream = schema.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
         for name in ("t_device_ns", "seq"):
-            again = again.append_column(first.schema.field(name), first.column(name))
-        table = synced(RecordingOutput({**streams, "xela1": again}), grid="logged").streams[""]
+            repeated_stream = repeated_stream.append_column(first.schema.field(name), first.column(name))
+        table = synced(RecordingOutput({**streams, "xela1": repeated_stream}), grid="logged").streams[""]
         rows = np.searchsorted(first.column("seq").to_numpy(), table.column("xela1_seq").to_numpy())
         marked = flags(table, "xela1_held")
-        hits, found, held = hits + (marked & repeated[rows]).sum(), found + marked.sum(), held + repeated[rows].sum()
-    assert hits / found >= 0.99
-    assert hits / held >= 0.99
+        hits, marked_rows, repeated_rows = (
+            hits + (marked & repeated[rows]).sum(),
+            marked_rows + marked.sum(),
+            repeated_rows + repeated[rows].sum(),
+        )
+    assert hits / marked_rows >= 0.99
+    assert hits / repeated_rows >= 0.99

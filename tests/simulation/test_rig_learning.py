@@ -1,4 +1,4 @@
-"""What can be learned of the simulated rig: how much the plan tells, what bounds a forecast, and what nobody can foresee.
+"""Forecasts on the simulated rig: the value of the plan, the bounds of a forecast, and the unpredictable part.
 
 Forecasters are trained and evaluated on trials in which nothing slips. Ground truth is for evaluation, never for training.
 """
@@ -35,7 +35,7 @@ PLANNED_SLIP = {"effort": 1.05}
 GRIP_LOSS = {"effort": 0.9, "grip_loss_probability": 1.0, "grip_loss": 0.3}
 TRAINING, WATCHED, TESTED = range(30), range(30, 32), range(32, 44)
 SLIPPING = range(100, 124)
-ALOFT_M = 0.002  # from its start, when the hand is on its way
+ALOFT_M = 0.002  # Offset from its start, when the hand is moving.
 SMALL = {
     "hidden": 64,
     "dropout": 0.0,
@@ -45,14 +45,14 @@ SMALL = {
     "stride": 6,
     "baselines": False,
 }
-LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 20)  # rows before now of which one who sees the motion without error knows it
+LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 20)  # Rows before now at which the exact motion is known.
 
 simulate, synchronize, contacts = load("simulate.forward"), load("synchronize"), load("segment.contacts")
 
 
 @cache
 def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
-    """A segmented trial of the rig."""
+    """Return a segmented trial of the rig."""
     recording = simulate(simulate.params(**rig), index)
     synced = synchronize(
         synchronize.params(values="interpolate", **({"rate_hz": 50.0} if grid == "uniform" else {"grid": grid})),
@@ -67,13 +67,13 @@ def trials(indices: range, **rig: Any) -> list[FakeShard]:
 
 
 def trained(folder: Path, training: list[FakeShard], watched: list[FakeShard], **params: Any) -> Forecaster:
-    given = fitting("train.forward", SMALL, **params)
-    return Forecaster.load(forward_training.train(given, dataset(*training), dataset(*watched), folder))
+    fitting_params = fitting("train.forward", SMALL, **params)
+    return Forecaster.load(forward_training.train(fitting_params, dataset(*training), dataset(*watched), folder))
 
 
 @pytest.fixture(scope="module")
 def forecasters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Forecaster]:
-    """By what they are told of the plan: planned, none or shuffled."""
+    """Return forecasters by the plan that they receive: planned, none or shuffled."""
     training, watched = trials(TRAINING, **STICK), trials(WATCHED, **STICK)
     return {
         actions: trained(tmp_path_factory.mktemp(actions), training, watched, actions=actions)
@@ -90,81 +90,84 @@ def columns(shard: FakeShard, pattern: str) -> AnyFloats:
 
 
 def aloft(shard: FakeShard, starts: Int64s) -> Bools:
-    """Which windows begin when the object is in the air: before, the grip tells most of what comes."""
+    """Return which windows begin when the object is in the air: before, the grip determines most of the signal."""
     position = columns(shard, "robot_position_{}_m")
-    apart = np.linalg.norm(position - position[0], axis=1)
-    found: Bools = np.logical_or.accumulate(apart > ALOFT_M)[starts]
-    return found
+    distance_m = np.linalg.norm(position - position[0], axis=1)
+    in_air: Bools = np.logical_or.accumulate(distance_m > ALOFT_M)[starts]
+    return in_air
 
 
 def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False) -> dict[str, AnyFloats]:
-    """The squared errors in counts (window, step) of model and persistence, in the air."""
+    """Return the squared errors in counts (window, step) of model and persistence, in the air."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     starts = track.starts(forecaster.context, forecaster.horizon)
     chosen = starts if everywhere else starts[aloft(shard, starts)]
     parts = list(predicted(forecaster, track, chosen))
     return {
         name: np.concatenate(
-            [np.square(some.predictions[name].count - some.truth.count).mean(axis=2) for some in parts]
+            [np.square(batch.predictions[name].count - batch.truth.count).mean(axis=2) for batch in parts]
         )
         for name in (MODEL, BASELINE)
     }
 
 
 def skill_at_the_end(forecaster: Forecaster, *, everywhere: bool = False) -> float:
-    """The skill over persistence ten steps ahead on trials that the forecaster has not seen."""
-    found = [errors(forecaster, shard, everywhere=everywhere) for shard in trials(TESTED, **STICK)]
-    model, baseline = (np.concatenate([one[name][:, -1] for one in found]).mean() for name in (MODEL, BASELINE))
+    """Return the skill over persistence ten steps ahead on trials that the forecaster has not seen."""
+    trial_errors = [errors(forecaster, shard, everywhere=everywhere) for shard in trials(TESTED, **STICK)]
+    model, baseline = (
+        np.concatenate([errors_by_name[name][:, -1] for errors_by_name in trial_errors]).mean()
+        for name in (MODEL, BASELINE)
+    )
     return float(skill(np.array([model]), np.array([baseline]))[0])
 
 
 def acceleration_forecast() -> Any:
-    """A network that tells where acceleration goes from its past, position and velocity, all without error.
+    """Return a network that predicts the acceleration from its past, position and velocity, all without error.
 
     It learns from more trajectories than the forecasters do, and sees twice as far back: what it cannot foresee lies in
     the chance by which trajectories are made.
     """
     torch.manual_seed(0)
     rows = [flight(index) for index in range(240)]
-    seen, change = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*rows, strict=True))
-    mean, spread = seen.mean(0), seen.std(0) + 1e-6
+    past, change = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*rows, strict=True))
+    mean, spread = past.mean(0), past.std(0) + 1e-6
     network = torch.nn.Sequential(
-        torch.nn.Linear(seen.shape[1], 96),
+        torch.nn.Linear(past.shape[1], 96),
         torch.nn.GELU(),
         torch.nn.Linear(96, 96),
         torch.nn.GELU(),
         torch.nn.Linear(96, 3),
     )
     optimiser = torch.optim.Adam(network.parameters(), 3e-3)
-    steps = 6 * len(seen) // 512
+    steps = 6 * len(past) // 512
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
-        some = torch.randint(len(seen), (512,))
-        loss = torch.nn.functional.mse_loss(network((seen[some] - mean) / spread), change[some])
+        batch = torch.randint(len(past), (512,))
+        loss = torch.nn.functional.mse_loss(network((past[batch] - mean) / spread), change[batch])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         falling.step()
-    return lambda given: network((torch.from_numpy(given).float() - mean) / spread).detach().numpy()
+    return lambda inputs: network((torch.from_numpy(inputs).float() - mean) / spread).detach().numpy()
 
 
 def flight(index: int) -> tuple[AnyFloats, AnyFloats]:
-    """What is known of a random trajectory in the air at each row, and the change of acceleration to come."""
+    """Return the exact inputs of a random trajectory in the air at each row, and the next change of acceleration."""
     rng = np.random.default_rng([7, index])
     path = trajectory.trajectory(trajectory.PROTOCOLS[index % 2], 12.0, 1.5, rng)
-    every = round(ROW_NS * trajectory.RATE_HZ / 1e9)
-    position, acceleration = path.position_m[::every], path.acceleration_m_s2[::every]
-    now = np.arange(1_500 // every + 10, len(position) - HORIZON)
-    return known(position, acceleration, now), acceleration[now + HORIZON] - acceleration[now]
+    stride = round(ROW_NS * trajectory.RATE_HZ / 1e9)
+    position, acceleration = path.position_m[::stride], path.acceleration_m_s2[::stride]
+    now = np.arange(1_500 // stride + 10, len(position) - HORIZON)
+    return inputs_at(position, acceleration, now), acceleration[now + HORIZON] - acceleration[now]
 
 
-def known(position: AnyFloats, acceleration: AnyFloats, now: Int64s) -> AnyFloats:
+def inputs_at(position: AnyFloats, acceleration: AnyFloats, now: Int64s) -> AnyFloats:
     before = [acceleration[now - lag] for lag in LAGS]
     return np.hstack([*before, position[now] - position[0], position[now] - position[now - 1]])
 
 
 def bound_without_plan() -> float:
-    """The skill that is left to one who knows the object, the skin and the past, but not the acceleration to come.
+    """Return the best skill with the object, the skin and the past known, but not the coming acceleration.
 
     Touch in the air is linear in acceleration but for a few percent. Its slope is fitted on each test trial itself, so
     that it is known as nobody can know it; neither noise nor what is not linear is counted.
@@ -180,7 +183,7 @@ def bound_without_plan() -> float:
         felt = track.tactile[now + HORIZON] - track.tactile[now]
         change = acceleration[now + HORIZON] - acceleration[now]
         slope = np.linalg.lstsq(change, felt, rcond=None)[0]
-        told_change = forecast(known(columns(shard, "robot_position_{}_m"), acceleration, now))
+        told_change = forecast(inputs_at(columns(shard, "robot_position_{}_m"), acceleration, now))
         missed += np.square((change - told_change) @ slope).sum()
         moved += np.square(felt).sum()
     return 1 - missed / moved
@@ -188,7 +191,7 @@ def bound_without_plan() -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """How near load comes to slip, (time,): felt, and foretold ten steps before; and what it is where slip begins."""
+    """Load over pressure (time,), felt and predicted ten steps before, and its value at the onset of slip."""
 
     felt: AnyFloats
     ahead: AnyFloats
@@ -196,51 +199,51 @@ class Watch:
 
 
 def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
-    """The pull of the object over the pressure of the fingers, in counts, and the truth's friction in the same unit."""
+    """Return the pull of the object over the pressure of the fingers, in counts, and the true friction in the same unit."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     ahead = np.full_like(track.tactile, np.nan)
-    for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-        ahead[some.now] = some.predictions[MODEL].count[:, -1]
+    for batch in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        ahead[batch.now] = batch.predictions[MODEL].count[:, -1]
     felt = pull_over_pressure(track.tactile[:])
     pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
     pressure = floats(shard, "gt_finger1_normal_n") + floats(shard, "gt_finger2_normal_n")
-    held = (floats(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)
-    true = pull[held] / pressure[held]
-    limit = float(felt[held] @ true / (true @ true)) * float(shard.attributes["gt_friction"])
+    sticking = (floats(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)
+    true = pull[sticking] / pressure[sticking]
+    limit = float(felt[sticking] @ true / (true @ true)) * float(shard.attributes["gt_friction"])
     return Watch(felt, pull_over_pressure(ahead), limit)
 
 
 def pull_over_pressure(counts: AnyFloats) -> AnyFloats:
-    """The ratio (time,) that friction bounds; ``counts`` are (time, channel)."""
+    """Return the ratio (time,) that friction bounds; ``counts`` are (time, channel)."""
     x, y, z = (counts[:, axis::3].sum(axis=1) for axis in range(3))
     ratio: AnyFloats = np.hypot(x, y) / np.maximum(np.abs(z), 1.0)
     return ratio
 
 
 def median_lead(forecaster: Forecaster, kind: dict[str, Any]) -> float:
-    """The median of the rows by which alarms come before slip, over trials in which the object slips.
+    """Return the median of the rows by which alarms precede slip, over trials in which the object slips.
 
-    The event is the slip itself, at the first row T of the truth's. An alarm is on in a row in which touch, as foretold
-    ten rows later, would pass what friction holds; the judge knows the friction, the forecaster does not. The lead is T
+    The event is the slip itself, at the first row T of the truth's. An alarm is on in a row in which touch, as predicted
+    ten rows later, would pass what friction holds; this test knows the friction, the forecaster does not. The lead is T
     less the first row with an alarm from T - 12, for what a forecast rounds, but never above 10, to T + 9; with none it
-    is -10. The onset of a change of load, as `tacpipe.tasks.forward.alarms` tells it, is another event: the load rises
+    is -10. The onset of a change of load, as `tacpipe.tasks.forward.alarms` detects it, is another event: the load rises
     before the object slips, and an exact forecast leads the rise by a few rows only.
     """
-    found = []
+    leads = []
     for shard in trials(SLIPPING, **kind):
         slipping = np.flatnonzero(floats(shard, "gt_slip") > 0)
         if not len(slipping):
             continue
-        seen, onset = watch(forecaster, shard), int(slipping[0])
+        watched, onset = watch(forecaster, shard), int(slipping[0])
         first = max(onset - HORIZON - 2, 0)
-        alarm = seen.ahead[first : onset + HORIZON] > seen.limit
-        found.append(min(onset - first - int(alarm.argmax()), HORIZON) if alarm.any() else -HORIZON)
-    assert len(found) >= len(SLIPPING) - 2
-    return float(np.median(found))
+        alarm = watched.ahead[first : onset + HORIZON] > watched.limit
+        leads.append(min(onset - first - int(alarm.argmax()), HORIZON) if alarm.any() else -HORIZON)
+    assert len(leads) >= len(SLIPPING) - 2
+    return float(np.median(leads))
 
 
 def loaded(index: int) -> FakeShard:
-    """A trial without any motion, under a load that the tare does not tell; on the rows of xela1, as it came."""
+    """Return a trial without motion, under a load that the tare does not reveal, on the logged rows of xela1."""
     shard = recorded(index, grid="logged", **STILL)
     rng, content = np.random.default_rng([8, index]), shard.content
     for position, about in enumerate(content.schema):
@@ -251,7 +254,7 @@ def loaded(index: int) -> FakeShard:
 
 
 def altered(shard: FakeShard, change: dict[str, AnyFloats]) -> FakeShard:
-    """The recording with some values added to its columns."""
+    """Return the recording with some values added to its columns."""
     content = shard.content
     for name, values in change.items():
         position = content.column_names.index(name)
@@ -262,12 +265,12 @@ def altered(shard: FakeShard, change: dict[str, AnyFloats]) -> FakeShard:
     return FakeShard(shard.name, content, shard.attributes)
 
 
-def said(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, AnyFloats]:
-    """The rows at which predictions are made, and these (window, step, channel)."""
+def predicted_counts(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, AnyFloats]:
+    """Return the rows at which predictions are made, and the predicted counts (window, step, channel)."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     parts = list(predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
-    counts = np.concatenate([some.predictions[MODEL].count for some in parts])
-    return np.concatenate([some.now for some in parts]), counts
+    counts = np.concatenate([batch.predictions[MODEL].count for batch in parts])
+    return np.concatenate([batch.now for batch in parts]), counts
 
 
 def from_row(shard: FakeShard, row: int, values: AnyFloats | float) -> AnyFloats:
@@ -300,14 +303,17 @@ def test_plans_of_other_windows_help_no_more_than_none(forecasters: dict[str, Fo
 def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     noise = (np.square(taxels.NOISE_COUNT) + 1 / 12).mean()
     forecaster = trained(tmp_path, [loaded(index) for index in range(8)], [loaded(8)], epochs=6, hidden=32)
-    own = slice(0, len(forecaster.codec.channels) // 2)  # xela1: what stands between its rows is not interpolated
+    # The channels of xela1, whose rows are not interpolated.
+    first_skin = slice(0, len(forecaster.codec.channels) // 2)
     squared: dict[str, list[AnyFloats]] = {MODEL: [], BASELINE: []}
     for index in range(9, 14):
         shard = loaded(index)
         track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-        for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            for name, found in squared.items():
-                found.append(np.square(some.predictions[name].count - some.truth.count)[..., own].mean(axis=2))
+        for batch in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            for name, errors_of_name in squared.items():
+                errors_of_name.append(
+                    np.square(batch.predictions[name].count - batch.truth.count)[..., first_skin].mean(axis=2)
+                )
     model, baseline = (np.concatenate(squared[name]).mean(axis=0) / noise for name in (MODEL, BASELINE))  # (step,)
     assert baseline == pytest.approx(2.0, rel=0.05)
     assert (model >= (1 + 1 / 10) * 0.95).all()
@@ -322,8 +328,8 @@ def test_touch_that_is_to_come_changes_no_forecast(forecasters: dict[str, Foreca
         name: from_row(shard, row + 1, rng.normal(0, 500, shard.content.num_rows - row - 1))
         for name in forecaster.codec.channels
     }
-    now, before = said(forecaster, shard)
-    _, after = said(forecaster, altered(shard, off))
+    now, before = predicted_counts(forecaster, shard)
+    _, after = predicted_counts(forecaster, altered(shard, off))
     assert np.abs(after[now <= row] - before[now <= row]).max() < 0.01
     assert np.abs(after[now == row + 1] - before[now == row + 1]).max() > 10
 
@@ -333,8 +339,8 @@ def test_touch_that_is_to_come_changes_no_forecast(forecasters: dict[str, Foreca
 def test_a_plan_changes_no_forecast_before_its_own_step(ahead: int, forecasters: dict[str, Forecaster]) -> None:
     forecaster, shard, row = forecasters["planned"], recorded(TESTED[0], **STICK), 300
     off = {f"robot_position_{axis}_m": from_row(shard, row + ahead, 0.01) for axis in "xyz"}
-    now, before = said(forecaster, shard)
-    _, after = said(forecaster, altered(shard, off))
+    now, before = predicted_counts(forecaster, shard)
+    _, after = predicted_counts(forecaster, altered(shard, off))
     moved = np.abs(after - before)[now == row][0].max(axis=1)  # (step,)
     assert (moved[: ahead - 1] < 0.01).all()
     assert moved[ahead - 1] > 1

@@ -1,4 +1,4 @@
-"""What can be learned of the simulated slides, what a session gives away, and what joint learning does and does not show."""
+"""Learning on the simulated slides: accuracies, leaks through a session, and the effect of joint learning."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.simulation.slide_datasets import SEED, indices, slides
 from tests.tasks.material.textures import dataset, evaluated, trained
 
 RIG = Rig(materials=8, pac=False, arm_every=0)
-FEWER = replace(RIG, materials=6)  # for networks, which take their time
+FEWER = replace(RIG, materials=6)  # Networks train for long, so they get fewer materials.
 BOTH = ("biotac", "roboskin")
 TRAINING, WATCHED, TESTED = range(30), range(30, 34), range(34, 44)
 STRONG = {"features": 2_000, "baselines": False}
@@ -42,11 +42,11 @@ NETWORK = {
 
 
 def parts(rig: Rig, frames: int = 400, sensors: tuple[str, ...] = BOTH) -> list[Any]:
-    return [slides(rig, indices(rig, sensors, some), frames=frames) for some in (TRAINING, WATCHED, TESTED)]
+    return [slides(rig, indices(rig, sensors, numbers), frames=frames) for numbers in (TRAINING, WATCHED, TESTED)]
 
 
 @cache
-def whole() -> list[Any]:
+def parts_of_rig() -> list[Any]:
     return parts(RIG)
 
 
@@ -56,18 +56,18 @@ def short() -> list[Any]:
 
 
 def accuracy(metrics: dict[str, Any], predictor: str = "model") -> dict[str, float]:
-    found: dict[str, float] = metrics[predictor]["accuracy"]
-    return found
+    scores: dict[str, float] = metrics[predictor]["accuracy"]
+    return scores
 
 
 def within_chance(right: int, n: int, share: float, clusters: int) -> bool:
-    """Whether a count is that of guessing, to three standard errors; slides of a cluster are named alike at worst."""
+    """Return whether a count is at chance, to three standard errors; at worst, slides of a cluster are named alike."""
     return abs(right / n - share) <= 3 * math.sqrt(share * (1 - share) / clusters)
 
 
 @pytest.mark.long
 def test_the_strong_classifier_comes_close_to_one_that_knows_the_spectra(tmp_path: Path) -> None:
-    training, watched, tested = whole()
+    training, watched, tested = parts_of_rig()
     metrics, _ = evaluated(trained(tmp_path, training, watched, **STRONG), tested)
     for sensor in BOTH:
         bound = likelihood_accuracy(SEED, indices(RIG, [sensor], TESTED), RIG)
@@ -109,7 +109,7 @@ def test_pairs_of_other_materials_align_and_swap_as_well_so_that_sharing_is_driv
 
 @pytest.mark.long
 def test_labels_dealt_out_anew_are_named_by_chance(tmp_path: Path) -> None:
-    training, watched, tested = whole()
+    training, watched, tested = parts_of_rig()
     metrics, _ = evaluated(trained(tmp_path, training, watched, **STRONG, labels="permuted"), tested)
     for sensor in BOTH:
         correct, n = metrics["model"]["correct"][sensor], metrics["model"]["n"][sensor]
@@ -121,32 +121,39 @@ def test_of_materials_that_are_all_the_same_sessions_are_told_and_nothing_is_lef
     tmp_path: Path,
 ) -> None:
     rig = replace(RIG, materials=10, sessions=2, identical_materials=True)
-    every = slides(rig, indices(rig, ["biotac"], range(16)))
+    all_slides = slides(rig, indices(rig, ["biotac"], range(16)))
 
-    def of(session: int, numbers: range) -> Any:
+    def slides_of_session(session: int, numbers: range) -> Any:
         chosen = [
             shard
-            for shard in every.recordings.values()
+            for shard in all_slides.recordings.values()
             if str(shard.attributes["session"]).endswith(f"s{session}") and shard.attributes["trial"] in numbers
         ]
         assert chosen
         return dataset(*chosen)
 
-    def both(numbers: range) -> Any:
-        return dataset(*of(1, numbers).recordings.values(), *of(2, numbers).recordings.values())
+    def slides_of_both_sessions(numbers: range) -> Any:
+        return dataset(
+            *slides_of_session(1, numbers).recordings.values(), *slides_of_session(2, numbers).recordings.values()
+        )
 
     model = {"features": 2_000}
-    blocked, _ = evaluated(trained(tmp_path, both(range(12)), dataset(), **model), both(range(12, 16)))
+    blocked, _ = evaluated(
+        trained(tmp_path, slides_of_both_sessions(range(12)), dataset(), **model),
+        slides_of_both_sessions(range(12, 16)),
+    )
     assert accuracy(blocked, "mean_level")["biotac"] > 0.25  # the baseline that gives the session away
-    apart, _ = evaluated(trained(tmp_path, of(1, range(16)), dataset(), **model), of(2, range(16)))
+    separated, _ = evaluated(
+        trained(tmp_path, slides_of_session(1, range(16)), dataset(), **model), slides_of_session(2, range(16))
+    )
     clusters = rig.materials
     for predictor in ("model", "mean_level"):
-        found = apart[predictor]
-        assert within_chance(found["correct"]["biotac"], found["n"]["biotac"], 0.1, clusters), (predictor, found)
+        result = separated[predictor]
+        assert within_chance(result["correct"]["biotac"], result["n"]["biotac"], 0.1, clusters), (predictor, result)
 
 
 def test_the_rig_gives_the_same_slides_again() -> None:
-    one, other = (slides(RIG, [4, 5]).recordings for _ in range(2))
-    for name, shard in one.items():
-        assert shard.table("slide").equals(other[name].table("slide"))
-    assert np.isfinite([shard.attributes["slide_frames"] for shard in one.values()]).all()
+    first, second = (slides(RIG, [4, 5]).recordings for _ in range(2))
+    for name, shard in first.items():
+        assert shard.table("slide").equals(second[name].table("slide"))
+    assert np.isfinite([shard.attributes["slide_frames"] for shard in first.values()]).all()

@@ -27,54 +27,53 @@ APERTURE_M = {"biotac": 0.0006, "roboskin": 0.0018}
 stage = load("simulate.material")
 
 
-def trial(sensor: str, number: int = 0, of: int = 1, materials: int = 20) -> int:
-    """The index of a trial: sensors by turns, then materials, then numbers."""
-    return 2 * materials * number + 2 * (of - 1) + SENSORS.index(sensor)
+def trial(sensor: str, number: int = 0, material_number: int = 1, materials: int = 20) -> int:
+    """Return the index of a trial: sensors by turns, then materials, then numbers."""
+    return 2 * materials * number + 2 * (material_number - 1) + SENSORS.index(sensor)
 
 
 def tactile(table: pa.Table) -> np.ndarray:
-    """The electrodes or taxels of a stream (time, channel)."""
+    """Return the electrodes or taxels of a stream (time, channel)."""
     names = [name for name in table.column_names if name.startswith(("electrode", "triangle"))]
     return np.column_stack([column(table, name) for name in names]).astype(float)
 
 
 def middle(sensor: str, index: int, rig: Rig, seed: int = 0) -> np.ndarray:
-    """The middle 400 frames of a slide of the BioTac, or all of RoboSkin (time, channel)."""
+    """Return the middle 400 frames of a slide of the BioTac, or all of RoboSkin (time, channel)."""
     streams = simulate_trial(seed, index, rig).streams
     counts = tactile(streams[sensor])
     if sensor == "roboskin":
         return counts
     counts = counts[column(streams["truth"], "gt_phase") == 0]
-    kept: np.ndarray = counts[(len(counts) - 400) // 2 :][:400]
-    return kept
+    middle_counts: np.ndarray = counts[(len(counts) - 400) // 2 :][:400]
+    return middle_counts
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("sensor", "least"), [("biotac", 1.0), ("roboskin", 0.95)])
+@pytest.mark.parametrize(("sensor", "lowest_share"), [("biotac", 1.0), ("roboskin", 0.95)])
 @pytest.mark.parametrize("speed_m_s", [0.0125, 0.025, 0.05])
 def test_the_dominant_peak_is_the_speed_over_the_wavelength_that_is_felt_most(
-    sensor: str, speed_m_s: float, least: float
+    sensor: str, speed_m_s: float, lowest_share: float
 ) -> None:
     rig = replace(PLAIN, speed_m_s=speed_m_s, roboskin_speed_m_s=speed_m_s)
     right = []
     for number in range(1, 21):
-        of = material(0, sensor, number, rig)
-        felt = of.amplitude_n * np.exp(-2 * (np.pi * APERTURE_M[sensor] / of.wavelength_m) ** 2)
-        wanted_hz = (
-            speed_m_s / of.wavelength_m[felt >= 0.9 * felt.max()]
-        )  # wear decides between those that are as strong
+        spectrum = material(0, sensor, number, rig)
+        felt = spectrum.amplitude_n * np.exp(-2 * (np.pi * APERTURE_M[sensor] / spectrum.wavelength_m) ** 2)
+        # Wear decides between equally strong ones.
+        wanted_hz = speed_m_s / spectrum.wavelength_m[felt >= 0.9 * felt.max()]
         found_hz, bin_hz = peak(sensor, number, rig)
         right.append(np.abs(found_hz - wanted_hz).min() <= 1.5 * bin_hz)
-    assert np.mean(right) >= least
+    assert np.mean(right) >= lowest_share
 
 
 def peak(sensor: str, number: int, rig: Rig) -> tuple[float, float]:
-    """Where the power of ten trials, summed over a bin on either side, is largest among gratings; and a bin; Hz."""
+    """Return the frequency of the largest power of ten trials, summed over adjacent bins, and the bin width, in Hz."""
     speed_m_s, rate_hz, fine = rig.speed_m_s, 100.0 if sensor == "biotac" else 50.0, 8
     power: Any = 0.0
     for index in (trial(sensor, n, number) for n in range(10)):
         counts = middle(sensor, index, rig)
-        if sensor == "roboskin":  # what the patch does as it moves on is known, and taken off
+        if sensor == "roboskin":  # The known trend of the moving patch is subtracted.
             truth = simulate_trial(0, index, rig).streams["truth"]
             patch = np.column_stack([column(truth, f"gt_patch_{axis}_m") for axis in ("along", "across")])
             share = forearm.fractions(patch)
@@ -98,7 +97,7 @@ def test_without_noise_the_mean_level_is_linear_in_the_force(sensor: str) -> Non
         truth = simulate_trial(0, index, rig).streams["truth"]
         forces.append(column(truth, "gt_force_n")[column(truth, "gt_phase") == 0][-300:].mean())
         levels.append(middle(sensor, index, rig))
-    always = (np.min(levels, axis=(0, 1)) > 0) | (sensor == "biotac")  # without those taxels that are idle at times
+    always = (np.min(levels, axis=(0, 1)) > 0) | (sensor == "biotac")  # Taxels that are idle at times are left out.
     levels = [counts[:, always].mean() for counts in levels]
     assert np.corrcoef(forces, levels)[0, 1] ** 2 > 0.99
     assert max(forces) > 2 * min(forces)
@@ -192,16 +191,16 @@ def test_time_of_roboskin_is_the_axis_that_the_rule_finds_until_it_is_scrambled(
 
 @given(st.integers(0, 2000), st.integers(1, 25), st.integers(1, 4))
 def test_trials_take_turns_over_sensors_then_materials_then_sessions(index: int, materials: int, sessions: int) -> None:
-    found = place(index, Rig(materials=materials, sessions=sessions))
-    assert found.sensor == ("biotac", "roboskin")[index % 2]
-    assert found.material == index // 2 % materials + 1
-    assert found.number == index // (2 * materials)
-    assert found.session == found.number % sessions + 1
+    placed = place(index, Rig(materials=materials, sessions=sessions))
+    assert placed.sensor == ("biotac", "roboskin")[index % 2]
+    assert placed.material == index // 2 % materials + 1
+    assert placed.number == index // (2 * materials)
+    assert placed.session == placed.number % sessions + 1
 
 
 def test_attributes_say_which_sensor_material_trial_and_session_it_is() -> None:
-    found = stage(stage.params(sessions=2), 2 * 20 * 3 + 9)
-    assert found.attributes == {
+    slide = stage(stage.params(sessions=2), 2 * 20 * 3 + 9)
+    assert slide.attributes == {
         "sensor": "roboskin",
         "simulated": True,
         "material": 5,
@@ -231,18 +230,30 @@ def test_materials_that_are_identical_leave_nothing_but_the_session() -> None:
         for n in (1, 2, 3)
     ]
     assert slides == [800, 800, 800]
-    assert max(lengths) - min(lengths) < 60  # of one stiffness: only the hover differs
+    assert max(lengths) - min(lengths) < 60  # All have one stiffness: only the hover differs.
 
 
 def test_the_trials_of_a_session_have_a_fingerprint_in_common_and_those_of_another_have_another() -> None:
     rig = replace(QUIET, session_scale=1.0, identical_materials=True, sessions=2)
     for sensor, number in (("biotac", 19), ("roboskin", 60)):
-        offset = {(of, n): nuisance(0, trial(sensor, n, of), number, rig)[1] for of in (1, 2) for n in range(4)}
-        alike = [np.corrcoef(offset[of, n], offset[of, n + 2])[0, 1] for of in (1, 2) for n in (0, 1)]
-        apart = [np.corrcoef(offset[1, 0], offset[key])[0, 1] for key in ((1, 1), (2, 0), (2, 1))]
-        assert min(alike) > 0.99
-        assert max(np.abs(apart)) < 0.7
-        gains = {nuisance(0, trial(sensor, n, of), number, rig)[0] for of in (1, 2) for n in range(4)}
+        offset = {
+            (material_number, n): nuisance(0, trial(sensor, n, material_number), number, rig)[1]
+            for material_number in (1, 2)
+            for n in range(4)
+        }
+        same_session = [
+            np.corrcoef(offset[material_number, n], offset[material_number, n + 2])[0, 1]
+            for material_number in (1, 2)
+            for n in (0, 1)
+        ]
+        other_sessions = [np.corrcoef(offset[1, 0], offset[key])[0, 1] for key in ((1, 1), (2, 0), (2, 1))]
+        assert min(same_session) > 0.99
+        assert max(np.abs(other_sessions)) < 0.7
+        gains = {
+            nuisance(0, trial(sensor, n, material_number), number, rig)[0]
+            for material_number in (1, 2)
+            for n in range(4)
+        }
         assert len(gains) == 4
         drift = [nuisance(0, trial(sensor, n), number, rig)[1] for n in (0, 2, 48)]
         assert np.abs(drift[1] - drift[0]).max() < np.abs(drift[2] - drift[0]).max()
@@ -254,36 +265,39 @@ def test_a_session_tells_the_class_of_identical_materials_and_another_session_do
     rig, classes, numbers = replace(PLAIN, identical_materials=True, sessions=2, materials=10), 10, 30
     level = np.array(
         [
-            [middle(sensor, trial(sensor, number, of, classes), rig).mean(axis=0) for of in range(1, classes + 1)]
+            [
+                middle(sensor, trial(sensor, number, material_number, classes), rig).mean(axis=0)
+                for material_number in range(1, classes + 1)
+            ]
             for number in range(numbers)
         ]
     )  # (number, class, channel)
 
     def accuracy(train: range, test: range) -> float:
-        wanted = np.tile(np.arange(classes), len(train))
+        labels = np.tile(np.arange(classes), len(train))
         readout = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
-        readout.fit(level[train].reshape(len(wanted), -1), wanted)
-        shown = level[test].reshape(len(test) * classes, -1)
-        return float((readout.predict(shown) == np.tile(np.arange(classes), len(test))).mean())
+        readout.fit(level[train].reshape(len(labels), -1), labels)
+        samples = level[test].reshape(len(test) * classes, -1)
+        return float((readout.predict(samples) == np.tile(np.arange(classes), len(test))).mean())
 
-    assert accuracy(range(20), range(20, numbers)) > 0.3  # the session is known
-    others = [accuracy(range(first, numbers, 2), range(1 - first, numbers, 2)) for first in (0, 1)]
-    assert np.mean(others) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 20)  # the slides of a class and session are one sample
+    assert accuracy(range(20), range(20, numbers)) > 0.3  # The session is known.
+    accuracies = [accuracy(range(first, numbers, 2), range(1 - first, numbers, 2)) for first in (0, 1)]
+    assert np.mean(accuracies) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 20)  # the slides of a class and session are one sample
 
 
 def test_sensors_share_their_materials_unless_their_spectra_are_independent() -> None:
-    apart = Rig(spectra="independent")
+    independent = Rig(spectra="independent")
     for number in (1, 7, 20):
         finger, arm = (material(0, sensor, number) for sensor in SENSORS)
         np.testing.assert_array_equal(finger.wavelength_m, arm.wavelength_m)
-        own = material(0, "roboskin", number, apart)
-        assert not np.isin(own.wavelength_m, arm.wavelength_m).any()
-        np.testing.assert_array_equal(material(0, "biotac", number, apart).wavelength_m, finger.wavelength_m)
+        independent_arm = material(0, "roboskin", number, independent)
+        assert not np.isin(independent_arm.wavelength_m, arm.wavelength_m).any()
+        np.testing.assert_array_equal(material(0, "biotac", number, independent).wavelength_m, finger.wavelength_m)
 
 
 def test_every_twentieth_slide_of_a_finger_has_the_arm_with_it_on_a_clock_of_its_own() -> None:
     streams = {n: simulate_trial(0, trial("biotac", n, 6)).streams for n in (0, 1, 19, 20)}
-    assert [sorted(found) for found in streams.values()] == [
+    assert [sorted(stream_names) for stream_names in streams.values()] == [
         ["biotac", "truth", "twist", "wrench"],
         ["biotac", "truth"],
         ["biotac", "truth"],
@@ -325,30 +339,30 @@ def test_vibration_follows_the_texture_and_may_be_left_out() -> None:
 
 def test_ground_truth_is_in_the_stream_truth_and_nowhere_else() -> None:
     for index in (0, 1):
-        found = simulate_trial(0, index)
-        assert all(name.startswith("gt_") for name in found.streams["truth"].column_names[1:])
-        measured = [name for key, table in found.streams.items() if key != "truth" for name in table.column_names]
-        assert not any(name.startswith("gt_") for name in [*measured, *found.attributes])
+        slide = simulate_trial(0, index)
+        assert all(name.startswith("gt_") for name in slide.streams["truth"].column_names[1:])
+        measured = [name for key, table in slide.streams.items() if key != "truth" for name in table.column_names]
+        assert not any(name.startswith("gt_") for name in [*measured, *slide.attributes])
 
 
 @pytest.mark.parametrize("index", [4, 5])
 def test_the_same_seed_and_trial_give_the_same_bytes(index: int) -> None:
-    first, again = (stage(stage.params(seed=5), index) for _ in range(2))
-    assert first.attributes == again.attributes
-    assert all(to_parquet(table) == to_parquet(again.streams[name]) for name, table in first.streams.items())
+    first, repeat = (stage(stage.params(seed=5), index) for _ in range(2))
+    assert first.attributes == repeat.attributes
+    assert all(to_parquet(table) == to_parquet(repeat.streams[name]) for name, table in first.streams.items())
     sensor = SENSORS[index % 2]
-    for other in (stage(stage.params(seed=6), index), stage(stage.params(seed=5), index + 40)):
-        assert not first.streams[sensor].equals(other.streams[sensor])
-    many = stage(stage.params(seed=5, trials=5000), index)
-    assert many.streams[sensor].equals(first.streams[sensor])
+    for different in (stage(stage.params(seed=6), index), stage(stage.params(seed=5), index + 40)):
+        assert not first.streams[sensor].equals(different.streams[sensor])
+    long_run = stage(stage.params(seed=5, trials=5000), index)
+    assert long_run.streams[sensor].equals(first.streams[sensor])
 
 
 def test_materials_sessions_and_trials_have_random_numbers_of_their_own() -> None:
-    several, single = Rig(sessions=3), Rig(sessions=1)
-    assert nuisance(0, trial("biotac", 0), 19, several)[0] == nuisance(0, trial("biotac", 0), 19, single)[0]
-    few = Rig(materials=5)
+    three_sessions, single = Rig(sessions=3), Rig(sessions=1)
+    assert nuisance(0, trial("biotac", 0), 19, three_sessions)[0] == nuisance(0, trial("biotac", 0), 19, single)[0]
+    five_materials = Rig(materials=5)
     np.testing.assert_array_equal(
-        material(0, "biotac", 4, few).wavelength_m, material(0, "biotac", 4, single).wavelength_m
+        material(0, "biotac", 4, five_materials).wavelength_m, material(0, "biotac", 4, single).wavelength_m
     )
     calm, strong = (simulate_trial(0, 4, replace(PLAIN, session_scale=scale)) for scale in (0.0, 1.0))
     assert calm.streams["truth"].equals(strong.streams["truth"])

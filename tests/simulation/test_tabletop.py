@@ -1,4 +1,4 @@
-"""What lies on the simulated table beside the object."""
+"""Neighbours of the object on the simulated table."""
 
 import numpy as np
 import pytest
@@ -11,17 +11,17 @@ def test_what_lies_beside_an_object_may_first_be_tried_where_the_camera_does_not
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     up = np.array([0.0, 0.0, -1.0])
-    rest = solids.BOX.rests()[0]
-    placed = depth_camera.place_shape(solids.BOX, rest, 0.0, (0.0, 0.0), up, 0.8)
-    real, tried = depth_camera.window, []
+    rest_pose = solids.BOX.rests()[0]
+    placed = depth_camera.place_shape(solids.BOX, rest_pose, 0.0, (0.0, 0.0), up, 0.8)
+    find_window, tried = depth_camera.window, []
 
-    def window(found: depth_camera.Placed) -> tuple[range, range]:
-        tried.append(found)
-        return (range(0), range(0)) if len(tried) == 1 else real(found)
+    def window(candidate: depth_camera.Placed) -> tuple[range, range]:
+        tried.append(candidate)
+        return (range(0), range(0)) if len(tried) == 1 else find_window(candidate)
 
     monkeypatch.setattr(depth_camera, "window", window)
-    beside = tabletop._place_neighbour(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
+    neighbour = tabletop._place_neighbour(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
 
-    assert len(tried) > 1 and beside is tried[-1]
-    apart_m = np.linalg.norm(beside.origin_m - placed.origin_m)
+    assert len(tried) > 1 and neighbour is tried[-1]
+    apart_m = np.linalg.norm(neighbour.origin_m - placed.origin_m)
     assert apart_m > solids.BOX.bound_m

@@ -1,4 +1,4 @@
-"""What can be known of a touch: the expected reading and its least error, against closed forms and brute force."""
+"""Bounds of a touch: the expected reading and its least error, against closed forms and brute force."""
 
 from __future__ import annotations
 
@@ -17,53 +17,57 @@ TRIALS = range(240)
 
 
 def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognormal_effort() -> None:
-    of = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    situation = perform(SEED, 2, Rig(stiffness="rigid")).situation
     rng = np.random.default_rng(1)
     possible = touch_bound.readings(
-        of, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
+        situation, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
     )
     mean, variance = touch_bound.mean_and_variance(possible)
-    limit = 140 * pinch.limits_n(of.opening_m)
+    limit = 140 * pinch.limits_n(situation.opening_m)
     expected = np.array([1676, 2779]) + limit * np.exp(0.02)
     np.testing.assert_allclose(mean[:, -1], expected, atol=1.5)
     np.testing.assert_allclose(variance[:, -1], limit**2 * np.exp(0.04) * (np.exp(0.04) - 1), rtol=0.03)
 
 
 def test_drift_and_noise_add_their_own_variances() -> None:
-    of = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    situation = perform(SEED, 2, Rig(stiffness="rigid")).situation
     rng = np.random.default_rng(2)
     possible = touch_bound.readings(
-        of, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0
+        situation, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0
     )
     periods = np.array([2.0, 3.0, 5.0])
-    expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # of three waves, and of rounding
+    expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # Variances of three waves, and of rounding.
     np.testing.assert_allclose(touch_bound.mean_and_variance(possible)[1][:, -1], expected, rtol=0.03)
 
 
 @pytest.mark.parametrize("index", [0, 1, 5])
 def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_the_rig(index: int) -> None:
     scene = perform(SEED, index, RIG)
-    made = sensors(SEED)
+    sensor_pair = sensors(SEED)
     rng = np.random.default_rng(index)
-    made_again = []
+    repeated_counts = []
     for _ in range(3_000):
         hidden = pinch.unseen(rng, 1, RIG.effort_spread)
         t_ns = stamp_ns(int(rng.integers(200_000)), RIG)
-        again = read_sensors(made, replace(scene, hidden=hidden), t_ns, RIG)
-        made_again.append(fingertip_sp.counted(again.signal + made.noise * rng.normal(size=(2, 25))))
-    mean, variance = touch_bound.mean_and_variance(np.array(made_again))
-    found, spread = touch_bound.mean_and_variance(touch_bound.readings(scene.situation, made, rng, draws=3_000))
-    np.testing.assert_allclose(found, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
+        repeated_touch = read_sensors(sensor_pair, replace(scene, hidden=hidden), t_ns, RIG)
+        repeated_counts.append(
+            fingertip_sp.counted(repeated_touch.signal + sensor_pair.noise * rng.normal(size=(2, 25)))
+        )
+    mean, variance = touch_bound.mean_and_variance(np.array(repeated_counts))
+    expected_mean, spread = touch_bound.mean_and_variance(
+        touch_bound.readings(scene.situation, sensor_pair, rng, draws=3_000)
+    )
+    np.testing.assert_allclose(expected_mean, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
     np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
 
 
 @pytest.mark.long
 def test_no_constant_comes_near_the_bound_and_the_readings_keep_to_it() -> None:
-    made = grasps(RIG, TRIALS)
+    dataset = grasps(RIG, TRIALS)
     for target in ("pdc_th", "pdc_mf", "e_th", "e_mf"):
-        read = readings(made, target)
-        error = read - readings(made, target, "truth", "gt_expected_")
-        variances = readings(made, target, "truth", "gt_variance_")
+        read = readings(dataset, target)
+        error = read - readings(dataset, target, "truth", "gt_expected_")
+        variances = readings(dataset, target, "truth", "gt_variance_")
         bound = np.sqrt(variances.mean())
         constant = np.sqrt(read.var(axis=0).mean())
         assert np.sqrt((error**2).mean()) == pytest.approx(bound, rel=0.2), target  # they share a drift
@@ -74,5 +78,5 @@ def test_the_least_error_is_the_root_of_the_mean_variance_by_target() -> None:
     variances = np.zeros((4, 2, 25))
     variances[:, 0, -1], variances[:, 1, -1] = [9, 9, 25, 25], 4
     variances[:, 0, :-1], variances[:, 1, :-1] = 1, 36
-    found = touch_bound.irreducible_rmse(variances)
-    assert found == pytest.approx({"pdc_mf": np.sqrt(17), "pdc_th": 2, "e_mf": 1, "e_th": 6})
+    rmse = touch_bound.irreducible_rmse(variances)
+    assert rmse == pytest.approx({"pdc_mf": np.sqrt(17), "pdc_th": 2, "e_mf": 1, "e_th": 6})

@@ -16,27 +16,27 @@ def path(protocol: str, seed: int, duration_s: float = 20.0) -> Trajectory:
 @pytest.mark.parametrize("protocol", ["controlled", "kinaesthetic"])
 def test_the_hand_stays_in_its_workspace_above_the_table_and_moves_smoothly(protocol: str) -> None:
     for seed in range(20):
-        one = path(protocol, seed)
-        reach = one.position_m - one.position_m[0]
+        motion = path(protocol, seed)
+        reach = motion.position_m - motion.position_m[0]
         assert reach[:, 2].min() > -0.005
         assert reach[:, 2].max() > 0.1
         assert np.abs(reach).max() < 0.6
-        assert np.abs(one.acceleration_m_s2).max() < 13  # a Panda's limit
-        assert np.abs(np.diff(one.acceleration_m_s2, axis=0)).max() < 1
+        assert np.abs(motion.acceleration_m_s2).max() < 13  # a Panda's limit
+        assert np.abs(np.diff(motion.acceleration_m_s2, axis=0)).max() < 1
 
 
 @pytest.mark.parametrize("protocol", ["controlled", "kinaesthetic"])
 def test_acceleration_is_what_makes_the_position_and_nothing_moves_before_the_lift(protocol: str) -> None:
-    one = path(protocol, 3)
-    twice = np.cumsum(np.cumsum(one.acceleration_m_s2, axis=0), axis=0) / RATE_HZ**2
-    np.testing.assert_allclose(twice, one.position_m - one.position_m[0], atol=1e-9)
-    assert not one.acceleration_m_s2[:1500].any()
+    motion = path(protocol, 3)
+    integrated_m = np.cumsum(np.cumsum(motion.acceleration_m_s2, axis=0), axis=0) / RATE_HZ**2
+    np.testing.assert_allclose(integrated_m, motion.position_m - motion.position_m[0], atol=1e-9)
+    assert not motion.acceleration_m_s2[:1500].any()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_controlled_trial_begins_with_the_seven_phases_of_the_published_profile(seed: int) -> None:
-    one = path("controlled", seed)
-    sign = np.sign(np.where(np.abs(one.acceleration_m_s2) > 0.05, one.acceleration_m_s2, 0.0))
+    motion = path("controlled", seed)
+    sign = np.sign(np.where(np.abs(motion.acceleration_m_s2) > 0.05, motion.acceleration_m_s2, 0.0))
     changes = sign[np.flatnonzero(np.diff(sign, axis=0).any(axis=1)) + 1]
     moving = [tuple(row) for row in changes if row.any()]
     assert moving[:4] == [(0, 0, 1), (0, 0, -1), (-1, 0, 0), (1, 0, 0)]
@@ -60,9 +60,9 @@ def test_a_minimum_jerk_movement_starts_and_ends_at_rest_and_peaks_where_theory_
 
 
 def test_a_hand_that_is_still_is_still_and_aloft() -> None:
-    one = rest(2.0)
-    assert len(one.t_ns) == 2001
-    assert not one.acceleration_m_s2.any()
+    motion = rest(2.0)
+    assert len(motion.t_ns) == 2001
+    assert not motion.acceleration_m_s2.any()
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""Whether a sensor names materials that only another one was told of: where both feel the same, and only there.
+"""A sensor names materials that only another one was trained on: where both feel the same, and only there.
 
 Slides of one material are alike in what is wrong with them, so certainty is counted by materials, not by slides.
 """
@@ -24,7 +24,7 @@ from tests.stage_params import fitting
 from tests.tasks.material.textures import Slide, dataset
 
 SEEDS, MATERIALS = (0, 1, 2), 12
-KNOWN, NEW = range(7), range(7, 10)  # which slides of each material and sensor are learned from, and which are named
+KNOWN, NEW = range(7), range(7, 10)  # Slides of each material and sensor: training slides, and test slides.
 HELD = (range(1, 5), range(5, 9), range(9, 13))  # every material is held out once
 CHANCE, CHANCE_AMONG_HELD = 1 / MATERIALS, 1 / 4
 simulate, segment = load("simulate.material"), load("segment.slides")
@@ -33,48 +33,51 @@ simulate, segment = load("simulate.material"), load("segment.slides")
 @cache
 def slide(seed: int, index: int, spectra: str) -> Slide:
     """Slide ``index`` of the rig, cut as any other."""
-    asked = simulate.params(seed=seed, materials=MATERIALS, spectra=spectra, pac=False, arm_every=0)
-    recording = simulate(asked, index)
+    params = simulate.params(seed=seed, materials=MATERIALS, spectra=spectra, pac=False, arm_every=0)
+    recording = simulate(params, index)
     cut = segment(segment.params(), FakeRecording(recording.streams, f"slide-{index}", recording.attributes))
     return Slide(cut.streams, f"slide-{index}", {**recording.attributes, **cut.attributes})
 
 
 def slides(seed: int, numbers: range, spectra: str) -> list[Slide]:
-    """The slides with these numbers, of all materials and both sensors."""
-    each = len(SENSORS) * MATERIALS
-    return [slide(seed, index, spectra) for index in range(each * numbers.start, each * numbers.stop)]
+    """Return the slides with these numbers, of all materials and both sensors."""
+    slides_per_number = len(SENSORS) * MATERIALS
+    return [
+        slide(seed, index, spectra)
+        for index in range(slides_per_number * numbers.start, slides_per_number * numbers.stop)
+    ]
 
 
 @cache
-def named(spectra: str) -> dict[str, Floats]:
-    """How RoboSkin's slides of each material of each seed are named while it is not told of it: shares named rightly.
+def zero_shot_accuracies(spectra: str) -> dict[str, Floats]:
+    """Return the accuracy on RoboSkin's slides of each material of each seed while that material is held out.
 
-    ``every``: of all materials, ``among``: of those held out; by what the BioTac was told. Both are (material,).
+    ``every``: among all materials, ``among``: among those held out, from the BioTac's slides. Both are (material,).
     """
-    found: dict[str, list[float]] = {"every": [], "among": []}
-    for seed, held in product(SEEDS, HELD):
-        hold_out = "roboskin=" + ",".join(map(str, held))
+    accuracies: dict[str, list[float]] = {"every": [], "among": []}
+    for seed, held_out in product(SEEDS, HELD):
+        hold_out = "roboskin=" + ",".join(map(str, held_out))
         params = fitting("train.material", {}, architecture="spectra", hold_out=hold_out, baselines=False)
         files = material_training.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
-        for number in held:
-            new = [one for one in slides(seed, NEW, spectra) if one.attributes["material"] == number]
+        for number in held_out:
+            new = [sample for sample in slides(seed, NEW, spectra) if sample.attributes["material"] == number]
             zero: dict[str, Any] = json.loads(material_evaluation.evaluate(files, dataset(*new)).files["metrics.json"])[
                 "zero_shot"
             ]
             assert zero["n"] == {"roboskin": len(NEW)}
-            found["every"].append(zero["accuracy"]["roboskin"])
-            found["among"].append(zero["among_held_out"]["accuracy"]["roboskin"])
-    return {name: np.array(shares) for name, shares in found.items()}
+            accuracies["every"].append(zero["accuracy"]["roboskin"])
+            accuracies["among"].append(zero["among_held_out"]["accuracy"]["roboskin"])
+    return {name: np.array(shares) for name, shares in accuracies.items()}
 
 
 def margin(shares: Floats, chance: float) -> float:
-    """Three standard errors of the mean over materials, of which a guesser names all slides rightly or none."""
+    """Return three standard errors of the mean over materials, of which a guesser names all slides rightly or none."""
     return float(3 * max(shares.std(ddof=1), np.sqrt(chance * (1 - chance))) / np.sqrt(len(shares)))
 
 
 @pytest.mark.long
 def test_materials_told_to_one_sensor_are_named_by_the_other_three_times_as_often_as_by_chance() -> None:
-    shares = named("shared")
+    shares = zero_shot_accuracies("shared")
     assert shares["every"].mean() >= 3 * CHANCE
     assert shares["every"].mean() - margin(shares["every"], CHANCE) > CHANCE
     assert shares["among"].mean() - margin(shares["among"], CHANCE_AMONG_HELD) > CHANCE_AMONG_HELD
@@ -82,7 +85,7 @@ def test_materials_told_to_one_sensor_are_named_by_the_other_three_times_as_ofte
 
 @pytest.mark.long
 def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> None:
-    shares = named("independent")
+    shares = zero_shot_accuracies("independent")
     assert abs(shares["every"].mean() - CHANCE) <= margin(shares["every"], CHANCE)
     assert abs(shares["among"].mean() - CHANCE_AMONG_HELD) <= margin(shares["among"], CHANCE_AMONG_HELD)
 

@@ -1,4 +1,4 @@
-"""A recording without a store, for stages that are called as plain functions."""
+"""Define a recording without a store, for stages that are called as plain functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Synchronized recordings made by hand, with what the stages of learning read of real ones."""
+"""Build synchronized recordings with the columns that learning stages read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def table(
     rest: float | None = REST,
     extra: Mapping[str, np.ndarray[Any, Any]] | None = None,
 ) -> pa.Table:
-    """A segmented recording at 50 Hz: counts above rest (time, channel) and poses (time, 7)."""
+    """Return a segmented recording at 50 Hz: counts above rest (time, channel) and poses (time, 7)."""
     rows = len(tactile)
     if pose is None:
         pose = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (rows, 1))
@@ -52,7 +52,7 @@ def table(
 
 
 def motion(seed: int, rows: int = 80) -> FakeShard:
-    """A recording in which the arm swings and each channel feels its position, with a little noise."""
+    """Return a recording in which the arm swings and each channel feels its position, with a little noise."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(rows) * 0.02
     x = 0.1 * np.sin(2 * np.pi * (1 + 0.3 * rng.random()) * time_s + rng.random())

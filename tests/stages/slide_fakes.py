@@ -1,4 +1,4 @@
-"""Made-up recordings of a BioTac that an iiwa draws over a material."""
+"""Build recordings of a BioTac that an iiwa draws over a material."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def finger(pressure: AnyArray, seed: int = 0) -> pa.Table:
 
 def pressed(rows: int = 800, reached: int = 0) -> AnyArray:
     """Return a pressure that reaches 40 counts in the row ``reached``, and falls below for most of what follows."""
-    found = np.full(rows, 25)
-    found[:reached] = np.minimum(np.arange(reached), 39)
-    found[reached : reached + 20] = 40
-    return found
+    pressure = np.full(rows, 25)
+    pressure[:reached] = np.minimum(np.arange(reached), 39)
+    pressure[reached : reached + 20] = 40
+    return pressure
 
 
 def drawn(rows: int, moves: slice, speed_m_s: float = LIMIT_M_S, rate_hz: float = 150.0) -> dict[str, pa.Table]:

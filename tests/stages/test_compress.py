@@ -23,26 +23,26 @@ FIT_AUTOENCODER = AUTOENCODER.fit
 RECORDINGS = [motion(seed) for seed in range(4)]
 
 
-def fitted(*shards: FakeShard, **how: float | str) -> dict[str, bytes]:
-    return dict(FIT(PCA.params(**({"components": 3} | how)), dataset(*shards)).files)
+def fitted(*shards: FakeShard, **options: float | str) -> dict[str, bytes]:
+    return dict(FIT(PCA.params(**({"components": 3} | options)), dataset(*shards)).files)
 
 
 def compressed(shard: FakeShard, files: dict[str, bytes]) -> pa.Table:
     return PCA(PCA.params(), shard, files)
 
 
-def learned(folder: Path, *shards: FakeShard, **how: Any) -> dict[str, bytes]:
-    params = AUTOENCODER.params(**({"components": 3, "hidden": "8", "epochs": 2} | how))
+def learned(folder: Path, *shards: FakeShard, **options: Any) -> dict[str, bytes]:
+    params = AUTOENCODER.params(**({"components": 3, "hidden": "8", "epochs": 2} | options))
     return dict(FIT_AUTOENCODER(params, dataset(*shards), folder).files)
 
 
 def test_latents_are_added_and_everything_else_stays() -> None:
     shard = RECORDINGS[0]
-    found = compressed(shard, fitted(*RECORDINGS))
-    assert found.column_names == [*shard.content.column_names, "z00", "z01", "z02"]
-    assert found.select(shard.content.column_names).equals(shard.content, check_metadata=True)
-    assert found.schema.field("z01").metadata == {b"quantity": b"latent", b"unit": b"1"}
-    assert found.schema.field("z01").type == pa.float32()
+    encoded = compressed(shard, fitted(*RECORDINGS))
+    assert encoded.column_names == [*shard.content.column_names, "z00", "z01", "z02"]
+    assert encoded.select(shard.content.column_names).equals(shard.content, check_metadata=True)
+    assert encoded.schema.field("z01").metadata == {b"quantity": b"latent", b"unit": b"1"}
+    assert encoded.schema.field("z01").type == pa.float32()
 
 
 def test_the_rest_level_of_each_recording_is_taken_off() -> None:
@@ -55,8 +55,8 @@ def test_the_rest_level_of_each_recording_is_taken_off() -> None:
 
 def test_decoding_gives_back_counts_above_rest() -> None:
     files = fitted(*RECORDINGS, components=len(CHANNELS))
-    found = compressed(RECORDINGS[0], files)
-    latents = np.column_stack([found[name].to_numpy() for name in codec.load(files).latents])
+    encoded = compressed(RECORDINGS[0], files)
+    latents = np.column_stack([encoded[name].to_numpy() for name in codec.load(files).latents])
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
     assert np.allclose(codec.load(files).decode(latents), counts, atol=0.01)
 
@@ -67,14 +67,14 @@ def test_the_codec_does_not_depend_on_the_order_of_recordings_nor_on_rows_in_gap
     tactile = np.random.default_rng(0).normal(size=(80, len(CHANNELS)))
     wild = tactile.copy()
     wild[-5:] = 1e5
-    tame, torn = (fitted(FakeShard("a", table(one, gap=gap))) for one in (tactile, wild))
+    tame, torn = (fitted(FakeShard("a", table(samples, gap=gap))) for samples in (tactile, wild))
     assert tame == torn
     assert fitted(*RECORDINGS) == fitted(*reversed(RECORDINGS))
 
 
 def test_a_recording_without_rows_is_compressed_to_none() -> None:
-    found = compressed(FakeShard("empty", table(np.zeros((0, len(CHANNELS))))), fitted(*RECORDINGS))
-    assert (found.num_rows, found.column_names[-1]) == (0, "z02")
+    encoded = compressed(FakeShard("empty", table(np.zeros((0, len(CHANNELS))))), fitted(*RECORDINGS))
+    assert (encoded.num_rows, encoded.column_names[-1]) == (0, "z02")
 
 
 def test_a_rig_with_other_channels_is_refused_with_the_recordings_name() -> None:
@@ -106,14 +106,14 @@ def test_rows_that_are_not_finite_get_latents_that_are_not() -> None:
     values = np.random.default_rng(0).normal(size=(80, len(CHANNELS)))
     values[9, 4] = np.nan
     shard = FakeShard("a", table(values))
-    found = compressed(shard, fitted(shard))
-    assert np.isnan(found["z01"].to_numpy()).nonzero()[0].tolist() == [9]
+    encoded = compressed(shard, fitted(shard))
+    assert np.isnan(encoded["z01"].to_numpy()).nonzero()[0].tolist() == [9]
 
 
 def test_increments_do_not_reach_across_a_gap_in_time() -> None:
     files = fitted(*RECORDINGS, representation="increments")
-    whole = RECORDINGS[0].content
-    cut = FakeShard("cut", whole.take([*range(20), *range(30, 80)]))
+    content = RECORDINGS[0].content
+    cut = FakeShard("cut", content.take([*range(20), *range(30, 80)]))
     latents = compressed(cut, files)["z00"].to_numpy()
     uncut = compressed(RECORDINGS[0], files)["z00"].to_numpy()
     assert latents[0] == latents[20] == 0
@@ -122,28 +122,30 @@ def test_increments_do_not_reach_across_a_gap_in_time() -> None:
 
 
 def test_codec_json_says_what_latents_stand_for_and_what_is_lost() -> None:
-    told = json.loads(fitted(*RECORDINGS, representation="increments")["codec.json"])
-    assert (told["kind"], told["of"], told["latents"], len(told["explained_ratio"])) == ("pca", "increments", 3, 12)
-    assert told["reconstruction"]["val"].keys() == {"rows", "mse_standardised", "mae_counts"}
-    assert np.shape(told["latent_covariance"]) == (3, 3)
+    info = json.loads(fitted(*RECORDINGS, representation="increments")["codec.json"])
+    assert (info["kind"], info["of"], info["latents"], len(info["explained_ratio"])) == ("pca", "increments", 3, 12)
+    assert info["reconstruction"]["val"].keys() == {"rows", "mse_standardised", "mae_counts"}
+    assert np.shape(info["latent_covariance"]) == (3, 3)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_an_autoencoder_adds_its_latents_and_everything_else_stays(tmp_path: Path, frames: int) -> None:
     files = learned(tmp_path, *RECORDINGS, frames=frames)
-    found = AUTOENCODER(AUTOENCODER.params(), RECORDINGS[0], files)
-    assert found.column_names == [*RECORDINGS[0].content.column_names, "z00", "z01", "z02"]
+    encoded = AUTOENCODER(AUTOENCODER.params(), RECORDINGS[0], files)
+    assert encoded.column_names == [*RECORDINGS[0].content.column_names, "z00", "z01", "z02"]
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
     expected = codec.load(files).encode(counts, CHANNELS)
-    assert np.allclose(np.column_stack([found[name].to_numpy() for name in ("z00", "z01", "z02")]), expected, atol=1e-5)
-    told = json.loads(files["codec.json"])
-    assert (told["kind"], told["frames"], len(told["search"])) == ("autoencoder", frames, 1)
+    assert np.allclose(
+        np.column_stack([encoded[name].to_numpy() for name in ("z00", "z01", "z02")]), expected, atol=1e-5
+    )
+    info = json.loads(files["codec.json"])
+    assert (info["kind"], info["frames"], len(info["search"])) == ("autoencoder", frames, 1)
 
 
 def test_an_autoencoder_is_the_same_for_the_same_seed_and_another_for_another(tmp_path: Path) -> None:
-    one, two = learned(tmp_path / "a", *RECORDINGS), learned(tmp_path / "b", *reversed(RECORDINGS))
-    assert one == two
-    assert learned(tmp_path / "c", *RECORDINGS, seed=1) != one
+    first, second = learned(tmp_path / "a", *RECORDINGS), learned(tmp_path / "b", *reversed(RECORDINGS))
+    assert first == second
+    assert learned(tmp_path / "c", *RECORDINGS, seed=1) != first
 
 
 def test_a_rig_with_other_channels_is_refused_by_an_autoencoder_too(tmp_path: Path) -> None:
@@ -164,8 +166,8 @@ def test_an_array_with_fewer_channels_than_latents_keeps_as_many_as_it_has_and_a
     stage = registry.load("compress.pca")
     assert stage.fit is not None
     shards = dataset(*(motion(seed) for seed in range(3)))
-    made = stage.fit(stage.params(components=len(CHANNELS) + 1), shards)
-    whole = stage.fit(stage.params(components=len(CHANNELS)), shards)
-    assert made.files == whole.files
-    assert len(made.notes) == 1 and str(len(CHANNELS)) in made.notes[0]
-    assert not whole.notes
+    too_many = stage.fit(stage.params(components=len(CHANNELS) + 1), shards)
+    all_channels = stage.fit(stage.params(components=len(CHANNELS)), shards)
+    assert too_many.files == all_channels.files
+    assert len(too_many.notes) == 1 and str(len(CHANNELS)) in too_many.notes[0]
+    assert not all_channels.notes

@@ -1,4 +1,4 @@
-"""The evaluate stage finds the task of a model and hands it over."""
+"""Test that the evaluate stage finds the task of a model and hands the model over."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Raw grasps, made up, cut down to the object's points and one reading."""
+"""Test that raw grasps are cut down to the object's points and one reading."""
 
 from __future__ import annotations
 
@@ -31,14 +31,19 @@ def touched(rows: int = 300) -> pa.Table:
     return schema.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
 
 
-def raw(whole: Scene, **other: pa.Table) -> dict[str, pa.Table]:
-    return {"scene": whole.cloud.table(), "grasp": whole.grasp.table(START_NS), "biotac_sp": touched(), **other}
+def raw(ball_scene: Scene, **extra_streams: pa.Table) -> dict[str, pa.Table]:
+    return {
+        "scene": ball_scene.cloud.table(),
+        "grasp": ball_scene.grasp.table(START_NS),
+        "biotac_sp": touched(),
+        **extra_streams,
+    }
 
 
 def cut(recording: Any, **params: Any) -> RecordingOutput:
-    found = grasps(grasps.params(**params), recording)
-    assert isinstance(found, RecordingOutput)
-    return found
+    output = grasps(grasps.params(**params), recording)
+    assert isinstance(output, RecordingOutput)
+    return output
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +54,7 @@ def simulated() -> list[RecordingOutput]:
     return [simulate(params, trial) for trial in range(6)]
 
 
-def of_truth(recording: RecordingOutput, name: str) -> Any:
+def truth_value(recording: RecordingOutput, name: str) -> Any:
     return recording.streams["truth"].column(name)[0].as_py()
 
 
@@ -57,68 +62,70 @@ def test_of_simulated_scenes_nearly_all_points_of_the_object_and_nearly_no_other
     shard: Recording, simulated: list[RecordingOutput]
 ) -> None:
     for recording in simulated:
-        found = Cloud.of(cut(shard(recording.streams)).streams["cloud"]).points_m
-        whole = Cloud.of(recording.streams["scene"]).points_m
+        object_points_m = Cloud.of(cut(shard(recording.streams)).streams["cloud"]).points_m
+        scene_points_m = Cloud.of(recording.streams["scene"]).points_m
         is_object = recording.streams["scene_truth"].column("gt_surface").to_numpy() == OBJECT
-        theirs = set(map(tuple, whole[is_object].tolist()))
-        right = sum(point in theirs for point in map(tuple, found.tolist()))
-        assert right >= 0.95 * len(found) and right >= 0.95 * len(theirs)
+        true_points = set(map(tuple, scene_points_m[is_object].tolist()))
+        true_count = sum(point in true_points for point in map(tuple, object_points_m.tolist()))
+        assert true_count >= 0.95 * len(object_points_m) and true_count >= 0.95 * len(true_points)
 
 
 def test_of_simulated_streams_contact_and_reading_are_those_of_the_truth(
     shard: Recording, simulated: list[RecordingOutput]
 ) -> None:
     for recording in simulated:
-        found, stream = cut(shard(recording.streams)), recording.streams["biotac_sp"]
+        output, stream = cut(shard(recording.streams)), recording.streams["biotac_sp"]
         t_ns = stream.column("t_ns").to_numpy()
         begin_ns, hold_ns, release_ns = (
-            of_truth(recording, f"gt_{name}_ns") for name in ("contact", "hold", "release")
+            truth_value(recording, f"gt_{name}_ns") for name in ("contact", "hold", "release")
         )
-        held, free = (t_ns > hold_ns) & (t_ns < release_ns), t_ns < begin_ns
+        holding, free = (t_ns > hold_ns) & (t_ns < release_ns), t_ns < begin_ns
         at_ns = []  # the force grows as s²(3 - 2s) from contact to hold; here it has raised the pressure by a count
         for finger in biotac_sp.FINGERS:
             pressure = stream.column(f"{finger}_pdc").to_numpy().astype(float)
             share = np.linspace(0, 1, 100_001)
-            rise = (np.median(pressure[held]) - np.median(pressure[free])) * share**2 * (3 - 2 * share)
+            rise = (np.median(pressure[holding]) - np.median(pressure[free])) * share**2 * (3 - 2 * share)
             at_ns.append(begin_ns + share[np.searchsorted(rise, 1.0)] * (hold_ns - begin_ns))
-        contact_ns = found.attributes["contact_ns"]
+        contact_ns = output.attributes["contact_ns"]
         assert isinstance(contact_ns, int)
         assert abs(contact_ns - max(at_ns)) <= 2 * STEP_NS
-        reading = found.streams["reading"]
+        reading = output.streams["reading"]
         assert abs(reading.column("t_ns")[0].as_py() - hold_ns) <= 6 * STEP_NS
         for field in biotac_sp.fields():
-            channel = stream.column(field.name).to_numpy()[held].astype(float)
+            channel = stream.column(field.name).to_numpy()[holding].astype(float)
             error = abs(reading.column(field.name)[0].as_py() - np.median(channel))
             assert error <= 1 + 4 * channel.std() / np.sqrt(20 / 1.57)  # the spread of a median of 20 rows
 
 
 def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Recording) -> None:
-    whole = scene(1)
+    ball_scene = scene(1)
     truth = pa.table({"t_ns": [START_NS], "gt_force_n": [2.0]})
-    found = cut(shard(raw(whole, truth=truth)))
-    assert set(found.streams) == {"cloud", "grasp", "reading", "truth"}
-    cloud = Cloud.of(found.streams["cloud"])
-    theirs = {tuple(point) for point in whole.cloud.points_m[whole.ball].tolist()}
-    right = sum(tuple(point) in theirs for point in cloud.points_m.tolist())
-    assert right >= 0.95 * len(cloud) and right >= 0.95 * len(theirs)
-    of_point = dict(zip(map(tuple, whole.cloud.points_m.tolist()), np.asarray(whole.cloud.colours), strict=True))
+    output = cut(shard(raw(ball_scene, truth=truth)))
+    assert set(output.streams) == {"cloud", "grasp", "reading", "truth"}
+    cloud = Cloud.of(output.streams["cloud"])
+    true_points = {tuple(point) for point in ball_scene.cloud.points_m[ball_scene.ball].tolist()}
+    true_count = sum(tuple(point) in true_points for point in cloud.points_m.tolist())
+    assert true_count >= 0.95 * len(cloud) and true_count >= 0.95 * len(true_points)
+    colour_by_point = dict(
+        zip(map(tuple, ball_scene.cloud.points_m.tolist()), np.asarray(ball_scene.cloud.colours), strict=True)
+    )
     assert cloud.colours is not None
     for point, colour in zip(cloud.points_m.tolist(), cloud.colours, strict=True):
-        assert (of_point[tuple(point)] == colour).all()
-    np.testing.assert_array_equal(Grasp.of(found.streams["grasp"]).g1_m, whole.grasp.g1_m)
-    assert found.streams["truth"].equals(truth)
+        assert (colour_by_point[tuple(point)] == colour).all()
+    np.testing.assert_array_equal(Grasp.of(output.streams["grasp"]).g1_m, ball_scene.grasp.g1_m)
+    assert output.streams["truth"].equals(truth)
 
 
 def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_one(shard: Recording) -> None:
-    found = cut(shard(raw(scene(1))))
-    reading = found.streams["reading"]
+    output = cut(shard(raw(scene(1))))
+    reading = output.streams["reading"]
     assert reading.schema.equals(
         schema.stream(np.array([0]), [[0]] * 58, biotac_sp.fields()).schema, check_metadata=True
     )
     assert reading.num_rows == 1
     values = [reading.column(field.name)[0].as_py() for field in biotac_sp.fields()]
     assert values == (1300 + np.arange(58)).tolist()
-    contact_ns = found.attributes["contact_ns"]
+    contact_ns = output.attributes["contact_ns"]
     assert isinstance(contact_ns, int)
     assert abs(contact_ns - START_NS - CLOSED * STEP_NS) <= 2 * STEP_NS
     assert SETTLED - 1 <= (reading.column("t_ns")[0].as_py() - START_NS) / STEP_NS <= SETTLED
@@ -130,75 +137,75 @@ def test_single_wrong_readings_in_the_window_do_not_count(shard: Recording) -> N
     column[[SETTLED + 3, SETTLED + 9]] = 4095
     place = stream.column_names.index("mf_electrode07")
     stream = stream.set_column(place, stream.schema.field(place), pa.array(column))
-    found = cut(shard(raw(scene(1), biotac_sp=stream)))
-    assert found.streams["reading"].column("mf_electrode07")[0].as_py() == 1306
+    output = cut(shard(raw(scene(1), biotac_sp=stream)))
+    assert output.streams["reading"].column("mf_electrode07")[0].as_py() == 1306
 
 
 def test_a_scene_without_colours_gives_a_cloud_without_them(shard: Recording) -> None:
-    whole = scene(1)
-    found = cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m).table())))
-    assert found.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
+    ball_scene = scene(1)
+    output = cut(shard(raw(ball_scene, scene=Cloud(ball_scene.cloud.points_m).table())))
+    assert output.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
 
 
 def test_a_finished_grasp_stays_as_it_is(shard: Recording) -> None:
-    whole = scene(1)
-    first = cut(shard(raw(whole)))
-    again = cut(shard(first.streams))
-    assert set(again.streams) == set(first.streams)
-    for name, table in again.streams.items():
+    ball_scene = scene(1)
+    first = cut(shard(raw(ball_scene)))
+    second = cut(shard(first.streams))
+    assert set(second.streams) == set(first.streams)
+    for name, table in second.streams.items():
         assert table.equals(first.streams[name], check_metadata=True)
-    assert again.attributes == {}
+    assert second.attributes == {}
 
 
 def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(shard: Recording) -> None:
-    whole = raw(scene(1))
-    made = cut(shard(whole))
-    planned = cut(shard({name: table for name, table in whole.items() if name != "biotac_sp"}))
-    assert set(planned.streams) == set(made.streams) - {"reading"}
-    assert planned.streams["cloud"].equals(made.streams["cloud"])
+    streams = raw(scene(1))
+    grasped = cut(shard(streams))
+    planned = cut(shard({name: table for name, table in streams.items() if name != "biotac_sp"}))
+    assert set(planned.streams) == set(grasped.streams) - {"reading"}
+    assert planned.streams["cloud"].equals(grasped.streams["cloud"])
     assert planned.attributes == {}
     assert set(cut(shard(planned.streams)).streams) == set(planned.streams)
 
 
 def test_an_object_that_was_cut_out_already_needs_no_scene(shard: Recording) -> None:
-    whole = raw(scene(1))
-    first = cut(shard(whole))
-    again = cut(shard({"cloud": first.streams["cloud"], "grasp": whole["grasp"], "biotac_sp": whole["biotac_sp"]}))
-    assert again.streams["cloud"].equals(first.streams["cloud"])
-    assert again.streams["reading"].equals(first.streams["reading"])
+    streams = raw(scene(1))
+    first = cut(shard(streams))
+    second = cut(shard({"cloud": first.streams["cloud"], "grasp": streams["grasp"], "biotac_sp": streams["biotac_sp"]}))
+    assert second.streams["cloud"].equals(first.streams["cloud"])
+    assert second.streams["reading"].equals(first.streams["reading"])
 
 
 def test_a_sample_that_is_missing_is_no_reading_of_0(shard: Recording) -> None:
-    whole = raw(scene(1))
-    stream, name = whole["biotac_sp"], "th_electrode07"
+    streams = raw(scene(1))
+    stream, name = streams["biotac_sp"], "th_electrode07"
     at = stream.column_names.index(name)
     values = stream.column(name).to_pylist()
-    some = [None if row % 3 == 0 else value for row, value in enumerate(values)]
-    holed = stream.set_column(at, stream.schema.field(name), pa.array(some, pa.uint16()))
-    assert cut(shard({**whole, "biotac_sp": holed})).streams["reading"].column(name)[0].as_py() == values[-1]
+    values_with_gaps = [None if row % 3 == 0 else value for row, value in enumerate(values)]
+    holed = stream.set_column(at, stream.schema.field(name), pa.array(values_with_gaps, pa.uint16()))
+    assert cut(shard({**streams, "biotac_sp": holed})).streams["reading"].column(name)[0].as_py() == values[-1]
     empty = stream.set_column(at, stream.schema.field(name), pa.array([None] * len(values), pa.uint16()))
     with pytest.raises(TacpipeError, match="The column th_electrode07 of biotac_sp holds no value"):
-        cut(shard({**whole, "biotac_sp": empty}))
+        cut(shard({**streams, "biotac_sp": empty}))
 
 
 def test_what_a_raw_grasp_lacks_is_told(shard: Recording) -> None:
-    whole = raw(scene(1))
+    streams = raw(scene(1))
     with pytest.raises(TacpipeError, match="Recording trial has no scene; a grasp has the streams scene and grasp"):
-        cut(shard({"grasp": whole["grasp"]}))
+        cut(shard({"grasp": streams["grasp"]}))
     with pytest.raises(TacpipeError, match="lacks 1 of 58 columns, as th_pdc"):
-        cut(shard({**whole, "biotac_sp": whole["biotac_sp"].drop_columns("th_pdc")}))
+        cut(shard({**streams, "biotac_sp": streams["biotac_sp"].drop_columns("th_pdc")}))
 
 
 def test_what_cannot_be_found_is_told_with_the_recording(shard: Recording) -> None:
-    whole = scene(1)
-    away = whole.grasp.moved(np.eye(3), 0.3 * whole.normal)
+    ball_scene = scene(1)
+    away = ball_scene.grasp.moved(np.eye(3), 0.3 * ball_scene.normal)
     with pytest.raises(TacpipeError, match=r"Recording trial: No object is near the grasp: .* mm from the lines"):
-        cut(shard(raw(whole, grasp=away.table(START_NS))))
+        cut(shard(raw(ball_scene, grasp=away.table(START_NS))))
     with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
-        cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m[whole.ball]).table())))
+        cut(shard(raw(ball_scene, scene=Cloud(ball_scene.cloud.points_m[ball_scene.ball]).table())))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
-        cut(shard(raw(whole, biotac_sp=touched(CLOSED))))
+        cut(shard(raw(ball_scene, biotac_sp=touched(CLOSED))))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
-        cut(shard(raw(whole)), on_count=400.0)
+        cut(shard(raw(ball_scene)), on_count=400.0)
     with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
-        cut(shard(raw(whole)), plane_fraction=0.99)
+        cut(shard(raw(ball_scene)), plane_fraction=0.99)

@@ -1,4 +1,4 @@
-"""Stages that claim not to look ahead give recordings that are cut the rows that whole ones have before the cut."""
+"""Test that stages without look-ahead give a cut recording the rows that the whole one has before the cut."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from tests.fake_recordings import FakeRecording, FakeShard, dataset
 PAGE = Path(__file__).parents[2] / "docs/reference/look-ahead.md"
 MS = 1_000_000
 PERIOD_MS = 20
-SECONDS = 5.0  # of a simulated trial
+SECONDS = 5.0  # the duration of a simulated trial
 TARGETS = ("slip", "dropped")
-CUTS_MS = st.integers(600, int(SECONDS * 1000))  # after the level at rest, which is of the first 200 ms
+CUTS_MS = st.integers(600, int(SECONDS * 1000))  # the level at rest is measured in the first 200 ms
 
 
 def cut(recording: Any, until_ns: int) -> Any:
@@ -72,18 +72,18 @@ def codec(name: str) -> Mapping[str, bytes]:
 
 def codec_params(name: str) -> Any:
     kind, _, representation = name.partition(" ")
-    more = {"epochs": 1, "frames": 3} if kind == "autoencoder" else {}
-    return load(f"compress.{kind}").params(components=4, representation=representation, **more)
+    options = {"epochs": 1, "frames": 3} if kind == "autoencoder" else {}
+    return load(f"compress.{kind}").params(components=4, representation=representation, **options)
 
 
-def rows_before(part: pa.Table, whole: pa.Table, *left_out: str) -> None:
-    """Check that rows of a recording that was cut are those of the whole one, with the metadata of their columns."""
+def rows_before(part: pa.Table, uncut: pa.Table, *left_out: str) -> None:
+    """Check that rows of a recording that was cut are those of the uncut one, with the metadata of their columns."""
     assert part.num_rows
-    part, whole = (
-        table.drop_columns([name for name in left_out if name in table.column_names]) for table in (part, whole)
+    part, uncut = (
+        table.drop_columns([name for name in left_out if name in table.column_names]) for table in (part, uncut)
     )
-    assert part.schema.equals(whole.schema, check_metadata=True)
-    assert part.to_pydict() == whole.slice(0, part.num_rows).to_pydict()
+    assert part.schema.equals(uncut.schema, check_metadata=True)
+    assert part.to_pydict() == uncut.slice(0, part.num_rows).to_pydict()
 
 
 def test_the_page_has_the_claim_of_each_stage_that_makes_rows() -> None:
@@ -103,8 +103,8 @@ def test_contacts_leave_columns_and_levels_at_rest_as_a_cut_recording_has_them(
 ) -> None:
     recording = recorded(index)
     until_ns = int(recording.tables["xela1"]["t_ns"][0].as_py()) + until_ms * MS
-    part, whole = (segmented(each, tare=tare) for each in (cut(recording, until_ns), recording))
-    rows_before(part.content, whole.content, "contact")
+    part, uncut = (segmented(source, tare=tare) for source in (cut(recording, until_ns), recording))
+    rows_before(part.content, uncut.content, "contact")
 
 
 @settings(deadline=None, max_examples=200)
@@ -118,7 +118,7 @@ def test_contacts_leave_columns_and_levels_at_rest_as_a_cut_recording_has_them(
 def test_marks_of_contacts_look_ahead_by_no_more_than_the_page_states(
     runs: list[tuple[float, int]], until: int, pad_s: float, merge_s: float, min_s: float
 ) -> None:
-    """The longest time is that to the next contact, which is merged or padded, and until it has lasted long enough."""
+    """Check that the longest time is that to the next merged or padded contact, until it has lasted long enough."""
     loads = np.concatenate([np.full(rows, load) for load, rows in runs])
     marks = []
     for rows in (loads, loads[:until]):
@@ -133,9 +133,9 @@ def test_marks_of_contacts_look_ahead_by_no_more_than_the_page_states(
 @settings(deadline=None, max_examples=15)
 @given(index=st.integers(1, 3), rows=st.integers(20, int(SECONDS * 1000 / PERIOD_MS)))
 def test_slips_so_far_are_those_of_a_recording_that_is_cut(index: int, rows: int) -> None:
-    whole = segmented(recorded(index))
-    part = FakeShard(whole.name, whole.content.slice(0, rows), whole.attributes)
-    marked = [run_stage("segment.slips", each).content for each in (part, whole)]
+    uncut = segmented(recorded(index))
+    part = FakeShard(uncut.name, uncut.content.slice(0, rows), uncut.attributes)
+    marked = [run_stage("segment.slips", shard).content for shard in (part, uncut)]
     assert marked[1]["slip_online"].to_numpy().any()
     rows_before(*marked, *TARGETS)
 
@@ -146,15 +146,15 @@ def test_slips_so_far_are_those_of_a_recording_that_is_cut(index: int, rows: int
 def test_latents_and_what_a_forecaster_reads_are_those_of_a_recording_that_is_cut(
     name: str, index: int, rows: int
 ) -> None:
-    """Products of matrices of other shapes round differently in the last digits, so latents are compared to five."""
-    whole = segmented(recorded(index))
-    part = FakeShard(whole.name, whole.content.slice(0, rows), whole.attributes)
+    """Compare latents to five digits: products of matrices of other shapes round differently in the last digits."""
+    uncut = segmented(recorded(index))
+    part = FakeShard(uncut.name, uncut.content.slice(0, rows), uncut.attributes)
     files = codec(name)
     stage = load(f"compress.{name.partition(' ')[0]}")
     compressed: list[Any] = [
-        FakeShard(each.name, stage(codec_params(name), each, files), each.attributes) for each in (part, whole)
+        FakeShard(shard.name, stage(codec_params(name), shard, files), shard.attributes) for shard in (part, uncut)
     ]
-    short, full = (tracks.track(each, codecs.load(files)) for each in compressed)
+    short, full = (tracks.track(shard, codecs.load(files)) for shard in compressed)
     scale = np.abs(full.latent).max()
     np.testing.assert_allclose(short.latent, full.latent[:rows], rtol=1e-5, atol=1e-5 * scale)
     for field in ("arm", "finger", "usable", "groups"):
@@ -167,14 +167,14 @@ def test_a_slide_is_that_of_a_recording_that_goes_on_once_the_arm_has_stopped(in
     simulate, slides = load("simulate.material"), load("segment.slides")
     output = simulate(simulate.params(trials=5, materials=2, arm_every=1), index)
     recording = FakeRecording(output.streams, f"trial-{index}", output.attributes)
-    whole = slides(slides.params(), recording)
-    if "profile" not in whole.streams:
+    uncut = slides(slides.params(), recording)
+    if "profile" not in uncut.streams:
         return
-    t_ns, phase = (whole.streams["profile"][name].to_numpy() for name in ("t_ns", "phase"))
-    stopped_ns = int(t_ns[phase == 0][-1]) + 200 * MS  # behind the rows by whose steady motion an end is found
+    t_ns, phase = (uncut.streams["profile"][name].to_numpy() for name in ("t_ns", "phase"))
+    stopped_ns = int(t_ns[phase == 0][-1]) + 200 * MS  # an end is found by the steady motion of 200 ms
     until_ns = stopped_ns + int(fraction * max(0, int(t_ns[-1]) - stopped_ns))
     part = slides(slides.params(), cut(recording, until_ns))
-    assert part.streams["slide"].equals(whole.streams["slide"])
+    assert part.streams["slide"].equals(uncut.streams["slide"])
 
 
 @pytest.fixture(scope="module")
@@ -187,11 +187,11 @@ def grasped() -> tuple[FakeRecording, RecordingOutput]:
 
 
 def test_the_cloud_of_a_grasp_is_that_of_a_plan_without_fingers(grasped: tuple[FakeRecording, RecordingOutput]) -> None:
-    recording, whole = grasped
+    recording, with_fingers = grasped
     grasps = load("segment.grasps")
     planned = FakeRecording({name: table for name, table in recording.tables.items() if name in ("scene", "grasp")})
     output = grasps(grasps.params(), planned)
-    assert all(output.streams[name].equals(whole.streams[name]) for name in ("cloud", "grasp"))
+    assert all(output.streams[name].equals(with_fingers.streams[name]) for name in ("cloud", "grasp"))
 
 
 @settings(deadline=None, max_examples=20)
@@ -199,12 +199,12 @@ def test_the_cloud_of_a_grasp_is_that_of_a_plan_without_fingers(grasped: tuple[F
 def test_a_reading_of_the_fingers_is_that_of_a_recording_that_goes_on(
     fraction: float, grasped: tuple[FakeRecording, RecordingOutput]
 ) -> None:
-    recording, whole = grasped
+    recording, uncut = grasped
     grasps = load("segment.grasps")
-    stream, reading = recording.tables["biotac_sp"], whole.streams["reading"]
+    stream, reading = recording.tables["biotac_sp"], uncut.streams["reading"]
     read_ns = int(reading["t_ns"][0].as_py()) + 210 * MS  # the median is of 200 ms
     until_ns = read_ns + int(fraction * (int(stream["t_ns"][-1].as_py()) - read_ns))
     fingers = stream.filter(pa.array(stream["t_ns"].to_numpy() <= until_ns))
-    tables = {"grasp": recording.tables["grasp"], "cloud": whole.streams["cloud"], "biotac_sp": fingers}
+    tables = {"grasp": recording.tables["grasp"], "cloud": uncut.streams["cloud"], "biotac_sp": fingers}
     part = grasps(grasps.params(), FakeRecording(tables))
-    assert part.streams["reading"].equals(reading) and part.attributes == whole.attributes
+    assert part.streams["reading"].equals(reading) and part.attributes == uncut.attributes

@@ -1,4 +1,4 @@
-"""The table that the split stage writes."""
+"""Test the table that the split stage writes."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ def test_a_missing_attribute_is_an_error_sentence(shard: Recording) -> None:
 
 
 def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recording) -> None:
-    given = dataset(shard, 16)
-    few = build_params("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
-    rows = split(few, given).recordings["split"].tables.to_pylist()
+    source = dataset(shard, 16)
+    few_params = build_params("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
+    rows = split(few_params, source).recordings["split"].tables.to_pylist()
     assert {row["fold"] for row in rows} == {0, 1}
     for fold in (0, 1):
-        of_two = [row["role"] for row in rows if row["fold"] == fold and int(row["recording"][1:]) % 4 == 2]
-        assert of_two.count("train") == 1
-        assert "unused" in of_two
+        object_roles = [row["role"] for row in rows if row["fold"] == fold and int(row["recording"][1:]) % 4 == 2]
+        assert object_roles.count("train") == 1
+        assert "unused" in object_roles
         assert not any(row["role"] == "unused" for row in rows if int(row["recording"][1:]) % 4 != 2)
     blocked = build_params("split", scheme="blocked", test=0.25, val=0.0, reverse=True)
-    rows = split(blocked, given).recordings["split"].tables.to_pylist()
+    rows = split(blocked, source).recordings["split"].tables.to_pylist()
     assert [row["recording"] for row in rows if row["role"] == "test"] == ["t00", "t01", "t02", "t03"]
 
 
 @pytest.mark.parametrize(
-    ("params", "count", "wanted"),
+    ("params", "count", "expected_note"),
     [
         (
             {},
@@ -79,10 +79,10 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recordin
     ],
 )
 def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_them_some(
-    params: dict[str, Any], count: int, wanted: str, shard: Recording
+    params: dict[str, Any], count: int, expected_note: str, shard: Recording
 ) -> None:
     (note,) = split(build_params("split", **params), dataset(shard, count)).notes
-    assert wanted in note
+    assert expected_note in note
     if "Give --val " in note:
         enough = float(note.split("Give --val ")[1].split(",")[0])
         assert split(build_params("split", **{**params, "val": enough}), dataset(shard, count)).notes == []

@@ -1,4 +1,4 @@
-"""Streams on one clock: values, types, masks and what is refused."""
+"""Test streams on one clock: values, types, masks and refusals."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ def test_columns_that_are_put_aside_on_disk_give_the_rows_of_those_in_memory(
 ) -> None:
     wrapping = (np.arange(400)[:, None] * 700 + np.arange(48)) % 65_536
     streams = {"robot": robot(np.arange(-30, 395)), "xela1": uskin(np.arange(400), wrapping.astype(np.uint16))}
-    whole = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
+    in_memory = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
     module = sys.modules[synchronize.function.__module__]
     monkeypatch.setattr(module, "IN_MEMORY", 1000)
     monkeypatch.setattr(module, "BATCH_ROWS", 17)
     parts = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
-    assert parts.streams[""].read_all().equals(whole.streams[""], check_metadata=True)
-    assert (parts.attributes, parts.notes) == (whole.attributes, whole.notes)
+    assert parts.streams[""].read_all().equals(in_memory.streams[""], check_metadata=True)
+    assert (parts.attributes, parts.notes) == (in_memory.attributes, in_memory.notes)
 
 
 def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_does(shard: Recording) -> None:
@@ -94,13 +94,13 @@ def test_values_are_those_of_numpy_interp_and_scipy_slerp(shard: Recording) -> N
     table, _ = run(shard({"xela1": tactile, "robot": arm}), rate_hz=120.0)
     grid_ns = table.column("t_ns").to_numpy() - T0
     for name in ("taxel01_x", "taxel16_z"):
-        wanted = np.interp(grid_ns, t_ms * MS, tactile.column(name).to_numpy().astype(float))
-        np.testing.assert_allclose(table.column(f"xela1_{name}").to_numpy(), wanted, atol=0.01)
+        expected = np.interp(grid_ns, t_ms * MS, tactile.column(name).to_numpy().astype(float))
+        np.testing.assert_allclose(table.column(f"xela1_{name}").to_numpy(), expected, atol=0.01)
         assert table.schema.field(f"xela1_{name}").type == pa.float32()
     parts = [f"orientation_{part}" for part in "xyzw"]
     turned = Rotation.from_quat(np.column_stack([arm.column(part).to_numpy() for part in parts]))
-    found = Rotation.from_quat(np.column_stack([table.column(f"robot_{part}").to_numpy() for part in parts]))
-    assert (found * Slerp(t_ms * MS, turned)(grid_ns).inv()).magnitude().max() < 1e-6
+    rotations = Rotation.from_quat(np.column_stack([table.column(f"robot_{part}").to_numpy() for part in parts]))
+    assert (rotations * Slerp(t_ms * MS, turned)(grid_ns).inv()).magnitude().max() < 1e-6
     assert table.schema.field("robot_position_x_m").type == pa.float64()
 
 
@@ -108,13 +108,13 @@ def test_every_channel_tells_where_it_came_from_and_how(shard: Recording) -> Non
     labels = schema.stream(T0 + np.arange(1, 100, 3) * MS, [np.arange(33) % 2], [schema.label_field("slip")])
     t_ms = np.arange(0, 100, 9)
     table, _ = run(shard({"xela1": uskin(t_ms), "robot": robot(t_ms), "slip": labels}))
-    for column, how, quantity in (
+    for column, method, quantity in (
         ("xela1_taxel03_y", b"linear", b"tactile"),
         ("robot_orientation_w", b"slerp", b"orientation"),
         ("slip_slip", b"nearest", b"label"),
     ):
         metadata = table.schema.field(column).metadata
-        assert (metadata[b"interpolation"], metadata[b"quantity"]) == (how, quantity)
+        assert (metadata[b"interpolation"], metadata[b"quantity"]) == (method, quantity)
         assert metadata[b"stream"].decode() == column.split("_")[0]
     assert table.schema.field("slip_slip").type == pa.int8()
 
@@ -123,9 +123,9 @@ def test_wide_integers_become_float64_and_device_clocks_stay_integers(shard: Rec
     t_ms = np.arange(0, 100, 7)
     table = uskin(t_ms)
     table = table.append_column("wide", pa.array(t_ms * 10**9)).append_column("seq", pa.array(np.arange(len(t_ms))))
-    found, _ = run(shard({"xela1": table}))
-    assert found.schema.field("xela1_wide").type == pa.float64()
-    assert found.schema.field("xela1_seq").type == pa.int64()
+    synced, _ = run(shard({"xela1": table}))
+    assert synced.schema.field("xela1_wide").type == pa.float64()
+    assert synced.schema.field("xela1_seq").type == pa.int64()
 
 
 def test_holds_gaps_and_distances_are_marked(shard: Recording) -> None:
@@ -146,9 +146,9 @@ def test_on_the_logged_grid_values_at_equal_stamps_stay_as_they_are(shard: Recor
     table, _ = run(shard({"xela1": tactile, "robot": arm, "other": robot(np.arange(-5, 70, 2))}), grid="logged")
     assert table.num_rows == 4
     for name in tactile.column_names[1:]:
-        found = table.column(f"xela1_{name}")
-        assert found.type == pa.uint16()
-        assert found.to_pylist() == tactile.column(name).to_pylist()[:4]
+        channel = table.column(f"xela1_{name}")
+        assert channel.type == pa.uint16()
+        assert channel.to_pylist() == tactile.column(name).to_pylist()[:4]
     assert table.column("robot_orientation_x").to_pylist() == arm.column("orientation_x").to_pylist()
     assert table.schema.field("robot_orientation_x").metadata[b"interpolation"] == b"none"
     assert table.schema.field("other_orientation_x").metadata[b"interpolation"] == b"slerp"
@@ -198,14 +198,14 @@ def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Recording) -
     streams = {"xela1": with_device(table, device_ns), "robot": robot(np.arange(0, 9000))}
     errors = {}
     for clock in ("auto", "arrival"):
-        found, attributes = run(shard(streams), clock=clock)
-        taken_ms = (found.column("t_ns").to_numpy() - T0) / MS
-        errors[clock] = np.abs(found.column("xela1_taxel01_x").to_numpy() - taken_ms)
+        synced, attributes = run(shard(streams), clock=clock)
+        taken_ms = (synced.column("t_ns").to_numpy() - T0) / MS
+        errors[clock] = np.abs(synced.column("xela1_taxel01_x").to_numpy() - taken_ms)
         assert ("xela1_clock_drift_ppm" in attributes) == (clock == "auto")
         assert not any("robot_clock" in name for name in attributes)
-        assert found.schema.field("xela1_t_device_ns").type == pa.int64()
-        assert set(found.column("xela1_t_device_ns").to_pylist()) <= set(device_ns.tolist())
-        assert set(found.column("xela1_seq").to_pylist()) <= set(range(1000))
+        assert synced.schema.field("xela1_t_device_ns").type == pa.int64()
+        assert set(synced.column("xela1_t_device_ns").to_pylist()) <= set(device_ns.tolist())
+        assert set(synced.column("xela1_seq").to_pylist()) <= set(range(1000))
     assert errors["auto"].max() < 0.2
     assert np.median(errors["arrival"]) > 2
 
@@ -221,8 +221,8 @@ def test_the_fit_of_each_clock_is_an_attribute(shard: Recording) -> None:
 def test_ground_truth_needs_no_device(shard: Recording) -> None:
     table, device_ns = late()
     truth = schema.stream(T0 + np.arange(9000) * MS, [np.zeros(9000)], [schema.float_field("gt_mass_kg", "kg", "mass")])
-    found, _ = run(shard({"xela1": with_device(table, device_ns), "truth": truth}), clock="device")
-    assert "gt_mass_kg" in found.column_names
+    synced, _ = run(shard({"xela1": with_device(table, device_ns), "truth": truth}), clock="device")
+    assert "gt_mass_kg" in synced.column_names
 
 
 def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Recording) -> None:
@@ -231,9 +231,9 @@ def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Recording) 
         TacpipeError, match=r"Recording trial, stream 'xela1': .* stands still at 7 ns .*--clock arrival"
     ):
         run(shard({"xela1": with_device(table, np.full(len(device_ns), 7))}))
-    some = pa.array([None, *device_ns[1:].tolist()], pa.int64())
+    with_null = pa.array([None, *device_ns[1:].tolist()], pa.int64())
     with pytest.raises(TacpipeError, match="t_device_ns of stream 'xela1' is int64 with 1 empty rows"):
-        run(shard({"xela1": table.append_column("t_device_ns", some)}))
+        run(shard({"xela1": table.append_column("t_device_ns", with_null)}))
 
 
 def test_proximity_is_the_median_of_the_readings_around_and_lies_between_them_where_there_are_none(
@@ -244,13 +244,13 @@ def test_proximity_is_the_median_of_the_readings_around_and_lies_between_them_wh
     field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
     near = schema.stream(T0 + (t_ms * MS).astype(int), [counts], [field])
     table, _ = run(shard({"xela1": uskin(np.arange(0, 220, 20)), "proximity": near}))
-    wanted = []
+    expected = []
     for point in np.arange(0, 201, 20):
         around = np.abs(t_ms - point) <= 10
-        wanted.append(np.median(counts[around]) if around.any() else np.interp(point, t_ms, counts))
-    found = table.column("proximity_distance")
-    np.testing.assert_allclose(found.to_numpy(), wanted, rtol=1e-6)
-    assert found.type == pa.float32()
+        expected.append(np.median(counts[around]) if around.any() else np.interp(point, t_ms, counts))
+    medians = table.column("proximity_distance")
+    np.testing.assert_allclose(medians.to_numpy(), expected, rtol=1e-6)
+    assert medians.type == pa.float32()
     assert table.schema.field("proximity_distance").metadata[b"interpolation"] == b"median"
     assert table.column("proximity_gap").to_pylist()[6:7] == [True]
 
@@ -267,13 +267,13 @@ def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shar
     assert logged.column(f"xela1_{wrapping}").type == pa.int32()
     assert logged.column(f"xela1_{wrapping}").to_pylist() == walk[:, 5].tolist()
     assert attributes["xela1_wrapped_channels"] == 1
-    others = [name for name in tactile.column_names[1:] if name != wrapping]
-    assert all(logged.column(f"xela1_{name}").equals(tactile.column(name)) for name in others)
+    other_names = [name for name in tactile.column_names[1:] if name != wrapping]
+    assert all(logged.column(f"xela1_{name}").equals(tactile.column(name)) for name in other_names)
     uniform, _ = run(shard({"xela1": tactile}), rate_hz=200.0)
     assert uniform.column(f"xela1_{wrapping}").type == pa.float32()
     np.testing.assert_array_equal(uniform.column(f"xela1_{wrapping}").to_numpy(), 65_000 + 50 * np.arange(39))
-    kept, attributes = run(shard({"xela1": tactile}), grid="logged", unwrap=False)
-    assert kept.column(f"xela1_{wrapping}").equals(tactile.column(wrapping))
+    not_unwrapped, attributes = run(shard({"xela1": tactile}), grid="logged", unwrap=False)
+    assert not_unwrapped.column(f"xela1_{wrapping}").equals(tactile.column(wrapping))
     assert "xela1_wrapped_channels" not in attributes
 
 
@@ -285,9 +285,9 @@ def test_nothing_wraps_in_the_published_trials(shard: Recording) -> None:
     assert ingest.discover is not None
     for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
         recording = ingest(ingest.params(), files)
-        found, attributes = run(shard(recording.streams), grid="logged")
+        logged, attributes = run(shard(recording.streams), grid="logged")
         assert not any("wrapped" in name for name in attributes)
-        assert {found.schema.field(name).type for name in found.column_names if "_taxel" in name} == {pa.uint16()}
+        assert {logged.schema.field(name).type for name in logged.column_names if "_taxel" in name} == {pa.uint16()}
 
 
 def test_ground_truth_keeps_its_names_and_has_no_masks(shard: Recording) -> None:
@@ -346,8 +346,8 @@ def test_images_text_and_single_rows_neither_bound_the_grid_nor_stand_on_it(shar
     skin = pa.table({"t_ns": t_ns, "a": pa.array(np.arange(100), pa.int32())})
     camera = pa.table({"t_ns": t_ns[:3], "data": pa.array([b"x"] * 3, pa.binary()), "width": pa.array([1] * 3)})
     note = pa.table({"t_ns": t_ns[5:6], "data": ["hello"]})
-    still = pa.table({"t_ns": t_ns[:1], "position_x_m": [0.5]})
-    streams = {"skin": skin, "camera": camera, "note": note, "still": still}
+    fixed_pose = pa.table({"t_ns": t_ns[:1], "position_x_m": [0.5]})
+    streams = {"skin": skin, "camera": camera, "note": note, "still": fixed_pose}
     table, attributes = run(shard(streams), master="skin", rate_hz=100.0)
     assert table.column_names == ["t_ns", "skin_a", "skin_held", "skin_gap", "skin_dt_ns"]
     assert table.num_rows == 100
@@ -378,7 +378,7 @@ def test_held_rows_hold_the_newest_sample_that_had_come_and_its_age(shard: Recor
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 999), until_ms=st.integers(150, 1400))
 def test_rows_of_held_values_do_not_depend_on_what_comes_later(kind: str, seed: int, until_ms: int) -> None:
-    """Recordings that are cut off have the rows before the cut of the whole ones, also with their contacts marked."""
+    """Check that cut recordings have the rows before the cut of the whole ones, also with their contacts marked."""
     rng = np.random.default_rng(seed)
     t_ms = np.cumsum(rng.integers(5, 40, 60))
     near = schema.stream(
@@ -392,15 +392,15 @@ def test_rows_of_held_values_do_not_depend_on_what_comes_later(kind: str, seed: 
     }
     if not cut["xela1"].num_rows:
         return
-    held = params(gap_ms=50.0, **ROWS[kind])  # without --gap-ms the gap depends on the rate of the whole recording
-    whole, part = (synchronize(held, FakeRecording(tables)) for tables in (streams, cut))
+    hold_params = params(gap_ms=50.0, **ROWS[kind])  # the default gap depends on the rate of the whole recording
+    uncut, part = (synchronize(hold_params, FakeRecording(tables)) for tables in (streams, cut))
     rows = part.streams[""].num_rows
-    assert rows and part.streams[""].to_pydict() == whole.streams[""].slice(0, rows).to_pydict()
+    assert rows and part.streams[""].to_pydict() == uncut.streams[""].slice(0, rows).to_pydict()
     last_ns = max(stream["t_ns"].to_numpy()[-1] for stream in cut.values())
-    assert whole.streams[""]["t_ns"].to_numpy()[rows:].min(initial=2 * T0) > last_ns
-    assert whole.attributes["look_ahead_max_ms"] == 0.0
+    assert uncut.streams[""]["t_ns"].to_numpy()[rows:].min(initial=2 * T0) > last_ns
+    assert uncut.attributes["look_ahead_max_ms"] == 0.0
     levels = []
-    for output in (part, whole):
+    for output in (part, uncut):
         segmented = contacts(contacts.params(rest_s=0.0), FakeRecording({"": output.streams[""]})).streams[""]
         levels.append([(segmented.schema.field(name).metadata or {}).get(b"rest") for name in segmented.column_names])
     assert levels[0] == levels[1]
@@ -413,9 +413,9 @@ def test_the_look_ahead_of_interpolated_rows_is_the_time_to_the_next_sample_or_i
     ahead_ms = [min(arm_ms[arm_ms >= at]) - at for at in (table["t_ns"].to_numpy() - T0) / MS]
     assert attributes["look_ahead_mean_ms"] == pytest.approx(np.mean(ahead_ms), abs=1e-3)
     assert attributes["look_ahead_max_ms"] == max(ahead_ms) and attributes["step_ms"] == 20.0
-    held = synchronize(params(), FakeRecording({"xela1": tactile, "robot": arm}))
-    assert held.attributes["look_ahead_max_ms"] == 0.0 and held.attributes["grid"] == "logged"
-    assert held.streams[""]["robot_position_x_m"].type == pa.float64()
+    repeated = synchronize(params(), FakeRecording({"xela1": tactile, "robot": arm}))
+    assert repeated.attributes["look_ahead_max_ms"] == 0.0 and repeated.attributes["grid"] == "logged"
+    assert repeated.streams[""]["robot_position_x_m"].type == pa.float64()
 
 
 @pytest.mark.parametrize(
@@ -454,9 +454,9 @@ def test_without_a_gap_a_slow_stream_may_pause_for_two_and_a_half_periods(
 ) -> None:
     t_ms = np.arange(0, 4000, period_ms)
     t_ms = t_ms[(t_ms < 2000) | (t_ms > 3000)]  # a gap whichever the period
-    given = shard({"xela1": uskin(t_ms)})
-    table, attributes = run(given)
-    spelled_out, _ = run(given, gap_ms=gap_ms)
+    recording = shard({"xela1": uskin(t_ms)})
+    table, attributes = run(recording)
+    spelled_out, _ = run(recording, gap_ms=gap_ms)
     assert attributes["xela1_gap_ms"] == gap_ms
     assert table.equals(spelled_out)
     grid_ms = (table["t_ns"].to_numpy() - T0) / MS
@@ -466,28 +466,28 @@ def test_without_a_gap_a_slow_stream_may_pause_for_two_and_a_half_periods(
 
 def test_a_stream_with_many_rows_in_gaps_is_named_and_others_are_not(shard: Recording) -> None:
     slow, fast = uskin(np.arange(0, 4000, 73)), robot(np.arange(0, 4000, 10))
-    given = shard({"xela1": slow, "robot": fast})
-    assert not synchronize(interpolated(), given).notes
-    (note,) = synchronize(interpolated(gap_ms=50.0), given).notes
+    recording = shard({"xela1": slow, "robot": fast})
+    assert not synchronize(interpolated(), recording).notes
+    (note,) = synchronize(interpolated(gap_ms=50.0), recording).notes
     assert "stream xela1" in note and "--gap-ms" in note
 
 
 def test_streams_without_a_common_time_are_named_with_dates_and_can_be_left_out(shard: Recording) -> None:
     early, late = robot(np.arange(0, 100)), robot(np.arange(300, 400))
-    given = shard({"xela1": uskin(np.arange(0, 200)), "early": early, "late": late})
+    recording = shard({"xela1": uskin(np.arange(0, 200)), "early": early, "late": late})
     with pytest.raises(TacpipeError) as raised:
-        run(given)
-    stated = str(raised.value)
-    assert "late starts last, at 2021-11-24 16:39:35.078 UTC" in stated
-    assert "early ends first, at 2021-11-24 16:39:34.877 UTC" in stated and "--without" in stated
-    alone, _ = run(shard({"xela1": uskin(np.arange(0, 200)), "early": early}))
+        run(recording)
+    message = str(raised.value)
+    assert "late starts last, at 2021-11-24 16:39:35.078 UTC" in message
+    assert "early ends first, at 2021-11-24 16:39:34.877 UTC" in message and "--without" in message
+    without_late, _ = run(shard({"xela1": uskin(np.arange(0, 200)), "early": early}))
     for values in ({"without": "late"}, {"streams": "xela1, early"}, {"streams": "*1,e*", "without": "l*"}):
-        assert run(given, **values)[0].equals(alone)
+        assert run(recording, **values)[0].equals(without_late)
 
 
 def test_a_stream_that_is_selected_and_does_not_exist_is_refused_with_a_near_name(shard: Recording) -> None:
-    given = shard({"xela1": uskin(np.arange(0, 200)), "robot": robot(np.arange(0, 100))})
+    recording = shard({"xela1": uskin(np.arange(0, 200)), "robot": robot(np.arange(0, 100))})
     with pytest.raises(TacpipeError, match=r"no stream 'rob0t', which --without names; it has .*Did you mean robot"):
-        run(given, without="rob0t")
+        run(recording, without="rob0t")
     with pytest.raises(TacpipeError, match="no stream left"):
-        run(given, without="*")
+        run(recording, without="*")

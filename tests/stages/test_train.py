@@ -1,4 +1,4 @@
-"""The train stage hands its params to the task, and its presets are what they are named after."""
+"""Test that the train stage hands its params to the task, and that its presets have the params of their names."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
     params = build_params("train.forward", **{**SMALL, "epochs": 1})
     init: Dataset = dataset(files=STAGE(params, training, watched, tmp_path / "a").files)
     tuned = STAGE(params, training, watched, tmp_path / "b", init).files
-    first, second = (json.loads(one["history.jsonl"])["val_loss"] for one in (init.files, tuned))
+    first, second = (json.loads(files["history.jsonl"])["val_loss"] for files in (init.files, tuned))
     assert second < first
 
 
 def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> None:
     shards = [motion(seed) for seed in range(2)]
     params = build_params("train.forward", hidden=8, epochs=1, context=5, horizon=4)
-    found = {}
-    for kind, given in (
+    chosen = {}
+    for kind, source in (
         ("raw", dataset(*shards)),
         ("levels", compressed(*shards)),
         ("increments", compressed(*shards, representation="increments")),
     ):
-        config = json.loads(STAGE(params, given, given, tmp_path / kind).files["config.json"])
+        config = json.loads(STAGE(params, source, source, tmp_path / kind).files["config.json"])
         assert config["params"]["architecture"] == config["architecture"]
-        found[kind] = (config["architecture"], config["params"]["loss"])
-    assert found == {"raw": ("taxelwise", "absolute"), "levels": ("gru", "absolute"), "increments": ("gru", "huber")}
+        chosen[kind] = (config["architecture"], config["params"]["loss"])
+    assert chosen == {"raw": ("taxelwise", "absolute"), "levels": ("gru", "absolute"), "increments": ("gru", "huber")}
 
 
 def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
@@ -69,10 +69,10 @@ def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
 
 
 def test_an_architecture_that_cannot_read_latents_is_refused_before_training(tmp_path: Path) -> None:
-    given = compressed(motion(0))
-    given.recordings["absent"] = None  # whoever reads on past the first recording trips over this one
+    latents = compressed(motion(0))
+    latents.recordings["absent"] = None  # reading past the first recording fails here
     with pytest.raises(TacpipeError, match=r"reads raw channels .* the recordings hold latents"):
-        STAGE(build_params("train.forward", architecture="taxelwise"), given, given, tmp_path)
+        STAGE(build_params("train.forward", architecture="taxelwise"), latents, latents, tmp_path)
     assert not any(tmp_path.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""The stage train.touch, and a model of it from the store to one grasp."""
+"""Test the stage train.touch, and the use of its model from the store for one grasp."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_presets_name_params_that_exist_and_train(preset: str, architecture: str
     files = STAGE(params, recordings(), recordings(6, 1), tmp_path).files
     config = json.loads(files["config.json"])
     assert config["architecture"] == architecture
-    kinds = [(one["kind"], one["targets"]) for one in config["members"]]
+    kinds = [(member["kind"], member["targets"]) for member in config["members"]]
     assert (
         kinds
         == {
@@ -64,15 +64,15 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
     lab.run("evaluate model grasps --split split -o results")
     metrics = json.loads(tacpipe.open("results").files["metrics.json"])
     assert metrics["model"]["n"] == metrics["counts"]["grasps"] > 0
-    model, found = tacpipe.load("model"), tacpipe.open("results").recordings["predictions"]
-    assert found.attributes["simulated"] is True
-    name = found.table("grasps").to_pydict()["recording"][0]
+    model, predictions = tacpipe.load("model"), tacpipe.open("results").recordings["predictions"]
+    assert predictions.attributes["simulated"] is True
+    name = predictions.table("grasps").to_pydict()["recording"][0]
     shard = tacpipe.open("grasps").recordings[name]
     cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
-    told = model.predict(cloud, grasp)
-    row = found.table("model").to_pylist()[0]
-    assert told.pdc_th == pytest.approx(row["pdc_th"], rel=1e-5)
-    np.testing.assert_allclose(told.e_mf, [row[f"e_mf_{n:02d}"] for n in range(1, 25)], rtol=1e-5)
+    predicted = model.predict(cloud, grasp)
+    row = predictions.table("model").to_pylist()[0]
+    assert predicted.pdc_th == pytest.approx(row["pdc_th"], rel=1e-5)
+    np.testing.assert_allclose(predicted.e_mf, [row[f"e_mf_{n:02d}"] for n in range(1, 25)], rtol=1e-5)
     with pytest.raises(TacpipeError, match=r"The grasp: grasp point g1 lies \d+ mm from the nearest point"):
         model.predict(cloud, grasp.moved(np.eye(3), np.array([0, 0, 1.0])))
     with pytest.raises(TacpipeError, match="The grasp has a cloud without colours"):
@@ -81,7 +81,7 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
 
 
 def _refuses(lab: Lab) -> None:
-    """Params off end with code 2 and a sentence, grasps off with code 1, and neither leaves a model."""
+    """Check that wrong params end with code 2 and a sentence, wrong grasps with code 1, and neither leaves a model."""
     for words, code, sentence in (
         ("--architecture tree", 2, "architecture is 'tree'; it must be one of tree-ensemble"),
         ("--targets thumb", 2, "targets is 'thumb'"),

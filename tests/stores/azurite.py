@@ -1,4 +1,4 @@
-"""Azurite, Microsoft's emulator of Azure Blob Storage (`npm install -g azurite`), run for a test."""
+"""Run Azurite, Microsoft's emulator of Azure Blob Storage (`npm install -g azurite`), for a test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from tests.stores.places import free_ports
 
 ACCOUNT, CONTAINER = "devstoreaccount1", "lab"
-KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="  # in its manual
+KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="  # a public key
 _VERSION = "2021-08-06"
 
 
@@ -38,10 +38,10 @@ def environment(endpoint: str) -> dict[str, str]:
 @contextlib.contextmanager
 def served(root: Path) -> Iterator[str]:
     """Run the emulator with a container ``lab``; yield the address."""
-    found = program()
-    assert found is not None
+    executable = program()
+    assert executable is not None
     (port,) = free_ports(1)
-    words = [found, "--blobPort", str(port), "--location", str(root), "--silent", "--skipApiVersionCheck"]
+    words = [executable, "--blobPort", str(port), "--location", str(root), "--silent", "--skipApiVersionCheck"]
     with (root / "log").open("wb") as log:
         process = subprocess.Popen(words, cwd=root, stdout=log, stderr=log, start_new_session=True)
     try:

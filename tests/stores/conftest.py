@@ -1,4 +1,4 @@
-"""One suite for every place that may keep a store; the real server is started once, for tests marked ``long``."""
+"""Offer every place that may keep a store to one suite; the real server is started once, for tests marked ``long``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def azure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def without_profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No setting of whoever runs the tests."""
+    """Remove the settings of the user who runs the tests."""
     for name in ("AWS_PROFILE", "AWS_DEFAULT_PROFILE", "AWS_SESSION_TOKEN", "AWS_ENDPOINT_URL_S3"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "no-config"))

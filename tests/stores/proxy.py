@@ -1,4 +1,4 @@
-"""A proxy between a client and a server of objects, which fails as networks and servers do."""
+"""Run a proxy between a client and a server of objects, which fails as networks and servers do."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ WAIT_S = 0.05
 
 @dataclass
 class Proxy:
-    """What a proxy did; ``fault`` gives what happens to the request of a number, None for nothing."""
+    """The state of a proxy; ``fault`` maps the number of a request to its fault or None."""
 
     fault: Callable[[int], str | None] = lambda number: None
-    change: Change | None = None  # from requests to wrong answers
+    change: Change | None = None  # maps requests to wrong answers
     endpoint: str = ""
     requests: int = 0
     texts: list[str] = field(default_factory=list)  # the first line of each request
@@ -67,7 +67,7 @@ class _Handler(BaseHTTPRequestHandler):
             request, change = Request(self.command, self.path), self.proxy.change
 
             def forward(request: Request) -> Answer:
-                return Answer(*self.asked(request.path, body))
+                return Answer(*self.forward_request(request.path, body))
 
             answer = change(request, forward) if change else forward(request)
             if fault == "lost answer":
@@ -77,7 +77,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_PUT = do_POST = do_DELETE = do_HEAD = do_GET  # noqa: N815
 
-    def asked(self, path: str, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
+    def forward_request(self, path: str, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
         """Return what the server answers: status, headers, content."""
         connection = http.client.HTTPConnection(*self.upstream, timeout=60)
         with contextlib.closing(connection):
@@ -86,9 +86,13 @@ class _Handler(BaseHTTPRequestHandler):
                 if name.lower() != "connection":
                     connection.putheader(name, value)
             connection.endheaders(body)
-            found = connection.getresponse()
-            headers = [one for one in found.getheaders() if one[0].lower() not in ("connection", "transfer-encoding")]
-            return found.status, headers, found.read()
+            response = connection.getresponse()
+            headers = [
+                header
+                for header in response.getheaders()
+                if header[0].lower() not in ("connection", "transfer-encoding")
+            ]
+            return response.status, headers, response.read()
 
     def answer(self, status: int, headers: list[tuple[str, str]], content: bytes, *, cut: bool = False) -> None:
         """Answer, with ``cut`` half of the content alone although all of it was announced."""
@@ -121,37 +125,37 @@ class _Server(ThreadingHTTPServer):
 @contextlib.contextmanager
 def between(upstream: str) -> Iterator[Proxy]:
     """Yield a proxy of the server at ``upstream``."""
-    place, found = urlsplit(upstream), Proxy()
+    place, running_proxy = urlsplit(upstream), Proxy()
 
     class Handler(_Handler):
-        proxy = found
+        proxy = running_proxy
         upstream = str(place.hostname), int(place.port or 80)
 
-    with places.serving(_Server(("127.0.0.1", 0), Handler)) as found.endpoint:
-        yield found
+    with places.serving(_Server(("127.0.0.1", 0), Handler)) as running_proxy.endpoint:
+        yield running_proxy
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a client asks: the method, and the path with its query."""
+    """A request of a client: the method, and the path with its query."""
 
     method: str
     path: str
 
     @property
     def is_list(self) -> bool:
-        """Whether it lists names."""
+        """Return whether it lists names."""
         return self.method == "GET" and "list-type=" in self.path
 
     @property
     def is_object(self) -> bool:
-        """Whether it reads the content of an object."""
+        """Return whether it reads the content of an object."""
         return self.method == "GET" and not self.is_list
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a server answers."""
+    """An answer of a server."""
 
     status: int
     headers: list[tuple[str, str]]
@@ -159,7 +163,7 @@ class Answer:
 
 
 Forward = Callable[[Request], Answer]
-Change = Callable[[Request, Forward], Answer]  # from a request to a wrong answer; it may ask the server or not
+Change = Callable[[Request, Forward], Answer]  # maps a request to a wrong answer; it may ask the server or not
 
 
 def refuse(status: int, code: str, methods: str = "GET PUT POST DELETE HEAD") -> Change:
@@ -211,7 +215,7 @@ def change_clock(header: str, iso: str) -> Change:
     """Return a change of all times that a server states."""
     in_lists = change_lists(rb"<LastModified>[^<]*", b"<LastModified>" + iso.encode())
     in_headers = change_header("last-modified", header)
-    return lambda request, forward: in_headers(request, lambda again: in_lists(again, forward))
+    return lambda request, forward: in_headers(request, lambda relayed: in_lists(relayed, forward))
 
 
 def lose_uploads(request: Request, forward: Forward) -> Answer:

@@ -1,4 +1,4 @@
-"""A bucket in which something else happens before one of the requests."""
+"""Define a bucket in which something else happens before one of the requests."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from tacpipe.store.bucket import Bucket
 class Stepping(Bucket):
     """A bucket in memory, in which something else happens before one of its steps."""
 
-    def __init__(
-        self, content: dict[str, bytes], step: int = 0, meanwhile: Callable[[], object] = lambda: None
-    ) -> None:
+    def __init__(self, content: dict[str, bytes], step: int = 0, action: Callable[[], object] = lambda: None) -> None:
         from obstore.store import MemoryStore
 
         client = MemoryStore()
@@ -27,12 +25,12 @@ class Stepping(Bucket):
     def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
         self.steps += 1
         if self.steps == self._step:
-            self._meanwhile()
+            self._action()
         return super()._tried(request, tries)
 
-    def begin(self, step: int, meanwhile: Callable[[], object]) -> None:
-        """Count steps from here; before the one of this number ``meanwhile`` happens."""
-        self.steps, self._step, self._meanwhile = 0, step, meanwhile
+    def begin(self, step: int, action: Callable[[], object]) -> None:
+        """Count steps from here, and call ``action`` before the step of this number."""
+        self.steps, self._step, self._action = 0, step, action
 
     def list(self, folder: str) -> Iterator[Entry]:
         """Do as `Bucket.list`; what is there is listed as ``days`` older than it is."""

@@ -1,4 +1,4 @@
-"""Stages that work on a store in a bucket, each computer with a folder of its own in front."""
+"""Test stages that work on a store in a bucket, each computer with a folder of its own in front."""
 
 import itertools
 import json
@@ -37,7 +37,7 @@ SIMULATE = "simulate toy -o data/r --trials 3 --rows 3 --jobs 1"
 SCALE = "scale data/r -o data/s --factor 2 --jobs 1"
 CHAIN = (SIMULATE, SCALE, "centre data/s -o data/c --split data/split --jobs 1")
 EVERY = pytest.mark.parametrize(
-    "every",
+    "stride",
     [pytest.param(1, marks=pytest.mark.faults), pytest.param(5, marks=pytest.mark.long)],
 )
 
@@ -85,9 +85,9 @@ class Computers:
     @property
     def store(self) -> CachedStore:
         """The store of the computer at work."""
-        found = location.locate()
-        assert isinstance(found, CachedStore)
-        return found
+        cached_store = location.locate()
+        assert isinstance(cached_store, CachedStore)
+        return cached_store
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -103,32 +103,32 @@ def computers(lab: Lab, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixture
     for module in (cached, transfer):
         monkeypatch.setattr(module, "Bucket", lambda address: request.node.files)
     request.node.files = files
-    found = Computers(lab, monkeypatch, "s3://lab/store")
-    found.enter("first")
-    return found
+    new_computers = Computers(lab, monkeypatch, "s3://lab/store")
+    new_computers.enter("first")
+    return new_computers
 
 
 @pytest.fixture
 def files(computers: Computers, request: pytest.FixtureRequest) -> Stepping:
     """The bucket of `computers`."""
-    found: Stepping = request.node.files
-    return found
+    shared_bucket: Stepping = request.node.files
+    return shared_bucket
 
 
 @pytest.fixture
 def emptied(computers: Computers, request: pytest.FixtureRequest) -> Callable[[dict[str, bytes]], Stepping]:
     """A function that puts another bucket in the place of that of `computers`, with this content, and clears all caches."""
 
-    def empty(kept: dict[str, bytes]) -> Stepping:
-        request.node.files = Stepping(kept)
+    def empty(objects: dict[str, bytes]) -> Stepping:
+        request.node.files = Stepping(objects)
         cached._buckets.clear()
         cached._stores.clear()
         for name in computers.names:
             shutil.rmtree(computers.lab.folder / name, ignore_errors=True)
         computers.names.clear()
         computers.enter("first")
-        found: Stepping = request.node.files
-        return found
+        shared_bucket: Stepping = request.node.files
+        return shared_bucket
 
     return empty
 
@@ -136,15 +136,15 @@ def emptied(computers: Computers, request: pytest.FixtureRequest) -> Callable[[d
 def expect_whole(files: Bucket) -> None:
     """Expect that a bucket is sound, and that every record names what is there."""
     store = RemoteStore(files)
-    found = remote_upkeep.verify(store)
-    assert found.clean, found.to_text()
-    named = {
+    report = remote_upkeep.verify(store)
+    assert report.clean, report.to_text()
+    named_digests = {
         shard["digest"]
         for _, record in store.records()
         for entry in record["result"]["recordings"].values()
         for shard in entry["shards"].values()
     }
-    assert named <= set(store.sizes(named))
+    assert named_digests <= set(store.sizes(named_digests))
 
 
 # ---- what a user sees
@@ -157,8 +157,8 @@ def test_a_chain_gives_the_same_bytes_with_any_store(lab: Lab, place: Place, mon
     monkeypatch.chdir(plain)
     lab.run(SIMULATE)
     lab.run(SCALE)
-    here = Computers(lab, monkeypatch, place.address)
-    folder = here.enter("first")
+    computers = Computers(lab, monkeypatch, place.address)
+    folder = computers.enter("first")
     lab.run(SIMULATE)
     lab.run(SCALE)
     assert content(folder) == content(plain)
@@ -173,15 +173,15 @@ def test_a_chain_gives_the_same_bytes_with_any_store(lab: Lab, place: Place, mon
 def test_another_computer_reuses_what_the_first_one_computed_whatever_server_keeps_it(
     lab: Lab, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    both = Computers(lab, monkeypatch, place.address)
-    first, second = both.enter("first"), both.enter("second")
-    both.run("first", SIMULATE, SCALE)
-    assert counts(both.run("second", f"{SIMULATE} --json")) == (0, 3)
-    assert counts(both.run("second", f"{SCALE} --json")) == (0, 3)
+    computers = Computers(lab, monkeypatch, place.address)
+    first, second = computers.enter("first"), computers.enter("second")
+    computers.run("first", SIMULATE, SCALE)
+    assert counts(computers.run("second", f"{SIMULATE} --json")) == (0, 3)
+    assert counts(computers.run("second", f"{SCALE} --json")) == (0, 3)
     assert content(first) == content(second)
-    both.run("second", "store gc --cache" if "://" in place.address else "store gc")
-    assert counts(both.run("second", f"{SCALE} --json")) == (0, 3)
-    assert both.run("first", "store verify").endswith("all sound\n")
+    computers.run("second", "store gc --cache" if "://" in place.address else "store gc")
+    assert counts(computers.run("second", f"{SCALE} --json")) == (0, 3)
+    assert computers.run("first", "store verify").endswith("all sound\n")
 
 
 def test_another_computer_brings_only_what_it_needs_and_computes_nothing(computers: Computers, files: Stepping) -> None:
@@ -190,8 +190,8 @@ def test_another_computer_brings_only_what_it_needs_and_computes_nothing(compute
     second = computers.enter("second")
     assert counts(computers.lab.run(f"{SIMULATE} --json").out) == (0, 3)
     objects = {path.name for path in computers.store.root.glob("objects/*/*")}
-    named = {digest for _, digest in computers.lab.manifest("first/project/data/r").objects()}
-    assert objects == named | {manifest_digest(second / "data/r")}
+    named_digests = {digest for _, digest in computers.lab.manifest("first/project/data/r").objects()}
+    assert objects == named_digests | {manifest_digest(second / "data/r")}
     assert counts(computers.lab.run(f"{SCALE} --json").out) == (0, 3)
     assert content(first) == content(second)
 
@@ -214,20 +214,20 @@ def test_where_there_is_nothing_to_do_nobody_is_asked(computers: Computers, file
 def test_a_hit_and_one_new_recording_take_as_many_requests_however_many_recordings_there_are(
     computers: Computers, files: Stepping
 ) -> None:
-    taken: dict[int, tuple[int, int]] = {}
-    for several in (6, 18):
-        simulate = f"simulate toy -o data/r{several} --rows {several} --jobs 1 --trials"
-        scale = f"scale data/r{several} -o data/s{several} --factor 2 --jobs 1"
-        computers.run("first", f"{simulate} {several}", scale, f"{simulate} {several + 1}")
+    request_counts: dict[int, tuple[int, int]] = {}
+    for trial_count in (6, 18):
+        simulate = f"simulate toy -o data/r{trial_count} --rows {trial_count} --jobs 1 --trials"
+        scale = f"scale data/r{trial_count} -o data/s{trial_count} --factor 2 --jobs 1"
+        computers.run("first", f"{simulate} {trial_count}", scale, f"{simulate} {trial_count + 1}")
         files.begin(0, lambda: None)
-        assert counts(computers.lab.run(f"{scale} --json").out) == (1, several)
+        assert counts(computers.lab.run(f"{scale} --json").out) == (1, trial_count)
         new = files.steps
-        shutil.rmtree(f"data/s{several}")
+        shutil.rmtree(f"data/s{trial_count}")
         files.begin(0, lambda: None)
-        assert counts(computers.lab.run(f"{scale} --json").out) == (0, several + 1)
-        taken[several] = new, files.steps
-    assert taken[6] == taken[18], taken
-    assert taken[18][0] < 40 and taken[18][1] < 5, taken
+        assert counts(computers.lab.run(f"{scale} --json").out) == (0, trial_count + 1)
+        request_counts[trial_count] = new, files.steps
+    assert request_counts[6] == request_counts[18], request_counts
+    assert request_counts[18][0] < 40 and request_counts[18][1] < 5, request_counts
 
 
 @pytest.mark.long
@@ -246,11 +246,11 @@ def test_status_list_and_checkout_show_what_the_bucket_holds(computers: Computer
     assert (status["store"], status["objects"]["files"], len(status["roots"])) == ("s3://lab/store", 11, 2)
     assert status["cache"]["objects"]["files"] == 0 and status["cache"]["path"].startswith(os.environ["TACPIPE_CACHE"])
     listed = json.loads(computers.lab.run("store list --json").out)["manifests"]
-    assert {one["path"] for one in listed} == {"data/r", "data/s"}
-    (wanted,) = [one["manifest"] for one in listed if one["path"] == "data/s"]
-    computers.lab.run(f"store checkout {wanted} -o data/back")
-    there = computers.lab.folder / "first/project/data/s/manifest.json"
-    assert Path("data/back/manifest.json").read_bytes() == there.read_bytes()
+    assert {entry["path"] for entry in listed} == {"data/r", "data/s"}
+    (digest,) = [entry["manifest"] for entry in listed if entry["path"] == "data/s"]
+    computers.lab.run(f"store checkout {digest} -o data/back")
+    stored = computers.lab.folder / "first/project/data/s/manifest.json"
+    assert Path("data/back/manifest.json").read_bytes() == stored.read_bytes()
     assert "all sound" in computers.lab.run("store repair").out
     assert "s3://lab/store" in computers.lab.run("store status").out
 
@@ -280,22 +280,22 @@ def test_copies_are_cleared_of_a_bucket_alone(lab: Lab) -> None:
 def test_each_address_and_server_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def folder(address: str, endpoint: str = "") -> Path:
         monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
-        found = parsed(address)
-        assert isinstance(found, Address)
-        return cached.folder(found)
+        parsed_address = parsed(address)
+        assert isinstance(parsed_address, Address)
+        return cached.folder(parsed_address)
 
     monkeypatch.setenv("TACPIPE_CACHE", str(tmp_path / "copies"))
-    several = [
+    folders = [
         folder("s3://lab/a"),
         folder("s3://lab/b"),
         folder("s3://lab/a", "http://rig:8333"),
         folder("gs://lab/a"),
     ]
-    assert len(set(several)) == 4 and all(one.parent == tmp_path / "copies" for one in several)
-    assert folder("s3://lab/a/") == several[0]
+    assert len(set(folders)) == 4 and all(path.parent == tmp_path / "copies" for path in folders)
+    assert folder("s3://lab/a/") == folders[0]
     monkeypatch.delenv("TACPIPE_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert folder("s3://lab/a") == tmp_path / "cache/tacpipe" / several[0].name
+    assert folder("s3://lab/a") == tmp_path / "cache/tacpipe" / folders[0].name
 
 
 # ---- damage, and what is gone
@@ -329,27 +329,27 @@ def test_a_damaged_object_of_the_bucket_is_recomputed_and_replaced(computers: Co
 
 
 @pytest.mark.parametrize("lost", ["bytes", "object"])
-@pytest.mark.parametrize("kept", ["copy", "dataset", "nothing"])
+@pytest.mark.parametrize("survivor", ["copy", "dataset", "nothing"])
 def test_a_repair_sends_again_what_is_damaged_or_missing_in_the_bucket(
-    computers: Computers, files: Stepping, lost: str, kept: str
+    computers: Computers, files: Stepping, lost: str, survivor: str
 ) -> None:
     computers.run("first", SIMULATE, SCALE)
     recorded = computers.lab.manifest("first/project/data/r").recordings["trial-001"]["shards"]["left"]["digest"]
-    made = computers.lab.manifest("first/project/data/s").recordings["trial-001"]["shards"][""]["digest"]
+    computed = computers.lab.manifest("first/project/data/s").recordings["trial-001"]["shards"][""]["digest"]
     manifests = [manifest_digest(Path("data/r")), manifest_digest(Path("data/s"))]
     before = files.content()
-    for name in (recorded, made, *manifests):
+    for name in (recorded, computed, *manifests):
         path = f"objects/{name[:2]}/{name}"
         files.delete(path)
         if lost == "bytes":
             files.create(path, before[path][:-1] + b"x")
-    if kept != "copy":
+    if survivor != "copy":
         shutil.rmtree(computers.store.root / "objects")
-    if kept == "nothing":
+    if survivor == "nothing":
         for file in (Path("data/r/trial-001/left.parquet"), Path("data/s/trial-001.parquet")):
             file.unlink()
     ran = computers.lab.run("store repair --json")
-    assert sorted(json.loads(ran.out)["repaired"]) == sorted([recorded, made, *manifests])
+    assert sorted(json.loads(ran.out)["repaired"]) == sorted([recorded, computed, *manifests])
     assert {name: value for name, value in files.content().items() if name.startswith("objects/")} == {
         name: value for name, value in before.items() if name.startswith("objects/")
     }
@@ -409,18 +409,18 @@ def test_a_dataset_whose_directory_is_gone_is_forgotten_after_the_grace_and_a_sn
 def test_an_output_that_is_replaced_leaves_no_snapshot_unless_it_was_pushed(
     computers: Computers, files: Stepping
 ) -> None:
-    def held() -> list[str]:
+    def snapshots() -> list[str]:
         (root,) = [root for root in RemoteStore(files).roots.all() if root["path"] == "data/s"]
-        return [root["manifest"], *(one["manifest"] for one in root["history"])]
+        return [root["manifest"], *(entry["manifest"] for entry in root["history"])]
 
     computers.run("first", SIMULATE, SCALE)
     first = manifest_digest(Path("data/s"))
     computers.lab.run("scale data/r -o data/s --factor 3 --jobs 1")
     second = manifest_digest(Path("data/s"))
-    assert held() == [second] != [first]
+    assert snapshots() == [second] != [first]
     computers.lab.run("store push s3://lab/store data/s")
     computers.lab.run("scale data/r -o data/s --factor 4 --jobs 1")
-    assert held() == [manifest_digest(Path("data/s")), second]
+    assert snapshots() == [manifest_digest(Path("data/s")), second]
 
 
 # ---- links that fail
@@ -453,9 +453,9 @@ class Linked:
 @pytest.fixture
 def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
     """A proxy before the server that the environment names."""
-    with proxy.between(localbucket) as found:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", found.endpoint)
-        yield found
+    with proxy.between(localbucket) as running_proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.endpoint)
+        yield running_proxy
 
 
 @pytest.fixture
@@ -466,45 +466,45 @@ def linked(lab: Lab, faulty: Proxy, monkeypatch: pytest.MonkeyPatch) -> Linked:
 
 @EVERY
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_stage_outlasts_a_fault_of_any_one_request(linked: Linked, fault: str, every: int) -> None:
-    whole = linked.next()
+def test_a_stage_outlasts_a_fault_of_any_one_request(linked: Linked, fault: str, stride: int) -> None:
+    reference = linked.next()
     linked.under(at(0, None), SIMULATE)
-    requests, wanted = linked.faulty.requests, whole.whole()
-    assert requests > 20 and len(wanted) == 7 + 4
-    for step in range(1 + len(fault) % every, requests + 1, every):
-        there = linked.next()
+    requests, expected = linked.faulty.requests, reference.whole()
+    assert requests > 20 and len(expected) == 7 + 4
+    for step in range(1 + len(fault) % stride, requests + 1, stride):
+        place = linked.next()
         ran = linked.under(at(step, fault), SIMULATE)
         assert ran.code == 0, (step, ran.err)
-        assert digests(there.whole()) == digests(wanted), step
-        expect_whole(there.files)  # type: ignore[arg-type]
+        assert digests(place.whole()) == digests(expected), step
+        expect_whole(place.files)  # type: ignore[arg-type]
         count("requests to a store failed")
 
 
-def digests(found: dict[str, bytes]) -> set[str]:
+def digests(content_by_name: dict[str, bytes]) -> set[str]:
     """Return the names of objects and of records; records hold times too."""
-    return set(found)
+    return set(content_by_name)
 
 
 @EVERY
 @pytest.mark.parametrize("fault", ["refused", "503", "cut upload", "cut answer"])
 def test_a_stage_whose_link_fails_for_good_ends_in_a_sentence_and_its_rerun_gives_the_same_bytes(
-    linked: Linked, fault: str, every: int
+    linked: Linked, fault: str, stride: int
 ) -> None:
-    whole = linked.next()
+    reference = linked.next()
     linked.under(at(0, None), SIMULATE)
-    shown = content(Path.cwd())
-    requests, wanted = linked.faulty.requests, whole.whole()
+    outputs = content(Path.cwd())
+    requests, expected = linked.faulty.requests, reference.whole()
     failed = 0
-    for step in range(1 + len(fault) % every, requests + 1, every):
-        there = linked.next()
+    for step in range(1 + len(fault) % stride, requests + 1, stride):
+        place = linked.next()
         ran = linked.under(since(step, fault), SIMULATE)
         assert ran.code in (0, 1) and "Traceback" not in ran.err and SECRET not in ran.err + ran.out, (step, ran)
         failed += ran.code
-        if RemoteStore(there.files).check():
-            expect_whole(there.files)  # type: ignore[arg-type]
+        if RemoteStore(place.files).check():
+            expect_whole(place.files)  # type: ignore[arg-type]
         linked.computers.lab.run(SIMULATE)
-        assert digests(there.whole()) == digests(wanted) and content(Path.cwd()) == shown, step
-        expect_whole(there.files)  # type: ignore[arg-type]
+        assert digests(place.whole()) == digests(expected) and content(Path.cwd()) == outputs, step
+        expect_whole(place.files)  # type: ignore[arg-type]
         count("requests to a store failed")
     assert failed
 
@@ -515,26 +515,26 @@ def test_without_a_link_what_is_shown_is_a_hit_and_anything_else_a_sentence(link
     computers.lab.run(SIMULATE)
     computers.lab.run(SCALE)
     assert counts(linked.under(off, f"{SCALE} --json").out) == (0, 3)
-    other = linked.under(off, "scale data/r -o data/t --factor 9 --jobs 1")
-    assert other.code == 1 and computers.address in other.err and other.err.count("\n") == 1
+    ran = linked.under(off, "scale data/r -o data/t --factor 9 --jobs 1")
+    assert ran.code == 1 and computers.address in ran.err and ran.err.count("\n") == 1
     assert linked.under(off, "show data/s").code == 0
 
 
 @pytest.mark.long
 def test_a_label_is_kept_here_where_there_is_no_link_and_goes_there_with_the_next(linked: Linked) -> None:
-    there = linked.next()
+    place = linked.next()
     run = linked.computers.lab.run
     run(SIMULATE)
     run("store push s3://lab/elsewhere data/r")  # a project has its identity from now on
     ran = linked.under(since(1, "refused"), "label data/r trial-000 --label material=foam")
     assert ran.code == 0 and linked.computers.address in ran.err
     assert "foam" in run("show data/r --json").out
-    (root,) = RemoteStore(there.files).roots.all()
+    (root,) = RemoteStore(place.files).roots.all()
     assert root["manifest"] != manifest_digest(Path("data/r"))
     run("label data/r trial-001 --set material=cork")
-    (root,) = RemoteStore(there.files).roots.all()
+    (root,) = RemoteStore(place.files).roots.all()
     assert root["manifest"] == manifest_digest(Path("data/r"))
-    expect_whole(there.files)  # type: ignore[arg-type]
+    expect_whole(place.files)  # type: ignore[arg-type]
 
 
 @pytest.mark.long
@@ -545,11 +545,11 @@ def test_credentials_are_in_nothing_that_is_kept_or_printed(linked: Linked) -> N
         ran = linked.computers.lab.run(command)
         printed += ran.out + ran.err
     printed += linked.under(since(1, "503"), "scale data/r -o data/t --factor 9").err
-    kept = [entry.name.encode() + place.files.read(entry.name) for entry in place.files.list("")]
-    here = [path.read_bytes() for path in Path.cwd().parent.rglob("*") if path.is_file()]
+    stored = [entry.name.encode() + place.files.read(entry.name) for entry in place.files.list("")]
+    local = [path.read_bytes() for path in Path.cwd().parent.rglob("*") if path.is_file()]
     for secret in (SECRET, KEY):
         assert secret not in printed
-        assert not [one for one in [*kept, *here] if secret.encode() in one]
+        assert not [data for data in [*stored, *local] if secret.encode() in data]
 
 
 def test_folders_that_begin_anew_are_one_project_where_the_environment_names_it(
@@ -575,9 +575,9 @@ def test_a_job_that_begins_anew_pulls_what_an_earlier_one_pushed_under_the_name_
 ) -> None:
     monkeypatch.setenv("TACPIPE_PROJECT", "nightly")
     computers.run("first", SIMULATE, "store push s3://lab/elsewhere data/r")
-    wanted = content(computers.enter("first"))
+    expected = content(computers.enter("first"))
     computers.run("second", "store pull s3://lab/elsewhere data/r")
-    assert content(computers.enter("second")) == wanted
+    assert content(computers.enter("second")) == expected
     refused = computers.lab.call("store push s3://lab/elsewhere data/r --project another")
     assert refused.code == 2 and refused.err.count("\n") == 1
 
@@ -594,29 +594,29 @@ def test_a_name_that_no_project_can_have_is_refused(
 def test_results_are_sent_while_others_are_computed_and_objects_still_come_before_their_records(
     computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    several, create, lock = threading.Event(), files.create, threading.Lock()
+    overlapping, create, lock = threading.Event(), files.create, threading.Lock()
     under_way = [0, 0]  # now, and at most
 
     def creating(name: str, content: bytes | Iterable[bytes]) -> bool:
         if not name.startswith("records/"):
             return create(name, content)
         assert isinstance(content, bytes)
-        for wanted in records.digests(json.loads(content)["result"]):
-            assert files.stat(f"objects/{wanted[:2]}/{wanted}") is not None, name
+        for digest in records.digests(json.loads(content)["result"]):
+            assert files.stat(f"objects/{digest[:2]}/{digest}") is not None, name
         with lock:
             under_way[0] += 1
             under_way[1] = max(under_way)
             if under_way[0] > 1:
-                several.set()
-        several.wait(60)  # in vain where each waits for the one before
-        kept = create(name, content)
+                overlapping.set()
+        overlapping.wait(60)  # this times out if each waits for the one before
+        created = create(name, content)
         with lock:
             under_way[0] -= 1
-        return kept
+        return created
 
     monkeypatch.setattr(files, "create", creating)
     computers.run("first", SIMULATE.replace("--trials 3", "--trials 12"))
-    assert several.is_set() and 1 < under_way[1] <= computing.AT_ONCE
+    assert overlapping.is_set() and 1 < under_way[1] <= computing.AT_ONCE
     expect_whole(files)
     assert not [path for path in computers.store.root.glob("leases/*") if not path.name.startswith("run-")]
     computers.run("second", SIMULATE.replace("--trials 3", "--trials 12"))
@@ -626,22 +626,22 @@ def test_results_are_sent_while_others_are_computed_and_objects_still_come_befor
 def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_looked_for_ahead(
     computers: Computers, files: Stepping
 ) -> None:
-    many = SIMULATE.replace("--trials 3", "--trials 12")
-    computers.run("first", many)
+    command = SIMULATE.replace("--trials 3", "--trials 12")
+    computers.run("first", command)
     tasks = {"scale": [], "simulate.toy": []}  # type: ignore[var-annotated]
     for _, record in computers.store.records():
         identity = record["identity"]
         if identity.get("stage") in tasks:
             tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
     computers.enter("second")
-    done = list(computing.compute.compute_all(tasks["simulate.toy"]))
-    assert len(done) == 12 and not any(task.is_new for task in done)
+    results = list(computing.compute.compute_all(tasks["simulate.toy"]))
+    assert len(results) == 12 and not any(task.is_new for task in results)
 
 
 def test_a_result_that_cannot_be_sent_ends_the_command_and_the_others_are_kept(
     computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    many, create, sent = SIMULATE.replace("--trials 3", "--trials 12"), files.create, itertools.count()
+    command, create, sent = SIMULATE.replace("--trials 3", "--trials 12"), files.create, itertools.count()
 
     def failing(name: str, content: bytes | Iterable[bytes]) -> bool:
         if name.startswith("records/") and next(sent) == 5:
@@ -650,10 +650,10 @@ def test_a_result_that_cannot_be_sent_ends_the_command_and_the_others_are_kept(
 
     with monkeypatch.context() as broken:
         broken.setattr(files, "create", failing)
-        ran = computers.lab.call(many)
+        ran = computers.lab.call(command)
     assert ran.code == 1 and "503" in ran.err
     assert not list(computers.store.root.glob("leases/*"))
-    assert counts(computers.lab.run(f"{many} --json").out) == (1, 11)
+    assert counts(computers.lab.run(f"{command} --json").out) == (1, 11)
     expect_whole(files)
 
 
@@ -661,14 +661,14 @@ def test_a_result_that_cannot_be_sent_ends_the_command_and_the_others_are_kept(
 
 
 def steps(
-    emptied: Callable[[dict[str, bytes]], Stepping], base: dict[str, bytes], every: int, run: Callable[[], object]
+    emptied: Callable[[dict[str, bytes]], Stepping], base: dict[str, bytes], stride: int, run: Callable[[], object]
 ) -> range:
     """Return the numbers of the requests that something takes on a bucket of this content."""
     files = emptied(base)
     files.begin(0, lambda: None)
     run()
     assert files.steps > 10
-    return range(1, files.steps + 1, every)
+    return range(1, files.steps + 1, stride)
 
 
 @pytest.fixture
@@ -680,22 +680,22 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 STEPS = pytest.mark.parametrize(
-    "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(4, marks=pytest.mark.long)]
+    "stride", [pytest.param(1, marks=pytest.mark.faults), pytest.param(4, marks=pytest.mark.long)]
 )
 
 
 @STEPS
-@pytest.mark.parametrize("other", [SIMULATE, "simulate toy -o data/r --trials 2 --rows 3 --jobs 1"])
+@pytest.mark.parametrize("other_command", [SIMULATE, "simulate toy -o data/r --trials 2 --rows 3 --jobs 1"])
 def test_the_same_or_another_run_elsewhere_at_any_request_does_no_harm(
     computers: Computers,
     emptied: Callable[[dict[str, bytes]], Stepping],
     one_at_a_time: None,
-    every: int,
-    other: str,
+    stride: int,
+    other_command: str,
 ) -> None:
-    for step in steps(emptied, {}, every, lambda: computers.run("first", SIMULATE)):
+    for step in steps(emptied, {}, stride, lambda: computers.run("first", SIMULATE)):
         files = emptied({})
-        files.begin(step, lambda: computers.run("second", other))
+        files.begin(step, lambda: computers.run("second", other_command))
         computers.run("first", SIMULATE)
         expect_whole(files)
         assert counts(computers.run("third", f"{SIMULATE} --json")) == (0, 3)
@@ -706,20 +706,20 @@ def test_the_same_or_another_run_elsewhere_at_any_request_does_no_harm(
 
 @STEPS
 def test_a_collection_at_any_request_of_a_run_takes_nothing_that_it_needs(
-    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, every: int
+    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, stride: int
 ) -> None:
     computers.run("first", SIMULATE)
     files = emptied({})
     computers.run("first", SIMULATE)
     for root in RemoteStore(files).roots.all():
         RemoteStore(files).roots.remove(root)
-    garbage = files.content()  # which nothing names any more, and a run would reuse
+    garbage = files.content()  # nothing names these objects any more, and a run would reuse them
 
     def collect() -> None:
         remote_upkeep.collect(RemoteStore(files), dry_run=False, recordings=True)
 
     for base in ({}, garbage):
-        for step in steps(emptied, base, every, lambda: computers.run("first", SIMULATE)):
+        for step in steps(emptied, base, stride, lambda: computers.run("first", SIMULATE)):
             files = emptied(base)
             files.begin(step, collect)
             computers.run("first", SIMULATE)
@@ -730,7 +730,7 @@ def test_a_collection_at_any_request_of_a_run_takes_nothing_that_it_needs(
 
 @STEPS
 def test_a_run_that_is_killed_at_any_request_leaves_a_sound_bucket_and_its_rerun_gives_the_same_bytes(
-    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, every: int
+    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, stride: int
 ) -> None:
     class Killed(BaseException):
         """Ends a run as no handler expects."""
@@ -740,9 +740,9 @@ def test_a_run_that_is_killed_at_any_request_leaves_a_sound_bucket_and_its_rerun
 
     files = emptied({})
     computers.run("first", SIMULATE)
-    wanted = {name for name in files.content() if name.startswith(("objects", "records"))}
-    shown = content(Path.cwd())
-    for step in steps(emptied, {}, every, lambda: computers.run("first", SIMULATE)):
+    expected = {name for name in files.content() if name.startswith(("objects", "records"))}
+    outputs = content(Path.cwd())
+    for step in steps(emptied, {}, stride, lambda: computers.run("first", SIMULATE)):
         files = emptied({})
         files.begin(step, killed)
         with pytest.raises(Killed):
@@ -753,8 +753,8 @@ def test_a_run_that_is_killed_at_any_request_leaves_a_sound_bucket_and_its_rerun
         computers.enter("first")
         computers.lab.run(SIMULATE)
         expect_whole(files)
-        assert content(Path.cwd()) == shown
-        assert {name for name in files.content() if name.startswith(("objects", "records"))} == wanted
+        assert content(Path.cwd()) == outputs
+        assert {name for name in files.content() if name.startswith(("objects", "records"))} == expected
         count("runs killed, in a bucket")
 
 
@@ -766,23 +766,23 @@ def test_processes_that_are_killed_while_they_upload_leave_a_bucket_in_which_a_r
     plain = Computers(lab, monkeypatch, "s3://lab/plain/store")
     folder = plain.enter("plain")
     lab.run(command)
-    wanted, whole = content(folder), set(places.bucket(plain.address).whole())
+    expected, expected_names = content(folder), set(places.bucket(plain.address).whole())
     for number in range(6):
         killed = Computers(lab, monkeypatch, f"s3://lab/killed-{number}/store")
         folder = killed.enter(f"killed-{number}")
-        there = places.bucket(killed.address)
+        place = places.bucket(killed.address)
         process = subprocess.Popen(
             [sys.executable, "-m", "tacpipe", *command.split(), "--jobs", "2"], start_new_session=True
         )
-        while process.poll() is None and len(there.names("objects")) < 1 + 7 * number:
+        while process.poll() is None and len(place.names("objects")) < 1 + 7 * number:
             time.sleep(0.002)
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        expect_whole(there.files)  # type: ignore[arg-type]
+        expect_whole(place.files)  # type: ignore[arg-type]
         lab.run(f"{command} --jobs 1")
-        assert content(folder) == wanted and set(there.whole()) == whole
-        expect_whole(there.files)  # type: ignore[arg-type]
+        assert content(folder) == expected and set(place.whole()) == expected_names
+        expect_whole(place.files)  # type: ignore[arg-type]
         count("runs killed, in a bucket")
 
 
@@ -790,20 +790,20 @@ def test_processes_that_are_killed_while_they_upload_leave_a_bucket_in_which_a_r
 def test_two_computers_that_run_the_same_and_other_stages_at_once_end_with_the_same_bytes(
     lab: Lab, localbucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    both = Computers(lab, monkeypatch, "s3://lab/shared/store")
+    computers = Computers(lab, monkeypatch, "s3://lab/shared/store")
     line = [sys.executable, "-m", "tacpipe"]
     for command in ("simulate toy -o data/r --trials 20 --rows 3", "scale data/r -o data/s --factor 2"):
         running = []
         for name in ("first", "second"):
-            both.enter(name)
+            computers.enter(name)
             running.append(subprocess.Popen([*line, *command.split(), "--jobs", "2"]))
-        both.enter("third")
+        computers.enter("third")
         running.append(subprocess.Popen([*line, *["simulate", "toy", "-o", "data/r", "--trials", "11", "--rows", "3"]]))
         running.append(subprocess.Popen([*line, "store", "gc"]))
         assert [process.wait() for process in running] == [0, 0, 0, 0]
     assert content(lab.folder / "first/project") == content(lab.folder / "second/project")
-    expect_whole(places.bucket(both.address).files)  # type: ignore[arg-type]
-    both.enter("fourth")
+    expect_whole(places.bucket(computers.address).files)  # type: ignore[arg-type]
+    computers.enter("fourth")
     assert counts(lab.run("simulate toy -o data/r --trials 20 --rows 3 --json").out) == (0, 20)
 
 
@@ -812,15 +812,15 @@ def test_a_worker_of_dask_reaches_the_bucket_by_its_address_and_keeps_copies_of_
     lab: Lab, localbucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    here = Computers(lab, monkeypatch, "s3://lab/dask/store")
-    folder = here.enter("client")
+    computers = Computers(lab, monkeypatch, "s3://lab/dask/store")
+    folder = computers.enter("client")
     lab.run("simulate toy -o data/r --trials 6 --rows 3")
     assert counts(lab.run("scale data/r -o data/s --factor 2 --executor dask --jobs 2 --json").out) == (6, 0)
-    here.enter("other")
+    computers.enter("other")
     lab.run("simulate toy -o data/r --trials 6 --rows 3")
     lab.run("scale data/r -o data/s --factor 2")
     assert content(folder) == content(Path.cwd())
-    expect_whole(places.bucket(here.address).files)  # type: ignore[arg-type]
+    expect_whole(places.bucket(computers.address).files)  # type: ignore[arg-type]
 
 
 def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucket(
@@ -829,13 +829,13 @@ def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucke
     honest = computing.compute
 
     def elsewhere(task: Task) -> Done:
-        with monkeypatch.context() as there:
-            there.setenv("TACPIPE_CACHE", str(computers.lab.folder / "worker"))
+        with monkeypatch.context() as patch:
+            patch.setenv("TACPIPE_CACHE", str(computers.lab.folder / "worker"))
             return honest(replace(task, run=""))
 
     computers.run("first", SIMULATE)
-    with monkeypatch.context() as there:
-        there.setattr(computing, "compute", elsewhere)
+    with monkeypatch.context() as patch:
+        patch.setattr(computing, "compute", elsewhere)
         assert counts(computers.lab.run(f"{SCALE} --json").out) == (3, 0)
     assert json.loads(computers.lab.run(f"{SCALE} --json").out)["reused"] == 3
     expect_whole(files)

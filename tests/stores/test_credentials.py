@@ -1,4 +1,4 @@
-"""Where credentials come from, and that they get nowhere else."""
+"""Test where credentials come from, and that they appear nowhere else."""
 
 from pathlib import Path
 from typing import Any
@@ -27,17 +27,17 @@ def test_a_profile_gives_credentials_region_and_endpoint(tmp_path: Path) -> None
     credentials = "[default]\naws_access_key_id = a\naws_secret_access_key = b\n"
     credentials += "[rig]\naws_access_key_id = c\naws_secret_access_key = d\naws_session_token = e\n"
     config = "[profile rig]\nregion = eu-central-1\nendpoint_url = https://s3.lab\n"
-    found = settings(tmp_path, credentials, config)
-    assert (found["access_key_id"], found["secret_access_key"]) == ("a", "b") and "endpoint" not in found
-    found = settings(tmp_path, credentials, config, AWS_PROFILE="rig")
-    assert (found["access_key_id"], found["secret_access_key"], found["session_token"]) == ("c", "d", "e")
-    assert (found["region"], found["endpoint"]) == ("eu-central-1", "https://s3.lab")
+    options = settings(tmp_path, credentials, config)
+    assert (options["access_key_id"], options["secret_access_key"]) == ("a", "b") and "endpoint" not in options
+    options = settings(tmp_path, credentials, config, AWS_PROFILE="rig")
+    assert (options["access_key_id"], options["secret_access_key"], options["session_token"]) == ("c", "d", "e")
+    assert (options["region"], options["endpoint"]) == ("eu-central-1", "https://s3.lab")
 
 
 def test_credentials_of_the_environment_come_before_those_of_a_profile(tmp_path: Path) -> None:
     credentials = "[rig]\naws_access_key_id = c\naws_secret_access_key = d\nregion = us-west-1\n"
-    found = settings(tmp_path, credentials, AWS_PROFILE="rig", AWS_ACCESS_KEY_ID="x", AWS_REGION="eu-west-1")
-    assert "access_key_id" not in found and found["region"] == "eu-west-1"
+    options = settings(tmp_path, credentials, AWS_PROFILE="rig", AWS_ACCESS_KEY_ID="x", AWS_REGION="eu-west-1")
+    assert "access_key_id" not in options and options["region"] == "eu-west-1"
 
 
 def test_a_profile_that_is_not_there_and_a_file_that_is_none_are_refused_without_showing_it(tmp_path: Path) -> None:
@@ -66,8 +66,8 @@ def test_plain_http_is_used_only_where_the_endpoint_says_so(tmp_path: Path) -> N
 
 def test_a_representation_shows_no_credential(tmp_path: Path) -> None:
     (tmp_path / "c").write_text(f"[default]\naws_access_key_id = {KEY}\naws_secret_access_key = {SECRET}\n")
-    found = addresses.settings(LAB, {"AWS_SHARED_CREDENTIALS_FILE": str(tmp_path / "c"), "HOME": str(tmp_path)})
-    assert found.config["secret_access_key"] == SECRET and SECRET not in repr(found)
+    resolved = addresses.settings(LAB, {"AWS_SHARED_CREDENTIALS_FILE": str(tmp_path / "c"), "HOME": str(tmp_path)})
+    assert resolved.config["secret_access_key"] == SECRET and SECRET not in repr(resolved)
 
 
 def test_no_credential_is_printed_or_written_by_any_command_of_a_store(
@@ -106,5 +106,5 @@ def test_a_real_server_refuses_a_wrong_secret_and_the_sentence_shows_neither(
 def test_the_account_of_an_address_of_azure_is_a_setting_and_the_container_is_the_first_folder() -> None:
     address = addresses.parsed("az://account/container/touch/store")
     assert isinstance(address, addresses.Address)
-    found = addresses.settings(address, {})
-    assert (found.config["account_name"], found.url) == ("account", "az://container/touch/store")
+    resolved = addresses.settings(address, {})
+    assert (resolved.config["account_name"], resolved.url) == ("account", "az://container/touch/store")

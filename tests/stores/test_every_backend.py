@@ -71,7 +71,7 @@ def test_content_of_any_size_comes_back(files: Backend, size: int) -> None:
     assert files.create(NAME, content) and files.read(NAME) == content
     entry = files.stat(NAME)
     assert entry is not None and (entry.name, entry.bytes) == (NAME, size)
-    assert [(one.name, one.bytes) for one in files.list("objects")] == [(NAME, size)]
+    assert [(listed.name, listed.bytes) for listed in files.list("objects")] == [(NAME, size)]
 
 
 def large(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
@@ -112,8 +112,8 @@ def test_a_folder_of_a_store_lists_what_lies_at_any_depth_in_it_and_nothing_else
     lease = f"leases/run-{'0' * 32}.lock"
     for name in (NAME, OTHER, lease):
         files.create(name, b"1")
-    assert {one.name for one in files.list("objects")} == {NAME, OTHER}
-    assert {one.name for one in files.list("leases")} == {lease}
+    assert {entry.name for entry in files.list("objects")} == {NAME, OTHER}
+    assert {entry.name for entry in files.list("leases")} == {lease}
 
 
 def test_a_folder_of_more_names_than_a_server_lists_at_once_is_listed_whole(localbucket: str, tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_a_folder_of_more_names_than_a_server_lists_at_once_is_listed_whole(loca
     names = {f"objects/ab/ab{number:062x}" for number in range(2500)}
     for name in names:
         (tmp_path / "buckets/lab/store" / name).write_bytes(b"")
-    assert {one.name for one in places.bucket("s3://lab/store").files.list("objects")} == names
+    assert {entry.name for entry in places.bucket("s3://lab/store").files.list("objects")} == names
 
 
 def test_a_list_of_many_pages_is_whole_also_where_any_request_for_one_fails_once(
@@ -133,24 +133,24 @@ def test_a_list_of_many_pages_is_whole_also_where_any_request_for_one_fails_once
     from obstore.exceptions import GenericError
     from obstore.store import MemoryStore
 
-    found = bucket.Bucket("s3://lab/store", MemoryStore())
+    lab_bucket = bucket.Bucket("s3://lab/store", MemoryStore())
     names = {f"objects/{number:02x}/{number:02x}{'0' * 62}" for number in range(20)}
     for name in names:
-        found.create(name, name.encode())
+        lab_bucket.create(name, name.encode())
     honest = obstore.list
     for failing in range(1, 9):
-        asked = 0
+        pages = 0
 
-        def failing_once(*given: object, failing: int = failing, **more: object) -> Iterator[object]:
-            nonlocal asked
-            for page in honest(*given, **more):  # type: ignore[call-overload]
-                asked += 1
-                if asked == failing:
+        def failing_once(*args: object, failing: int = failing, **kwargs: object) -> Iterator[object]:
+            nonlocal pages
+            for page in honest(*args, **kwargs):  # type: ignore[call-overload]
+                pages += 1
+                if pages == failing:
                     raise GenericError("the connection was lost")
                 yield page
 
         monkeypatch.setattr(obstore, "list", failing_once)
-        listed = [entry.name for entry in found.list("objects")]
+        listed = [entry.name for entry in lab_bucket.list("objects")]
         assert sorted(listed) == sorted(names), failing
         count("requests to a store failed")
 
@@ -158,28 +158,28 @@ def test_a_list_of_many_pages_is_whole_also_where_any_request_for_one_fails_once
 def test_only_as_many_pages_are_asked_for_as_are_used(without_profiles: None, monkeypatch: pytest.MonkeyPatch) -> None:
     from obstore.store import MemoryStore
 
-    asked = []
+    requests = []
 
     class Asked(bucket.Bucket):
         def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
-            asked.append(request)
+            requests.append(request)
             return super()._tried(request, tries)
 
     monkeypatch.setattr(bucket, "PAGE", 2)
-    found = Asked("s3://lab/store", MemoryStore())
+    counting_bucket = Asked("s3://lab/store", MemoryStore())
     for number in range(8):
-        found.create(f"objects/0{number}/0{number}{'0' * 62}", b"x")
-    asked.clear()
-    next(found.list("objects"))
-    assert len(asked) == 1
+        counting_bucket.create(f"objects/0{number}/0{number}{'0' * 62}", b"x")
+    requests.clear()
+    next(counting_bucket.list("objects"))
+    assert len(requests) == 1
 
 
 @pytest.mark.parametrize("count_of", [3, 40])
 def test_objects_are_looked_for_one_by_one_or_in_a_list_with_the_same_answer(place: Place, count_of: int) -> None:
     store = RemoteStore(place.files)
-    there = {f"{number:02x}{'1' * 62}": number + 1 for number in range(count_of)}
-    for name, size in there.items():
+    sizes = {f"{number:02x}{'1' * 62}": number + 1 for number in range(count_of)}
+    for name, size in sizes.items():
         place.files.create(f"objects/{name[:2]}/{name}", b"x" * size)
     absent = [f"{number:02x}{'2' * 62}" for number in range(count_of)]
-    assert store.sizes([*absent, *there]) == there
+    assert store.sizes([*absent, *sizes]) == sizes
     assert store.sizes(absent) == {} == store.sizes([])

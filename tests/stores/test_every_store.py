@@ -41,17 +41,19 @@ def shard(lab: Lab, trial: str = "trial-003", path: str = "data/s") -> str:
 
 def listed(lab: Lab, place: Place) -> list[dict[str, Any]]:
     """Return what was pushed, as `store list` prints it."""
-    found: list[dict[str, Any]] = json.loads(lab.run(f"store list --remote {place.address} --json").out)["manifests"]
-    return found
+    manifests: list[dict[str, Any]] = json.loads(lab.run(f"store list --remote {place.address} --json").out)[
+        "manifests"
+    ]
+    return manifests
 
 
 def test_an_empty_clone_pulls_what_was_pushed_byte_for_byte_and_computes_nothing_again(
     lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted = (lab.folder / "data/s/manifest.json").read_bytes()
+    expected = (lab.folder / "data/s/manifest.json").read_bytes()
     folder = clone(lab, monkeypatch)
     lab.run(f"store pull {pushed.address} data/s")
-    assert (folder / "data/s/manifest.json").read_bytes() == wanted
+    assert (folder / "data/s/manifest.json").read_bytes() == expected
     assert repair.verify(Store(folder / ".tacpipe")).clean
     assert tacpipe.open("data/s").to_numpy()["trial-001"].values[:, 0].tolist() == [0, 2, 4]
 
@@ -69,15 +71,15 @@ def test_records_come_along_so_that_a_clone_reuses_what_another_one_computed(
 @pytest.mark.long
 def test_a_second_push_and_a_second_pull_move_nothing(lab: Lab, pushed: Place) -> None:
     for verb in ("push", "push --verify", "pull"):
-        done = json.loads(lab.run(f"store {verb} {pushed.address} data/s --json").out)
-        assert (done["objects"], done["bytes"], done["there"] >= 5) == (0, 0, True), verb
+        report = json.loads(lab.run(f"store {verb} {pushed.address} data/s --json").out)
+        assert (report["objects"], report["bytes"], report["there"] >= 5) == (0, 0, True), verb
 
 
 @pytest.mark.long
 def test_a_push_that_was_cut_off_sends_only_what_is_missing(lab: Lab, pushed: Place) -> None:
     pushed.files.delete(shard(lab))
-    done = json.loads(lab.run(f"store push {pushed.address} data/s --json").out)
-    assert (done["objects"], done["replaced"]) == (1, 0)
+    report = json.loads(lab.run(f"store push {pushed.address} data/s --json").out)
+    assert (report["objects"], report["replaced"]) == (1, 0)
 
 
 @pytest.mark.long
@@ -85,8 +87,8 @@ def test_a_push_that_was_cut_off_sends_only_what_is_missing(lab: Lab, pushed: Pl
 def test_an_object_of_another_size_is_replaced_by_the_next_push(lab: Lab, pushed: Place, size: int) -> None:
     content = pushed.files.read(shard(lab))
     pushed.replace(shard(lab), (content * 1000)[:size])
-    done = json.loads(lab.run(f"store push {pushed.address} data/s --json").out)
-    assert (done["objects"], done["replaced"], pushed.files.read(shard(lab))) == (1, 1, content)
+    report = json.loads(lab.run(f"store push {pushed.address} data/s --json").out)
+    assert (report["objects"], report["replaced"], pushed.files.read(shard(lab))) == (1, 1, content)
     count("damages of a store found")
 
 
@@ -98,19 +100,19 @@ def test_an_object_with_other_bytes_is_never_pulled_is_named_and_is_replaced_by_
         pushed.files.delete(name)  # else a folder's own records bring it back
     pushed.replace(shard(lab), content[:-1] + b"?")
     digest = Path(shard(lab)).name
-    found = lab.call(f"store verify --remote {pushed.address} --json")
-    assert found.code == 4 and digest in found.out
+    ran = lab.call(f"store verify --remote {pushed.address} --json")
+    assert ran.code == 4 and digest in ran.out
     pushed.files.delete(shard(lab))
     assert pushed.files.create(shard(lab), content[:-1] + b"?")
-    here = Path.cwd()
+    origin = Path.cwd()
     clone(lab, monkeypatch)
     failed = lab.call(f"store pull {pushed.address} data/s")
     assert failed.code == 4 and not Path("data/s").exists()
-    monkeypatch.chdir(here)
+    monkeypatch.chdir(origin)
     pushed.files.delete(shard(lab))
     assert pushed.files.create(shard(lab), content[:-1] + b"?")
-    done = json.loads(lab.run(f"store push {pushed.address} data/s --verify --json").out)
-    assert (done["objects"], done["replaced"], pushed.files.read(shard(lab))) == (1, 1, content)
+    report = json.loads(lab.run(f"store push {pushed.address} data/s --verify --json").out)
+    assert (report["objects"], report["replaced"], pushed.files.read(shard(lab))) == (1, 1, content)
     assert lab.run(f"store verify --remote {pushed.address}").out.endswith("all sound\n")
     count("damages of a store found", 3)
 
@@ -122,8 +124,8 @@ def test_a_vanished_object_is_named_and_ends_a_pull_with_the_code_of_damage(
     pushed.files.delete(shard(lab))
     for name in pushed.names("records"):
         pushed.files.delete(name)
-    found = lab.call(f"store verify --remote {pushed.address} --json")
-    assert found.code == 4 and json.loads(found.out)["missing"] == [Path(shard(lab)).name]
+    ran = lab.call(f"store verify --remote {pushed.address} --json")
+    assert ran.code == 4 and json.loads(ran.out)["missing"] == [Path(shard(lab)).name]
     clone(lab, monkeypatch)
     failed = lab.call(f"store pull {pushed.address} data/s")
     assert failed.code == 4 and "trial-003.parquet" in failed.err and not Path("data/s").exists()
@@ -132,8 +134,8 @@ def test_a_vanished_object_is_named_and_ends_a_pull_with_the_code_of_damage(
 
 @pytest.mark.long
 def test_a_manifest_that_vanished_is_named_and_comes_back_with_the_next_push(lab: Lab, pushed: Place) -> None:
-    (one,) = listed(lab, pushed)
-    pushed.files.delete(f"objects/{one['manifest'][:2]}/{one['manifest']}")
+    (entry,) = listed(lab, pushed)
+    pushed.files.delete(f"objects/{entry['manifest'][:2]}/{entry['manifest']}")
     assert lab.call(f"store verify --remote {pushed.address}").code == 4
     lab.run(f"store push {pushed.address} data/s")
     assert lab.call(f"store verify --remote {pushed.address}").code == 0
@@ -177,10 +179,10 @@ def test_a_push_onto_what_another_computer_pushed_since_is_refused_and_both_stay
     refused = lab.call(f"store push {pushed.address} data/r")
     assert refused.code == 2 and "--replace" in refused.err
     lab.run(f"store push {pushed.address} data/r --replace")
-    states = [one["state"] for one in listed(lab, pushed) if one["path"] == "data/r"]
+    states = [entry["state"] for entry in listed(lab, pushed) if entry["path"] == "data/r"]
     assert states == ["pushed here", "pushed earlier", "pushed earlier"]
-    for number, one in enumerate(one["manifest"] for one in listed(lab, pushed) if one["path"] == "data/r"):
-        lab.run(f"store checkout {one} --remote {pushed.address} -o back/{number}")
+    for number, digest in enumerate(entry["manifest"] for entry in listed(lab, pushed) if entry["path"] == "data/r"):
+        lab.run(f"store checkout {digest} --remote {pushed.address} -o back/{number}")
 
 
 def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_refused(
@@ -189,27 +191,27 @@ def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_ref
     lab.run(f"store push {pushed.address} data/r")
     first, second = two_clones(lab, pushed, monkeypatch)
     honest = copying.copy
-    meanwhile: list[int] = []
+    calls: list[int] = []
 
-    def copy(*given: Any, **more: Any) -> None:
-        honest(*given, **more)
-        if not meanwhile:
-            meanwhile.append(1)
-            with monkeypatch.context() as there:
-                there.chdir(second)
-                there.setenv("TACPIPE_LOCK_TIMEOUT_S", "0.05")
-                meanwhile.append(lab.call(f"store push {pushed.address} data/r").code)
+    def copy(*args: Any, **kwargs: Any) -> None:
+        honest(*args, **kwargs)
+        if not calls:
+            calls.append(1)
+            with monkeypatch.context() as patch:
+                patch.chdir(second)
+                patch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0.05")
+                calls.append(lab.call(f"store push {pushed.address} data/r").code)
 
     monkeypatch.setattr(copying, "copy", copy)
     monkeypatch.chdir(first)
     code = lab.call(f"store push {pushed.address} data/r").code
-    assert (code, meanwhile[1]) in ((0, 6), (2, 0)), "where there are locks the second waits, else the first is refused"
-    newest = next(one for one in listed(lab, pushed) if one["path"] == "data/r")
+    assert (code, calls[1]) in ((0, 6), (2, 0)), "where there are locks the second waits, else the first is refused"
+    newest = next(entry for entry in listed(lab, pushed) if entry["path"] == "data/r")
     winner = first if code == 0 else second
     assert json.loads((winner / "data/r/manifest.json").read_text())
     monkeypatch.chdir(winner)
     assert not json.loads(lab.run(f"store push {pushed.address} data/r --json").out)["objects"]
-    assert next(one for one in listed(lab, pushed) if one["path"] == "data/r")["manifest"] == newest["manifest"]
+    assert next(entry for entry in listed(lab, pushed) if entry["path"] == "data/r")["manifest"] == newest["manifest"]
     count("pushes of one name at once")
 
 
@@ -222,7 +224,7 @@ def test_the_last_pushes_are_kept_and_forgotten_ones_are_collected(
         lab.run(f"simulate toy -o data/r --trials 1 --rows {rows} --jobs 1")
         lab.run(f"store push {place.address} data/r")
     assert len(listed(lab, place)) == 1 + 2
-    newest, *_, oldest = [one["manifest"] for one in listed(lab, place)]
+    newest, *_, oldest = [entry["manifest"] for entry in listed(lab, place)]
     lab.run(f"store gc --remote {place.address} --forget {newest} --forget {oldest[:12]}")
     assert len(listed(lab, place)) == 1
     lab.run(f"store gc --remote {place.address} --forget {listed(lab, place)[0]['project']}:data/r")
@@ -248,10 +250,10 @@ def test_a_collection_removes_what_nothing_names_and_keeps_all_that_is_needed(la
     dry = json.loads(lab.run(f"store gc --remote {pushed.address} --forget data/t --dry-run --json").out)
     assert pushed.whole() == before and dry["objects"] == 0
     project = listed(lab, pushed)[0]["project"]
-    done = json.loads(lab.run(f"store gc --remote {pushed.address} --forget {project}:data/t --json").out)
-    assert done["objects"] == 5 and done["records"] >= 4
+    report = json.loads(lab.run(f"store gc --remote {pushed.address} --forget {project}:data/t --json").out)
+    assert report["objects"] == 5 and report["records"] >= 4
     assert lab.run(f"store verify --remote {pushed.address}").out.endswith("all sound\n")
-    assert [one["path"] for one in listed(lab, pushed)] == ["data/s"]
+    assert [entry["path"] for entry in listed(lab, pushed)] == ["data/s"]
     assert json.loads(lab.run(f"store gc --remote {pushed.address} --json").out)["objects"] == 0
 
 
@@ -264,8 +266,8 @@ def test_recordings_that_nothing_names_are_kept_until_they_are_asked_for(lab: La
     before = place.names("objects")
     name = f"{listed(lab, place)[0]['project']}:data/i"
     aged(place)
-    done = json.loads(lab.run(f"store gc --remote {place.address} --forget {name} --json").out)
-    assert done["objects"] == 0 < done["kept_recordings"] and place.names("objects") == before
+    report = json.loads(lab.run(f"store gc --remote {place.address} --forget {name} --json").out)
+    assert report["objects"] == 0 < report["kept_recordings"] and place.names("objects") == before
     for record in place.names("records"):
         place.files.delete(record)
     lab.run(f"store gc --remote {place.address}")

@@ -1,4 +1,4 @@
-"""Networks and servers that fail at each request of a push and of a pull: for a moment, or from then on."""
+"""Test networks and servers that fail at each request of a push and of a pull: for a moment, or from then on."""
 
 import shutil
 import threading
@@ -18,7 +18,7 @@ from tests.stores.places import SECRET, Place
 from tests.stores.proxy import FAULTS, WRONG_ANSWERS, Proxy
 
 EVERY = pytest.mark.parametrize(
-    "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(13, marks=pytest.mark.long)]
+    "stride", [pytest.param(1, marks=pytest.mark.faults), pytest.param(13, marks=pytest.mark.long)]
 )
 LASTING = ("refused", "503", "cut upload", "cut answer")
 
@@ -33,9 +33,9 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
     """A proxy before the server that the environment names."""
-    with proxy.between(localbucket) as found:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", found.endpoint)
-        yield found
+    with proxy.between(localbucket) as running_proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.endpoint)
+        yield running_proxy
 
 
 @pytest.fixture
@@ -96,35 +96,35 @@ def test_a_push_and_a_pull_outlast_faults_and_one_that_cannot_says_so(remotes: R
 
 @EVERY
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_push_outlasts_a_fault_of_any_one_request(remotes: Remotes, fault: str, every: int) -> None:
-    whole = remotes.next()
-    remotes.under(at(0, None), f"store push {whole.address} data/s")
-    requests, wanted = remotes.faulty.requests, whole.whole()
-    assert requests > 15 and len(wanted) == 4 + 5  # objects; records of shards, and of them as a group
-    for step in range(1 + len(fault) % every, requests + 1, every):
+def test_a_push_outlasts_a_fault_of_any_one_request(remotes: Remotes, fault: str, stride: int) -> None:
+    reference = remotes.next()
+    remotes.under(at(0, None), f"store push {reference.address} data/s")
+    requests, expected = remotes.faulty.requests, reference.whole()
+    assert requests > 15 and len(expected) == 4 + 5  # objects; records of shards, and of them as a group
+    for step in range(1 + len(fault) % stride, requests + 1, stride):
         place = remotes.next()
         ran = remotes.under(at(step, fault), f"store push {place.address} data/s")
         assert ran.code == 0, (step, ran.err)
-        assert place.whole() == wanted, step
+        assert place.whole() == expected, step
         count("requests to a store failed")
 
 
 @EVERY
 @pytest.mark.parametrize("fault", LASTING)
 def test_a_push_that_fails_for_good_ends_in_a_sentence_and_its_rerun_gives_the_same_bytes(
-    remotes: Remotes, fault: str, every: int
+    remotes: Remotes, fault: str, stride: int
 ) -> None:
-    whole = remotes.next()
-    remotes.under(at(0, None), f"store push {whole.address} data/s")
-    requests, wanted, failed = remotes.faulty.requests, whole.whole(), 0
-    for step in range(1 + len(fault) % every, requests + 1, every):
+    reference = remotes.next()
+    remotes.under(at(0, None), f"store push {reference.address} data/s")
+    requests, expected, failed = remotes.faulty.requests, reference.whole(), 0
+    for step in range(1 + len(fault) % stride, requests + 1, stride):
         place = remotes.next()
         ran = remotes.under(since(step, fault), f"store push {place.address} data/s")
         assert ran.code in (0, 1) and without_created_store(ran.err).count("\n") == ran.code, (step, ran)
         failed += ran.code
         assert SECRET not in ran.err + ran.out and "Traceback" not in ran.err
         assert remotes.lab.run(f"store push {place.address} data/s").code == 0
-        assert place.whole() == wanted, step
+        assert place.whole() == expected, step
         assert remotes.lab.run(f"store verify --remote {place.address}").out.endswith("all sound\n")
         count("requests to a store failed")
     assert failed > 0
@@ -134,11 +134,11 @@ def test_a_push_that_fails_for_good_ends_in_a_sentence_and_its_rerun_gives_the_s
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("lasting", [False, True])
 def test_a_pull_outlasts_a_fault_or_ends_in_a_sentence_and_its_rerun_gives_the_same_bytes(
-    remotes: Remotes, fault: str, lasting: bool, every: int, monkeypatch: pytest.MonkeyPatch
+    remotes: Remotes, fault: str, lasting: bool, stride: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = remotes.next()
     remotes.lab.run(f"store push {place.address} data/s")
-    wanted = (remotes.lab.folder / "data/s/manifest.json").read_bytes()
+    expected = (remotes.lab.folder / "data/s/manifest.json").read_bytes()
 
     def cloned(number: int) -> Path:
         folder = remotes.lab.folder.with_name(f"{remotes.lab.folder.name}-{number}")
@@ -150,7 +150,7 @@ def test_a_pull_outlasts_a_fault_or_ends_in_a_sentence_and_its_rerun_gives_the_s
     remotes.under(at(0, None), f"store pull {place.address} data/s")
     requests = remotes.faulty.requests
     assert requests > 8
-    for step in range(1 + len(fault) % every, requests + 1, every):
+    for step in range(1 + len(fault) % stride, requests + 1, stride):
         folder = cloned(step)
         fails = since(step, fault) if lasting else at(step, fault)
         ran = remotes.under(fails, f"store pull {place.address} data/s")
@@ -158,7 +158,7 @@ def test_a_pull_outlasts_a_fault_or_ends_in_a_sentence_and_its_rerun_gives_the_s
             assert ran.code == 0, (step, ran.err)
         assert ran.code in (0, 1) and without_created_store(ran.err).count("\n") == ran.code, (step, ran)
         remotes.lab.run(f"store pull {place.address} data/s")
-        assert (folder / "data/s/manifest.json").read_bytes() == wanted
+        assert (folder / "data/s/manifest.json").read_bytes() == expected
         assert repair.verify(Store(folder / ".tacpipe")).clean
         shutil.rmtree(folder)
         count("requests to a store failed")

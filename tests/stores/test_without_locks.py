@@ -1,4 +1,4 @@
-"""Every order in which a push and what happens beside it can meet, in a store that knows no locks."""
+"""Test every order of a push and a concurrent operation in a store without locks."""
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -18,31 +18,31 @@ from tests.stores.stepping import Stepping
 
 Item = TypeVar("Item")
 FOLDERS = ("", "objects", "records", "roots", "snapshots", "leases", "tmp")
-EVERY = pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 7])
+EVERY = pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.faults), 7])
 
 
 @pytest.fixture(autouse=True)
 def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Requests follow each other, so that a step is the same one each time."""
 
-    def each(work: Callable[[Item], object], items: Iterable[Item], at_once: int) -> Iterator[object]:
+    def map_in_order(work: Callable[[Item], object], items: Iterable[Item], at_once: int) -> Iterator[object]:
         return map(work, items)
 
-    monkeypatch.setattr(threads, "map_in_threads", each)
+    monkeypatch.setattr(threads, "map_in_threads", map_in_order)
 
 
-def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **more: Any) -> None:
-    with monkeypatch.context() as there:
-        there.setattr(transfer, "named_store", lambda remote: RemoteStore(files))
-        transfer.push("s3://lab/store", [Path(path)], **more)
+def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **options: Any) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(transfer, "named_store", lambda remote: RemoteStore(files))
+        transfer.push("s3://lab/store", [Path(path)], **options)
 
 
-def expect_whole(files: Bucket, named: set[str]) -> None:
-    """Expect that all is there that the pushed datasets name, and that these are those of ``named``."""
+def expect_whole(files: Bucket, manifests: set[str]) -> None:
+    """Expect all objects that the pushed datasets name, and that these datasets are ``manifests``."""
     store = RemoteStore(files)
-    found = remote_upkeep.verify(store)
-    assert found.clean, found.to_text()
-    assert {root["manifest"] for root in store.roots.all()} == named
+    report = remote_upkeep.verify(store)
+    assert report.clean, report.to_text()
+    assert {root["manifest"] for root in store.roots.all()} == manifests
 
 
 def manifest(lab: Lab, path: str) -> str:
@@ -61,12 +61,12 @@ def abandoned(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
     return files.content()
 
 
-def steps_of(content: dict[str, bytes], work: Callable[[Stepping], object], every: int) -> Iterator[int]:
+def steps_of(content: dict[str, bytes], work: Callable[[Stepping], object], stride: int) -> Iterator[int]:
     files = Stepping(content)
     files.begin(0, lambda: None)
     work(files)
     assert files.steps > 10
-    return iter(range(1, files.steps + 1, every))
+    return iter(range(1, files.steps + 1, stride))
 
 
 def collect(files: Bucket) -> None:
@@ -75,9 +75,9 @@ def collect(files: Bucket) -> None:
 
 @EVERY
 def test_a_collection_at_any_step_of_a_push_takes_nothing_that_it_needs(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int
 ) -> None:
-    for step in steps_of(abandoned, lambda files: push(monkeypatch, files, "data/s"), every):
+    for step in steps_of(abandoned, lambda files: push(monkeypatch, files, "data/s"), stride):
         files = Stepping(abandoned)
         files.begin(step, lambda: collect(files))  # noqa: B023
         push(monkeypatch, files, "data/s")
@@ -88,17 +88,17 @@ def test_a_collection_at_any_step_of_a_push_takes_nothing_that_it_needs(
 @EVERY
 @pytest.mark.parametrize("collections", [1, 2])
 def test_a_push_at_any_step_of_a_collection_finds_or_brings_all_that_it_needs(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int, collections: int
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int, collections: int
 ) -> None:
-    for step in steps_of(abandoned, collect, every):
+    for step in steps_of(abandoned, collect, stride):
         files = Stepping(abandoned)
 
-        def meanwhile(files: Stepping = files) -> None:
+        def push_and_collect(files: Stepping = files) -> None:
             push(monkeypatch, files, "data/s")
             if collections > 1:
                 collect(files)
 
-        files.begin(step, meanwhile)
+        files.begin(step, push_and_collect)
         collect(files)
         expect_whole(files, {manifest(lab, "data/s")})
         count("pushes beside collections, without locks")
@@ -106,18 +106,18 @@ def test_a_push_at_any_step_of_a_collection_finds_or_brings_all_that_it_needs(
 
 @EVERY
 def test_a_collection_that_is_killed_at_any_step_loses_nothing_and_the_next_one_ends_it(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int
 ) -> None:
     def killed() -> None:
         raise KeyboardInterrupt
 
-    for step in steps_of(abandoned, collect, every):
+    for step in steps_of(abandoned, collect, stride):
         files = Stepping(abandoned)
         push(monkeypatch, files, "data/s")
         lab.run("scale data/r -o data/t --factor 5")
         push(monkeypatch, files, "data/t")
-        (other,) = [root for root in RemoteStore(files).roots.all() if root["path"] == "data/t"]
-        RemoteStore(files).roots.remove(other)
+        (root_of_t,) = [root for root in RemoteStore(files).roots.all() if root["path"] == "data/t"]
+        RemoteStore(files).roots.remove(root_of_t)
         files.begin(step, killed)
         with pytest.raises(KeyboardInterrupt):
             collect(files)
@@ -134,15 +134,17 @@ def test_a_collection_that_is_killed_at_any_step_loses_nothing_and_the_next_one_
 
 @EVERY
 def test_a_push_that_is_killed_at_any_step_leaves_what_was_pushed_before_and_its_rerun_gives_the_same_bytes(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int
 ) -> None:
     def killed() -> None:
         raise KeyboardInterrupt
 
-    whole = Stepping({})
-    push(monkeypatch, whole, "data/s")
-    wanted = {name: value for name, value in whole.content().items() if name.startswith(("objects", "records"))}
-    for step in steps_of({}, lambda files: push(monkeypatch, files, "data/s"), every):
+    pushed_bucket = Stepping({})
+    push(monkeypatch, pushed_bucket, "data/s")
+    expected = {
+        name: value for name, value in pushed_bucket.content().items() if name.startswith(("objects", "records"))
+    }
+    for step in steps_of({}, lambda files: push(monkeypatch, files, "data/s"), stride):
         files = Stepping({})
         files.begin(step, killed)
         with pytest.raises(KeyboardInterrupt):
@@ -152,42 +154,42 @@ def test_a_push_that_is_killed_at_any_step_leaves_what_was_pushed_before_and_its
             assert remote_upkeep.verify(RemoteStore(files)).clean
         push(monkeypatch, files, "data/s")
         expect_whole(files, {manifest(lab, "data/s")})
-        assert {name: value for name, value in files.content().items() if name in wanted} == wanted
+        assert {name: value for name, value in files.content().items() if name in expected} == expected
         count("pushes killed, without locks")
 
 
 @EVERY
 def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_silence(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int
 ) -> None:
     base = Stepping({})
     push(monkeypatch, base, "data/r")
     lab.run("label data/r trial-000 --label material=foam")
-    one = manifest(lab, "data/r")
+    labelled = manifest(lab, "data/r")
     before = (lab.folder / "data/r/manifest.json").read_bytes()
 
-    others: list[str] = []
+    other_manifests: list[str] = []
 
-    def other() -> None:
+    def push_other() -> None:
         lab.run("label data/r trial-000 --label material=cork")
         push(monkeypatch, files, "data/r", replace=True)
-        others.append(manifest(lab, "data/r"))
+        other_manifests.append(manifest(lab, "data/r"))
 
-    for step in steps_of(base.content(), lambda files: push(monkeypatch, files, "data/r", replace=True), every):
+    for step in steps_of(base.content(), lambda files: push(monkeypatch, files, "data/r", replace=True), stride):
         (lab.folder / "data/r/manifest.json").write_bytes(before)
         files = Stepping(base.content())
-        others.clear()
-        files.begin(step, other)
+        other_manifests.clear()
+        files.begin(step, push_other)
         try:
             push(monkeypatch, files, "data/r")
             refused = False
-        except UsageError:  # what the other one pushed was never here
+        except UsageError:  # the push of the other one was never pulled here
             refused = True
         except TacpipeError as error:
             raise AssertionError(str(error)) from error
         (root,) = RemoteStore(files).roots.all()
         history = {root["manifest"], *(entry["manifest"] for entry in root["history"])}
-        assert {*others, *([] if refused else [one])} <= history, (step, refused)
+        assert {*other_manifests, *([] if refused else [labelled])} <= history, (step, refused)
         assert remote_upkeep.verify(RemoteStore(files)).clean
         count("pushes of one name at once")
 
@@ -198,8 +200,8 @@ def test_a_push_whose_announcement_was_removed_says_so(
     files = Stepping(abandoned)
     honest = copying._send
 
-    def send(*given: Any) -> None:
-        honest(*given)
+    def send(*args: Any) -> None:
+        honest(*args)
         for entry in files.list("leases"):
             files.delete(entry.name)
 

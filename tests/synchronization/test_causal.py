@@ -1,4 +1,4 @@
-"""Rows made while samples arrive are those that `synchronize` makes of the whole recording."""
+"""Test that rows made while samples arrive are those that `synchronize` makes of the whole recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROWS: dict[str, dict[str, Any]] = {"uniform": {"rate_hz": 50.0}, "logged": {}, "
 
 
 def streams() -> dict[str, pa.Table]:
-    """A master whose counts wrap around and repeat, and a proximity sensor with stamps that repeat."""
+    """Return a master whose counts wrap around and repeat, and a proximity sensor with stamps that repeat."""
     rng = np.random.default_rng(0)
     t_ns = T0 + np.cumsum(rng.integers(0, 30, 60)) * MS
     counts = np.repeat(np.cumsum(rng.integers(-20_000, 20_000, (30, 3)), axis=0), 2, axis=0) % 65_536
@@ -41,29 +41,29 @@ READINGS = {"xela1": Reading(3, wraps=(0, 1, 2), compared=(0, 1, 2)), "near": Re
 @given(cuts=st.lists(st.integers(0, 900), max_size=20), turned=st.booleans())
 def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int], turned: bool) -> None:
     result = synchronize(synchronize.params(**ROWS[kind], gap_ms=20.0), FakeRecording(STREAMS))
-    wanted = result.streams[""]
+    expected = result.streams[""]
     grid = Grid(READINGS, "xela1", kind, ROWS[kind].get("rate_hz"), dict.fromkeys(READINGS, 20 * MS))
     last = max(int(table["t_ns"][-1].as_py()) for table in STREAMS.values())
     parts, before = [], T0 - 1
     for until_ns in [*sorted(T0 + cut * MS for cut in cuts if T0 + cut * MS < last), last]:
         for name in sorted(STREAMS, reverse=turned):
             t_ns = STREAMS[name]["t_ns"].to_numpy()
-            here = (t_ns > before) & (t_ns <= until_ns)
-            columns = [STREAMS[name].column(index).to_numpy()[here] for index in range(1, STREAMS[name].num_columns)]
-            grid.push(name, t_ns[here], np.column_stack(columns).astype(np.float64))
+            due = (t_ns > before) & (t_ns <= until_ns)
+            columns = [STREAMS[name].column(index).to_numpy()[due] for index in range(1, STREAMS[name].num_columns)]
+            grid.push(name, t_ns[due], np.column_stack(columns).astype(np.float64))
         parts.append(grid.rows(until_ns))
         before = until_ns
-    begun = [part.has_samples for part in parts]
-    t_ns = np.concatenate([part.t_ns[some] for part, some in zip(parts, begun, strict=True)])
-    assert t_ns.tolist() == wanted["t_ns"].to_pylist() and len(t_ns) > 20
+    sampled_masks = [part.has_samples for part in parts]
+    t_ns = np.concatenate([part.t_ns[mask] for part, mask in zip(parts, sampled_masks, strict=True)])
+    assert t_ns.tolist() == expected["t_ns"].to_pylist() and len(t_ns) > 20
     for name, columns in (("xela1", ["taxel01_x", "taxel01_y", "taxel01_z"]), ("near", ["near_m"])):
-        values = np.concatenate([part.values[name][some] for part, some in zip(parts, begun, strict=True)])
-        gap = np.concatenate([part.gap[name][some] for part, some in zip(parts, begun, strict=True)])
-        newest = np.concatenate([part.newest_ns[name][some] for part, some in zip(parts, begun, strict=True)])
+        values = np.concatenate([part.values[name][mask] for part, mask in zip(parts, sampled_masks, strict=True)])
+        gap = np.concatenate([part.gap[name][mask] for part, mask in zip(parts, sampled_masks, strict=True)])
+        newest = np.concatenate([part.newest_ns[name][mask] for part, mask in zip(parts, sampled_masks, strict=True)])
         for index, column in enumerate(columns):
-            assert values[:, index].tolist() == wanted[f"{name}_{column}"].to_pylist()
-        assert gap.tolist() == wanted[f"{name}_gap"].to_pylist()
-        assert (t_ns - newest).tolist() == wanted[f"{name}_dt_ns"].to_pylist()
+            assert values[:, index].tolist() == expected[f"{name}_{column}"].to_pylist()
+        assert gap.tolist() == expected[f"{name}_gap"].to_pylist()
+        assert (t_ns - newest).tolist() == expected[f"{name}_dt_ns"].to_pylist()
     assert not any(grid.late.values())
     assert result.attributes["xela1_wrapped_channels"] == 3
 

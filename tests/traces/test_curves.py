@@ -11,13 +11,13 @@ from tests.viewer import hand
 
 
 def test_channels_of_one_quantity_and_unit_share_a_plot_and_clocks_have_none() -> None:
-    found = curves.of_table("robot", hand.arm())
+    plots = curves.of_table("robot", hand.arm())
 
-    assert [(one.title, one.names) for one in found] == [
+    assert [(plot.title, plot.names) for plot in plots] == [
         ("robot position (m)", ("x", "y", "z")),
         ("robot orientation", ("x", "y", "z", "w")),
     ]
-    np.testing.assert_array_equal(found[0].values[:, 0], hand.arm()["position_x_m"].to_numpy())
+    np.testing.assert_array_equal(plots[0].values[:, 0], hand.arm()["position_x_m"].to_numpy())
 
 
 def test_taxels_labels_masks_and_pictures_are_no_curves() -> None:
@@ -29,30 +29,30 @@ def test_taxels_labels_masks_and_pictures_are_no_curves() -> None:
 def test_readings_within_a_row_become_one_curve_at_their_own_rate() -> None:
     table = schema.stream(np.arange(3) * 22_000, np.arange(44 * 3).reshape(3, 44).T, schema.biotac_fields())
 
-    (found,) = [one for one in curves.of_table("biotac", table) if one.quantity == "vibration"]
+    (vibration,) = [plot for plot in curves.of_table("biotac", table) if plot.quantity == "vibration"]
 
-    assert found.values.shape == (66, 1)
-    np.testing.assert_array_equal(np.diff(found.t_ns), 1000)
-    wanted = np.concatenate([[row[f"pac{n:02d}"] for n in range(1, 23)] for row in table.to_pylist()])
-    np.testing.assert_array_equal(found.values.ravel(), wanted)
+    assert vibration.values.shape == (66, 1)
+    np.testing.assert_array_equal(np.diff(vibration.t_ns), 1000)
+    expected = np.concatenate([[row[f"pac{n:02d}"] for n in range(1, 23)] for row in table.to_pylist()])
+    np.testing.assert_array_equal(vibration.values.ravel(), expected)
 
 
 def test_nulls_are_nan() -> None:
     table = pa.table({"t_ns": [0, 1, 2], "a": pa.array([1, None, 3], pa.int16())})
 
-    (found,) = curves.of_table("s", table)
+    (curve,) = curves.of_table("s", table)
 
-    np.testing.assert_array_equal(found.values.ravel(), [1, np.nan, 3])
+    np.testing.assert_array_equal(curve.values.ravel(), [1, np.nan, 3])
 
 
 def test_a_path_is_in_metres_with_the_orientation_beside_it() -> None:
-    (found,) = paths.of_table("robot", hand.arm())
+    (path,) = paths.of_table("robot", hand.arm())
 
-    assert found.name == "robot" and found.quaternion is not None
-    np.testing.assert_allclose(found.position_m[-1], [0.3999, 0, 0.5])
+    assert path.name == "robot" and path.quaternion is not None
+    np.testing.assert_allclose(path.position_m[-1], [0.3999, 0, 0.5])
     cm = [schema.float_field(f"p_{axis}", "cm", "position", axis) for axis in "xyz"]
-    (other,) = paths.of_table("m", schema.stream(np.arange(2), [[100, 200], [0, 0], [5, 5]], cm))
-    np.testing.assert_allclose(other.position_m, [[1, 0, 0.05], [2, 0, 0.05]])
+    (marker_path,) = paths.of_table("m", schema.stream(np.arange(2), [[100, 200], [0, 0], [5, 5]], cm))
+    np.testing.assert_allclose(marker_path.position_m, [[1, 0, 0.05], [2, 0, 0.05]])
 
 
 def test_two_points_of_one_stream_are_two_paths_and_a_cloud_is_none() -> None:
@@ -61,7 +61,7 @@ def test_two_points_of_one_stream_are_two_paths_and_a_cloud_is_none() -> None:
     ]
     grasp = schema.stream(np.array([0]), np.arange(6.0)[:, None], fields)
 
-    assert [(one.name, one.position_m.tolist()) for one in paths.of_table("grasp", grasp)] == [
+    assert [(path.name, path.position_m.tolist()) for path in paths.of_table("grasp", grasp)] == [
         ("grasp g1", [[0, 1, 2]]),
         ("grasp g2", [[3, 4, 5]]),
     ]

@@ -13,12 +13,12 @@ from tests.viewer import hand
 
 
 def test_colours_rise_in_brightness_with_the_value_and_are_cut_at_the_ends() -> None:
-    found = drawing.coloured(np.linspace(-1, 12, 200), 0.0, 10.0).astype(int)
-    brightness = found @ [0.299, 0.587, 0.114]
+    colours = drawing.coloured(np.linspace(-1, 12, 200), 0.0, 10.0).astype(int)
+    brightness = colours @ [0.299, 0.587, 0.114]
 
     assert (np.diff(brightness) > -1).all() and brightness[-1] > 4 * brightness[0]  # numbers are rounded
-    np.testing.assert_array_equal(found[0], drawing.coloured(np.array(0.0), 0.0, 10.0))
-    np.testing.assert_array_equal(found[-1], drawing.coloured(np.array(10.0), 0.0, 10.0))
+    np.testing.assert_array_equal(colours[0], drawing.coloured(np.array(0.0), 0.0, 10.0))
+    np.testing.assert_array_equal(colours[-1], drawing.coloured(np.array(10.0), 0.0, 10.0))
 
 
 def test_both_signs_differ_and_their_middle_is_the_ground() -> None:
@@ -34,32 +34,32 @@ def test_each_bin_of_the_carpet_has_the_value_farthest_from_rest(seed: int, rows
     t_ns = np.sort(rng.integers(0, 1000, rows))
     values = rng.normal(size=(rows, 2))
 
-    found = taxels.binned(t_ns, values, 0, 1000, bins)
+    carpet = taxels.binned(t_ns, values, 0, 1000, bins)
 
     latest = np.full(2, np.nan)
-    there = np.unique(t_ns * bins // 1000)
-    ends = there[-1] + int(np.median(np.diff(there))) if len(there) > 1 else bins
+    filled_bins = np.unique(t_ns * bins // 1000)
+    ends = filled_bins[-1] + int(np.median(np.diff(filled_bins))) if len(filled_bins) > 1 else bins
     for place in range(bins):
         inside = values[t_ns * bins // 1000 == place]
         if len(inside):
             latest = inside[np.abs(inside).argmax(axis=0), np.arange(2)]
         if place >= ends:  # the stream has ended
             latest = np.full(2, np.nan)
-        np.testing.assert_array_equal(found[place], latest)
+        np.testing.assert_array_equal(carpet[place], latest)
 
 
 def test_the_picture_of_a_notebook_is_svg_of_bounded_size_whatever_the_length() -> None:
     skin = taxels.of_table("xela1", hand.finger(hand.pressed()))
     arm = curves.of_table("<arm>", hand.arm())
-    found = drawing.svg(drawing.rows(arm * 10, skin))
+    picture = drawing.svg(drawing.rows(arm * 10, skin))
 
-    root = ET.fromstring(found)
-    lines = [one for one in root.iter() if one.tag.endswith("polyline")]
-    assert len(found) < 120_000 and len(lines) <= drawing.ROWS * drawing.LINES
-    assert all(len(one.attrib["points"].split()) <= drawing.POINTS for one in lines)
-    texts = [one.text or "" for one in root.iter() if one.tag.endswith("text")]
-    assert "xela1 touch (count)" in texts and any("<arm>" in one for one in texts)
-    assert any("13 more" in one and "3.999 s" in one for one in texts)
+    root = ET.fromstring(picture)
+    lines = [element for element in root.iter() if element.tag.endswith("polyline")]
+    assert len(picture) < 120_000 and len(lines) <= drawing.ROWS * drawing.LINES
+    assert all(len(element.attrib["points"].split()) <= drawing.POINTS for element in lines)
+    texts = [element.text or "" for element in root.iter() if element.tag.endswith("text")]
+    assert "xela1 touch (count)" in texts and any("<arm>" in element for element in texts)
+    assert any("13 more" in element and "3.999 s" in element for element in texts)
 
 
 def test_there_is_no_picture_of_nothing() -> None:

@@ -26,16 +26,16 @@ def predictions(measured: taxels.Taxels, steps: tuple[int, ...], off: float) -> 
 
 def test_a_forecast_stands_at_the_time_that_it_is_of() -> None:
     (measured,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
-    found = forecasts.of_table(predictions(measured, (1, 10), off=4.0), [measured])
+    steps_ahead = forecasts.of_table(predictions(measured, (1, 10), off=4.0), [measured])
 
-    assert [one.step for one in found] == [1, 10]
-    for one in found:
-        rows = np.searchsorted(measured.t_ns, one.predicted.t_ns)
-        assert rows[0] == one.step
-        np.testing.assert_allclose(one.measured.change, measured.change[rows])
-        np.testing.assert_allclose(one.predicted.change, measured.change[rows] + 4)
-        np.testing.assert_allclose(one.error, 4)
-        np.testing.assert_allclose(one.residual.change, 4)
+    assert [forecast.step for forecast in steps_ahead] == [1, 10]
+    for forecast in steps_ahead:
+        rows = np.searchsorted(measured.t_ns, forecast.predicted.t_ns)
+        assert rows[0] == forecast.step
+        np.testing.assert_allclose(forecast.measured.change, measured.change[rows])
+        np.testing.assert_allclose(forecast.predicted.change, measured.change[rows] + 4)
+        np.testing.assert_allclose(forecast.error, 4)
+        np.testing.assert_allclose(forecast.residual.change, 4)
 
 
 def test_a_finger_of_which_a_channel_is_missing_has_no_forecast() -> None:
@@ -50,7 +50,7 @@ def test_the_reading_of_two_fingers_is_compared_electrode_by_electrode() -> None
     table = schema.stream(np.array([5]), np.arange(58)[:, None], biotac_sp.fields())
     values = {name: 1000.0 + place for place, name in enumerate(biotac_sp.value_columns("e_th"))}
 
-    (found,) = forecasts.of_values(values, taxels.of_table("reading", table))
+    (forecast,) = forecasts.of_values(values, taxels.of_table("reading", table))
 
-    assert (found.step, found.measured.finger) == (0, "th")
-    np.testing.assert_array_equal(found.residual.magnitude, [1000.0 + np.arange(24) - (29 + np.arange(24))])
+    assert (forecast.step, forecast.measured.finger) == (0, "th")
+    np.testing.assert_array_equal(forecast.residual.magnitude, [1000.0 + np.arange(24) - (29 + np.arange(24))])

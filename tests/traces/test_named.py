@@ -1,4 +1,4 @@
-"""What a model named a recording, from the rows that `tacpipe evaluate` and `tacpipe predict` write."""
+"""Names that a model gave a recording, from the rows that `tacpipe evaluate` and `tacpipe predict` write."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ EVALUATED = {"material": (3, "label"), "mean_level": (3, "prediction"), "model":
 
 
 def test_an_evaluation_has_its_label_the_model_first_and_other_predictors() -> None:
-    found = of_row(row(recording=("trial-0", ""), **EVALUATED, **SCORES, z01=(1.0, "latent")), {"material": 99})
-    assert found is not None
-    assert (found.key, found.label, found.of_model) == ("material", "3", "10")
-    assert list(found.predicted.items()) == [("model", "10"), ("mean level", "3")]
-    assert found.leading() == {"10": 0.75, "3": 0.25}
+    naming = of_row(row(recording=("trial-0", ""), **EVALUATED, **SCORES, z01=(1.0, "latent")), {"material": 99})
+    assert naming is not None
+    assert (naming.key, naming.label, naming.of_model) == ("material", "3", "10")
+    assert list(naming.predicted.items()) == [("model", "10"), ("mean level", "3")]
+    assert naming.leading() == {"10": 0.75, "3": 0.25}
 
 
 @pytest.mark.parametrize(("attributes", "label"), [({"material": 10}, "10"), ({}, "")])
 def test_a_prediction_is_next_to_the_recordings_own_label(attributes: dict[str, Any], label: str) -> None:
-    found = of_row(row(material=(10, "prediction"), **SCORES), attributes)
-    assert found is not None
-    assert (found.of_model, found.label) == ("10", label)
+    naming = of_row(row(material=(10, "prediction"), **SCORES), attributes)
+    assert naming is not None
+    assert (naming.of_model, naming.label) == ("10", label)
 
 
 def test_values_without_names_are_no_names() -> None:

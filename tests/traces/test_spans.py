@@ -15,9 +15,9 @@ from tests.viewer import hand
 S = 1_000_000_000
 
 
-def seconds(found: list[Span]) -> list[tuple[str, str, float, float]]:
+def seconds(span_list: list[Span]) -> list[tuple[str, str, float, float]]:
     start_ns = hand.START_NS
-    return [(one.lane, one.text, (one.start_ns - start_ns) / S, (one.stop_ns - start_ns) / S) for one in found]
+    return [(span.lane, span.text, (span.start_ns - start_ns) / S, (span.stop_ns - start_ns) / S) for span in span_list]
 
 
 def test_contacts_have_their_number_and_slips_their_name() -> None:
@@ -41,19 +41,19 @@ def test_texts_are_spans_by_themselves_and_null_is_none() -> None:
     values = pa.array(["", "cork", "cork", None, "foam"])
     table = pa.table([pa.array(range(5)), values], schema=pa.schema([pa.field("t_ns", pa.int64()), field]))
 
-    assert [one[1:] for one in spans.of_labels(table)] == [("cork", 1, 3), ("foam", 4, 5)]
+    assert [span[1:] for span in spans.of_labels(table)] == [("cork", 1, 3), ("foam", 4, 5)]
 
 
 @given(st.lists(st.integers(-1, 3), min_size=2, max_size=60))
 def test_spans_are_the_rows_that_hold_their_value(values: list[int]) -> None:
     table = schema.stream(np.arange(len(values)), [values], [schema.label_field("contact")])
-    found = spans.of_labels(table)
+    found_spans = spans.of_labels(table)
 
-    held = {row: one.text for one in found for row in range(one.start_ns, one.stop_ns)}
+    texts_by_row = {row: span.text for span in found_spans for row in range(span.start_ns, span.stop_ns)}
     if set(values) <= {0, 1}:  # a switch
-        assert held == {row: "contact" for row, value in enumerate(values) if value}
+        assert texts_by_row == {row: "contact" for row, value in enumerate(values) if value}
     else:
-        assert held == {row: f"contact {value}" for row, value in enumerate(values) if value >= 0}
+        assert texts_by_row == {row: f"contact {value}" for row, value in enumerate(values) if value >= 0}
 
 
 def test_gaps_are_those_of_the_counter_where_the_device_counts() -> None:
@@ -71,18 +71,18 @@ def test_masks_of_a_synchronized_table_give_the_gaps_of_its_streams() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30), st.integers(1, 10)), max_size=12))
-def test_merged_spans_name_at_each_moment_all_lanes_that_are_there(some: list[tuple[str, int, int]]) -> None:
-    given_spans = [Span(lane, "gap", start, start + length) for lane, start, length in some]
+def test_merged_spans_name_at_each_moment_all_lanes_that_are_there(intervals: list[tuple[str, int, int]]) -> None:
+    given_spans = [Span(lane, "gap", start, start + length) for lane, start, length in intervals]
     merged = spans.merged(given_spans)
 
     for at in range(41):
-        wanted = sorted({one.lane for one in given_spans if one.start_ns <= at < one.stop_ns})
-        found = [one.text.split(", ") for one in merged if one.start_ns <= at < one.stop_ns]
-        assert found == ([wanted] if wanted else [])
+        expected = sorted({span.lane for span in given_spans if span.start_ns <= at < span.stop_ns})
+        lanes = [span.text.split(", ") for span in merged if span.start_ns <= at < span.stop_ns]
+        assert lanes == ([expected] if expected else [])
 
 
 def test_an_event_has_its_moment_stream_and_what_was_lost() -> None:
-    (found,) = spans.events(hand.events())
+    (event,) = spans.events(hand.events())
 
-    assert (found.t_ns, found.stream, found.cause) == (hand.START_NS + 2 * S, "xela1", "cut")
-    assert "1 frames" in found.text and "7 bytes" in found.text
+    assert (event.t_ns, event.stream, event.cause) == (hand.START_NS + 2 * S, "xela1", "cut")
+    assert "1 frames" in event.text and "7 bytes" in event.text

@@ -14,21 +14,21 @@ from tests.viewer import hand
 
 
 def test_the_change_from_rest_is_that_of_each_taxel_and_axis() -> None:
-    (found,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
+    (touch,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
 
-    np.testing.assert_array_equal(found.change, hand.pressed())
-    assert (found.name, found.unit, found.names[0], found.names[-1]) == ("xela1", "count", "taxel01", "taxel16")
-    np.testing.assert_allclose(found.magnitude[-1], np.hypot(30, 100 * np.arange(1, 17)))
+    np.testing.assert_array_equal(touch.change, hand.pressed())
+    assert (touch.name, touch.unit, touch.names[0], touch.names[-1]) == ("xela1", "count", "taxel01", "taxel16")
+    np.testing.assert_allclose(touch.magnitude[-1], np.hypot(30, 100 * np.arange(1, 17)))
 
 
 def test_the_load_is_the_one_that_contacts_are_segmented_by() -> None:
     values = np.random.default_rng(0).integers(0, 4000, (200, 48)).astype(float)
     table = schema.stream(hand.times(hand.SKIN_HZ), values.T, schema.uskin_fields())
 
-    (found,) = taxels.of_table("a", table)
+    (touch,) = taxels.of_table("a", table)
 
-    rest = contact.rest_level(values, hand.times(hand.SKIN_HZ), taxels.REST_S)
-    np.testing.assert_allclose(found.load, contact.load(values, rest))
+    rest_level = contact.rest_level(values, hand.times(hand.SKIN_HZ), taxels.REST_S)
+    np.testing.assert_allclose(touch.load, contact.load(values, rest_level))
 
 
 def test_the_level_of_the_segmentation_comes_before_the_start_of_the_recording() -> None:
@@ -36,18 +36,18 @@ def test_the_level_of_the_segmentation_comes_before_the_start_of_the_recording()
     names = [field.name for field in schema.uskin_fields()]
     marked = with_metadata(table, {name: {"rest": "15000.0"} for name in names})
 
-    (found,) = taxels.of_table("xela1", marked)
+    (touch,) = taxels.of_table("xela1", marked)
 
-    np.testing.assert_array_equal(found.change, hand.pressed() + 1000)
+    np.testing.assert_array_equal(touch.change, hand.pressed() + 1000)
 
 
 def test_axes_that_are_columns_in_another_order_make_the_same_vectors() -> None:
     table = hand.finger(hand.pressed())
     by_axis = sorted(table.column_names[1:], key=lambda name: (name[-1], name))
 
-    (found,) = taxels.of_table("xela1", table.select(["t_ns", *by_axis]))
+    (touch,) = taxels.of_table("xela1", table.select(["t_ns", *by_axis]))
 
-    np.testing.assert_array_equal(found.change, hand.pressed())
+    np.testing.assert_array_equal(touch.change, hand.pressed())
 
 
 def test_two_fingers_of_one_reading_are_apart_and_keep_their_counts() -> None:

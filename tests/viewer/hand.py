@@ -58,7 +58,9 @@ def events() -> pa.Table:
     return pa.table({**rows, "detail": [""]})
 
 
-def recording(**more: pa.Table) -> FakeRecording:
-    """Return the recording, with ``more`` streams."""
+def recording(**extra_streams: pa.Table) -> FakeRecording:
+    """Return the recording with ``extra_streams``."""
     tables = {"xela1": finger(pressed()), "xela2": finger(0.5 * pressed()), "robot": arm(), "marks": labels()}
-    return FakeRecording({**tables, "events": events(), "camera": camera(), **more}, "trial-000", {"object": "cup"})
+    return FakeRecording(
+        {**tables, "events": events(), "camera": camera(), **extra_streams}, "trial-000", {"object": "cup"}
+    )

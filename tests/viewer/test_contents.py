@@ -1,4 +1,4 @@
-"""What is drawn of a recording, and as a picture."""
+"""Drawn contents of a recording, also as a picture."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ def drawn() -> contents.Contents:
 
 
 def test_a_recording_has_its_fingers_arm_labels_events_and_camera() -> None:
-    found = drawn()
+    drawing_contents = drawn()
 
-    assert [one.name for one in found.taxels] == ["xela1", "xela2"]
-    assert {one.stream for one in found.curves} == {"robot"}
-    assert [(one.lane, one.text) for one in found.spans] == [("contact", "contact 0"), ("slip", "slip")]
-    assert [one.cause for one in found.events] == ["cut"] and found.gaps == []
-    assert [one.name for one in found.paths] == ["robot"]
-    ((frames),) = found.frames
+    assert [item.name for item in drawing_contents.taxels] == ["xela1", "xela2"]
+    assert {item.stream for item in drawing_contents.curves} == {"robot"}
+    assert [(item.lane, item.text) for item in drawing_contents.spans] == [("contact", "contact 0"), ("slip", "slip")]
+    assert [item.cause for item in drawing_contents.events] == ["cut"] and drawing_contents.gaps == []
+    assert [item.name for item in drawing_contents.paths] == ["robot"]
+    ((frames),) = drawing_contents.frames
     assert (frames.media_type, frames.content[0]) == ("image/png", hand.PNG)
-    assert found.duration_s == pytest.approx(hand.SECONDS - 1 / hand.ARM_HZ)
+    assert drawing_contents.duration_s == pytest.approx(hand.SECONDS - 1 / hand.ARM_HZ)
 
 
 def test_a_cloud_of_each_stamp_is_one_cloud() -> None:
     points = {f"{axis}_m": np.arange(6.0) for axis in "xyz"}
     table = pa.table({"t_ns": [hand.START_NS] * 2 + [hand.START_NS + 5] * 4, **points})
 
-    found = contents.of(hand.recording(scene=table))  # type: ignore[arg-type]
+    drawn_contents = contents.of(hand.recording(scene=table))  # type: ignore[arg-type]
 
-    assert [(one.t_ns, one.points_m.tolist()) for one in found.clouds] == [
+    assert [(item.t_ns, item.points_m.tolist()) for item in drawn_contents.clouds] == [
         (hand.START_NS, [[0, 0, 0], [1, 1, 1]]),
         (hand.START_NS + 5, [[n, n, n] for n in range(2, 6)]),
     ]
-    assert {one.stream for one in found.curves} == {"robot"}
+    assert {item.stream for item in drawn_contents.curves} == {"robot"}
 
 
 def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,11 +95,11 @@ def test_padding_is_apart_from_the_touch_also_where_neighbours_and_ends_cut_it(u
 
 
 def test_the_first_plot_is_the_touch_of_all_fingers_in_their_unit() -> None:
-    first, *rest = figure.panels(drawn())
+    first, *other_panels = figure.panels(drawn())
 
     assert first.names == ("xela1", "xela2") and "count" in first.title
     np.testing.assert_allclose(first.values[:, 1], first.values[:, 0] / 2, atol=0.5)
-    assert [one.title for one in rest] == ["robot position (m)", "robot orientation"]
+    assert [panel.title for panel in other_panels] == ["robot position (m)", "robot orientation"]
 
 
 @pytest.mark.parametrize("ending", [".png", ".svg"])
@@ -127,9 +127,9 @@ def test_a_recording_draws_itself_in_a_notebook(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     recording = tacpipe.open("data/r")["trial-000"]
 
-    found = recording._repr_html_()
+    html = recording._repr_html_()
 
-    assert "trial-000" in found and "<svg" in found and "<polyline" in found and len(found) < 120_000
+    assert "trial-000" in html and "<svg" in html and "<polyline" in html and len(html) < 120_000
 
 
 def test_conditions_are_read_as_labels_are_set() -> None:

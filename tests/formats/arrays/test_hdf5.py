@@ -23,7 +23,7 @@ from tests.formats.arrays import files
 NONE = Params()
 
 
-def given(text: str) -> Params:
+def layout_params(text: str) -> Params:
     return Params(json.dumps(tomllib.loads(text)))
 
 
@@ -56,8 +56,8 @@ def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_contr
 def test_what_is_left_out_is_named_with_its_reason(tmp_path: Path) -> None:
     files.robomimic(tmp_path / "lift.hdf5", demos=1)
     (result,) = read(tmp_path).values()
-    said = " ".join(result.notes)
-    assert all(part in said for part in ("obs/agentview_image", "84 x 84 x 3", "next_obs", "model_file", "800"))
+    notes = " ".join(result.notes)
+    assert all(part in notes for part in ("obs/agentview_image", "84 x 84 x 3", "next_obs", "model_file", "800"))
     assert "agentview_image" in str(result.attributes["skipped"])
 
 
@@ -71,7 +71,7 @@ def test_frames_of_aloha_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
     source = "observations/images/cam_high"
     time = { rate_hz = 50 }
     """
-    (result,) = read(tmp_path, given(layout)).values()
+    (result,) = read(tmp_path, layout_params(layout)).values()
     assert result.streams["camera"].column("data").to_pylist() == files.pictures(8)
     assert about(result.streams["camera"], "data") == {"quantity": "image", "encoding": "jpeg"}
     assert about(result.streams["arms"], "qpos_5") == {"quantity": "joint_position", "unit": "rad"}
@@ -83,7 +83,7 @@ def test_decoded_frames_are_named_and_not_read(tmp_path: Path) -> None:
     files.aloha(tmp_path / "episode_0.hdf5", compressed=False)
     layout = '[streams.camera]\nsource = "observations/images/cam_high"\ntime = { rate_hz = 50 }'
     with pytest.raises(TacpipeError, match=r"episode_0\.hdf5: observations/images/cam_high .*48 x 64 x 3"):
-        read(tmp_path, given(layout))
+        read(tmp_path, layout_params(layout))
 
 
 def test_frames_of_their_own_length_are_kept(tmp_path: Path) -> None:
@@ -148,7 +148,9 @@ def test_stamps_of_no_known_unit_are_not_taken_for_seconds(tmp_path: Path) -> No
         file["time"], file["x"] = [0.0, 1.0], [1.0, 2.0]
     with pytest.raises(TacpipeError, match=r"a\.h5 .*rate_hz"):
         read(tmp_path)
-    (result,) = read(tmp_path, given('[streams.x]\nsource = "x"\ntime = { column = "time", unit = "ms" }')).values()
+    (result,) = read(
+        tmp_path, layout_params('[streams.x]\nsource = "x"\ntime = { column = "time", unit = "ms" }')
+    ).values()
     assert result.streams["x"].column("t_ns").to_pylist() == [0, 10**6]
 
 
@@ -264,7 +266,7 @@ def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) ->
 
 def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
     files.lab(tmp_path / "run.h5")
-    (plain,), (laid,) = read(tmp_path).values(), read(tmp_path, given(HDF5.guess(tmp_path))).values()
+    (plain,), (laid,) = read(tmp_path).values(), read(tmp_path, layout_params(HDF5.guess(tmp_path))).values()
     assert plain.streams == laid.streams
     for name, table in plain.streams.items():
         assert table.schema.equals(laid.streams[name].schema, check_metadata=True)
@@ -284,7 +286,8 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
     )
     rows = [",".join(["t_ns", *(f"taxel_{at}" for at in range(4)), "fx"])]
     rows += [
-        f"{t},{','.join(map(str, some))},{value!r}" for t, some, value in zip(t_ns, taxels, force.tolist(), strict=True)
+        f"{t},{','.join(map(str, taxel_values))},{value!r}"
+        for t, taxel_values, value in zip(t_ns, taxels, force.tolist(), strict=True)
     ]
     (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
     with h5py.File(tmp_path / "run.h5", "w") as file:
@@ -299,7 +302,7 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
     text = reading.read_stream_table(
         tmp_path / "run.csv", layout.parse_layout(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0]
     )
-    (result,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
+    (result,) = read(tmp_path, layout_params(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
     assert to_parquet(result.streams["skin"].select(text.column_names)) == to_parquet(text)
 
 

@@ -27,12 +27,12 @@ LAYOUT = '[streams.hand]\nsource = "data"\ntime = { rate_hz = 60 }'
 INGEST = "ingest zarr stores --layout layout.toml -o data/rec"
 
 
-def given(text: str = LAYOUT, *, fill: bool = False) -> ZarrParams:
+def layout_params(text: str = LAYOUT, *, fill: bool = False) -> ZarrParams:
     return ZarrParams(json.dumps(tomllib.loads(text)), fill_missing_chunks=fill)
 
 
 def read(folder: Path, params: ZarrParams | None = None) -> dict[str, RecordingOutput]:
-    params = params or given()
+    params = params or layout_params()
     sources = ZARR.discover(params, folder)
     return {name: container_commands.zarr(params, value.files, value.values) for name, value in sources.items()}
 
@@ -62,7 +62,7 @@ def test_a_rate_names_and_labels_that_the_store_states_count(tmp_path: Path) -> 
     group.create_array("meta/episode_ends", data=np.array([2, 6]))
     group.create_array("meta/score", data=np.array([0.5, 0.25]))
     group["meta"].attrs.update(rate_hz=10, recordings=["cup", "box"], labels={"box": {"material": "cork"}})
-    result = read(tmp_path, given(""))
+    result = read(tmp_path, layout_params(""))
     assert result["box"].streams["data"].column("t_ns").to_pylist() == [row * 10**8 for row in range(4)]
     assert result["box"].streams["data"].column("tactile_3").to_pylist() == [11, 15, 19, 23]
     assert result["box"].attributes["material"] == "cork" and result["box"].attributes["score"] == 0.25
@@ -74,20 +74,20 @@ def test_a_store_without_episodes_is_one_recording(tmp_path: Path) -> None:
     group = files.store(tmp_path / "run.zarr", 3)
     group.create_array("skin/t_ns", data=files.START_NS + np.arange(5) * 10**7)
     group.create_array("skin/force", data=files.values(5, 3))
-    (result,) = read(tmp_path, given("")).values()
+    (result,) = read(tmp_path, layout_params("")).values()
     assert result.streams["skin"].column_names == ["t_ns", "force_x", "force_y", "force_z"]
 
 
 def test_a_lost_chunk_is_not_read_as_zeros(tmp_path: Path) -> None:
     files.replay(tmp_path / "replay.zarr")
     (tmp_path / "replay.zarr" / "data" / "robot0_eef_pos" / "3.0").unlink()
-    sources = ZARR.discover(given(), tmp_path)
+    sources = ZARR.discover(layout_params(), tmp_path)
     first, last = sources["replay-episode_000000"], sources["replay-episode_000002"]
-    assert container_commands.zarr(given(), first.files, first.values).streams["hand"].num_rows == 30
+    assert container_commands.zarr(layout_params(), first.files, first.values).streams["hand"].num_rows == 30
     with pytest.raises(TacpipeError, match=r"replay\.zarr lacks data/robot0_eef_pos/3\.0.*--fill-missing-chunks"):
-        container_commands.zarr(given(), last.files, last.values)
+        container_commands.zarr(layout_params(), last.files, last.values)
     filled = (
-        container_commands.zarr(given(fill=True), last.files, last.values)
+        container_commands.zarr(layout_params(fill=True), last.files, last.values)
         .streams["hand"]
         .column("robot0_eef_pos_x")
         .to_pylist()
@@ -150,9 +150,9 @@ def stores(lab: Lab) -> Lab:
     return lab
 
 
-def counts(lab: Lab, more: str = "") -> tuple[int, int]:
+def counts(lab: Lab, options: str = "") -> tuple[int, int]:
     """Return how many recordings were read, and how many were in the store."""
-    content = json.loads(lab.run(f"{INGEST} --json {more}").out)
+    content = json.loads(lab.run(f"{INGEST} --json {options}").out)
     return content["ran"], content["reused"]
 
 
@@ -191,8 +191,8 @@ def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(
 
 @pytest.mark.long
 def test_workers_leave_nothing_behind_that_python_complains_about(stores: Lab) -> None:
-    done = in_a_process(stores.folder, f"{INGEST} --jobs 2")
-    assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
+    process = in_a_process(stores.folder, f"{INGEST} --jobs 2")
+    assert process.returncode == 0 and "Warning" not in process.stderr, process.stderr
 
 
 def test_a_missing_chunk_ends_with_one_and_the_others_are_read_with_skip_bad(stores: Lab) -> None:

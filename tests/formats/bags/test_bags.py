@@ -424,9 +424,9 @@ def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
     about = yaml.safe_load((bag / "metadata.yaml").read_text())
     about["rosbag2_bagfile_information"]["relative_file_paths"].append("a_1.db3")
     (bag / "metadata.yaml").write_text(yaml.safe_dump(about))
-    together = writers.ros2(tmp_path / "together", full, "sqlite3")
+    joined = writers.ros2(tmp_path / "together", full, "sqlite3")
     assert {name: value.table for name, value in streams(bag).items()} == {
-        name: value.table for name, value in streams(together).items()
+        name: value.table for name, value in streams(joined).items()
     }
 
 
@@ -486,8 +486,8 @@ def test_what_a_database_has_not_moved_from_its_log_is_read_too_and_stays_there(
 
 def test_a_look_has_the_columns_of_the_whole(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
-    looked = {stream.name: stream.table.schema for stream in open_bag(bag).look(None).streams}
-    assert looked == {name: value.table.schema for name, value in streams(bag).items()}
+    schemas = {stream.name: stream.table.schema for stream in open_bag(bag).look(None).streams}
+    assert schemas == {name: value.table.schema for name, value in streams(bag).items()}
 
 
 def test_a_look_that_ended_early_states_no_number_of_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -517,8 +517,8 @@ def test_a_command_names_what_it_left_out_and_keeps_it_in_the_attributes(lab: La
     assert "/joint_states" in ran.err and "foo" in ran.err
     (entry,) = lab.manifest("data/rec").recordings.values()
     assert "/joint_states" in str(entry["attributes"]["skipped"])
-    again = lab.run("ingest rosbag bag -o data/rec --json")
-    assert '"reused": 1' in again.out and "/joint_states" in again.err
+    second_run = lab.run("ingest rosbag bag -o data/rec --json")
+    assert '"reused": 1' in second_run.out and "/joint_states" in second_run.err
 
 
 @pytest.mark.data
@@ -546,8 +546,8 @@ def test_messages_with_texts_of_any_length_are_read_in_their_order(tmp_path: Pat
     rng = np.random.default_rng(3)
     texts = [["x" * int(length) for length in rng.integers(0, 9, 4)] for _ in range(400)]
     sent: list[Sent] = []
-    for number, (message, *others) in enumerate(texts):
-        fields = dict(zip(("name", "file", "function"), others, strict=True))
+    for number, (message, *field_texts) in enumerate(texts):
+        fields = dict(zip(("name", "file", "function"), field_texts, strict=True))
         log = writers.build(TYPES, name, level=number % 50, msg=message, line=number, **fields)
         sent.append(("/rosout", name, START_NS + number, log))
     table = only(writers.ros2(tmp_path / "a", sent))

@@ -181,7 +181,7 @@ def _messages(types: Any, skin: pd.DataFrame, arm: pd.DataFrame) -> list[writers
         header = writers.header(types, int(t_ns))
         message = writers.build(types, "sensor_msgs/msg/JointState", header=header, name=names, position=position)
         sent.append(("/joint_states", "sensor_msgs/msg/JointState", int(t_ns) + 300_000, message))
-    return sorted(sent, key=lambda one: one[2])
+    return sorted(sent, key=lambda entry: entry[2])
 
 
 def _csv(folder: Path, trial: int) -> None:
@@ -339,8 +339,8 @@ def _touch_type() -> tuple[Any, bytes]:
         ("at", kinds.TYPE_MESSAGE, kinds.LABEL_OPTIONAL, ".lab.Touch.Point"),
         ("name", kinds.TYPE_STRING, kinds.LABEL_OPTIONAL, ""),
     ]
-    for number, (name, kind, label, of) in enumerate(fields, 1):
-        message.field.add(name=name, number=number, type=kind, label=label, type_name=of or None)
+    for number, (name, kind, label, type_name) in enumerate(fields, 1):
+        message.field.add(name=name, number=number, type=kind, label=label, type_name=type_name or None)
     stamps = descriptor_pb2.FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamps)
     described = descriptor_pb2.FileDescriptorSet(file=[stamps, file])

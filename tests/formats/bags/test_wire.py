@@ -64,8 +64,8 @@ def _leaves(message: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tu
         yield path, message
 
 
-def _types(found: Any) -> Any:
-    return {name: fields for name, (_, fields) in found.fielddefs.items()}
+def _types(typestore: Any) -> Any:
+    return {name: fields for name, (_, fields) in typestore.fielddefs.items()}
 
 
 @pytest.mark.parametrize("name", TYPES)

@@ -98,9 +98,9 @@ def write_v3(root: Path, files: Sequence[Sequence[int]] = ((0, 1), (2,)), **info
     pq.write_table(pa.Table.from_pylist(rows), path)
 
 
-def _info(root: Path, version: str, **more: Any) -> None:
+def _info(root: Path, version: str, **entries: Any) -> None:
     (root / "meta").mkdir(parents=True, exist_ok=True)
-    output = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "features": dict(FEATURES), **more}
+    output = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "features": dict(FEATURES), **entries}
     (root / "meta" / "info.json").write_text(json.dumps(output))
 
 

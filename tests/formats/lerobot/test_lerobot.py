@@ -27,7 +27,7 @@ NONE = Params()
 EPISODE = "pick-episode_00000{}"
 
 
-def given(text: str) -> Params:
+def layout_params(text: str) -> Params:
     return Params(json.dumps(tomllib.loads(text)))
 
 
@@ -120,7 +120,7 @@ def test_a_layout_renames_and_adds_what_the_dataset_does_not_state(tmp_path: Pat
     files.write_v3(tmp_path / "pick")
     text = '[recordings]\nname = "{recording}"\n[streams.robot]\nsource = "action"\ncolumns = [\n'
     text += '{ match = "action_{n}", name = "joint{n}_target_rad", quantity = "target_joint_position", unit = "rad" }]'
-    result = read(tmp_path, given(text))
+    result = read(tmp_path, layout_params(text))
     assert set(result) == {"episode_000000", "episode_000001", "episode_000002"}
     table = result["episode_000002"].streams["robot"]
     assert about(table, "joint6_target_rad")["quantity"] == "target_joint_position"
@@ -220,8 +220,8 @@ def test_a_wrong_description_is_one_sentence_with_its_entry(
     assert all(part in str(raised.value) for part in parts)
 
 
-def counts(lab: Lab, more: str = "") -> tuple[int, int]:
-    content = json.loads(lab.run(f"ingest lerobot sets -o data/rec --json {more}").out)
+def counts(lab: Lab, options: str = "") -> tuple[int, int]:
+    content = json.loads(lab.run(f"ingest lerobot sets -o data/rec --json {options}").out)
     return content["ran"], content["reused"]
 
 

@@ -36,14 +36,18 @@ def write(folder: Path, trials: int = 3, **options: Any) -> list[pd.DataFrame]:
 
 def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> StreamLayout:
     """Return the stream of a layout with some entries of its own."""
-    return of(extra, columns, files).streams[0]
+    return skin_layout(extra, columns, files).streams[0]
 
 
-def of(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv", rest: str = "") -> Layout:
+def skin_layout(
+    extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv", more_toml: str = ""
+) -> Layout:
     """Return a layout of one stream, ``skin``."""
     columns = columns or (
         '{ match = "taxel{taxel}", quantity = "tactile", unit = "count", type = "uint16" }, '
         '{ match = "fx", name = "force_x_n", quantity = "force", unit = "N", component = "x" }'
     )
     time = "" if "time =" in extra else 'time = { column = "time" }'
-    return layout.parse_layout(f'[streams.skin]\nfiles = "{files}"\n{time}\n{extra}\ncolumns = [{columns}]\n{rest}')
+    return layout.parse_layout(
+        f'[streams.skin]\nfiles = "{files}"\n{time}\n{extra}\ncolumns = [{columns}]\n{more_toml}'
+    )

@@ -131,11 +131,11 @@ def test_axes_of_taxels_are_one_rule_and_lengths_called_x_y_z_are_a_position(tmp
 def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tmp_path: Path) -> None:
     place, turned = (dict.fromkeys(names, (0.5, 0.25)) for names in ("xyz", ("qx", "qy", "qz", "qw")))
     time = {"time": [1.7e9, 1.7e9 + 1]}
-    alone = columns_of(tmp_path, pd.DataFrame({**time, **place}))
-    beside = columns_of(tmp_path, pd.DataFrame({**time, **place, **turned}))
+    position_only = columns_of(tmp_path, pd.DataFrame({**time, **place}))
+    with_quaternion = columns_of(tmp_path, pd.DataFrame({**time, **place, **turned}))
     for part in "xyz":
-        assert 'quantity = "?"' in alone[part]
-        assert 'quantity = "position", unit = "?"' in beside[part]
+        assert 'quantity = "?"' in position_only[part]
+        assert 'quantity = "position", unit = "?"' in with_quaternion[part]
 
 
 def test_a_guess_lists_quantities_and_units_to_choose_from(tmp_path: Path) -> None:
@@ -184,11 +184,11 @@ def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) 
     comments = [
         line for line in guess.guess_layout(tmp_path).splitlines() if line.startswith("#") and "not read" in line
     ]
-    for path, why in (
+    for path, reason in (
         ("trial_0/camera.mp4", "*.csv"),
         ("trial_0/bag.mcap", "tacpipe ingest mcap"),
         ("trial_1/broken.parquet", "is not a Parquet file"),
         ("rig/deep/down/calibration.yaml", "labels"),
     ):
-        assert [line for line in comments if path in line and why in line], comments
+        assert [line for line in comments if path in line and reason in line], comments
     assert not any("skin.csv" in line for line in comments)

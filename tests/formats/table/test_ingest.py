@@ -30,7 +30,7 @@ INGEST = "ingest table own --layout layout.toml -o data/rec"
 
 
 @pytest.fixture
-def own(lab: Lab) -> Lab:
+def trial_lab(lab: Lab) -> Lab:
     """A project with a lab's own folder of three trials, their labels and a layout."""
     labs.write(lab.folder / "own")
     _label(lab, ["cork", "felt", "cork"])
@@ -49,8 +49,8 @@ def counts(ran: Ran) -> tuple[int, int]:
     return content["ran"], content["reused"]
 
 
-def test_a_labs_own_tables_become_recordings_with_labels(own: Lab) -> None:
-    own.run(INGEST)
+def test_a_labs_own_tables_become_recordings_with_labels(trial_lab: Lab) -> None:
+    trial_lab.run(INGEST)
     result = tacpipe.open("data/rec")
     assert [entry.name for entry in result] == ["trial-0", "trial-1", "trial-2"]
     assert [entry.attributes["material"] for entry in result] == ["cork", "felt", "cork"]
@@ -58,36 +58,36 @@ def test_a_labs_own_tables_become_recordings_with_labels(own: Lab) -> None:
     assert result["trial-1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
 
 
-def test_what_did_not_change_is_not_read_again(own: Lab) -> None:
-    assert counts(own.run(f"{INGEST} --json")) == (3, 0)
-    (own.folder / "layout.toml").write_text("# a comment\n" + LAYOUT)
-    assert counts(own.run(f"{INGEST} --json")) == (0, 3)
+def test_what_did_not_change_is_not_read_again(trial_lab: Lab) -> None:
+    assert counts(trial_lab.run(f"{INGEST} --json")) == (3, 0)
+    (trial_lab.folder / "layout.toml").write_text("# a comment\n" + LAYOUT)
+    assert counts(trial_lab.run(f"{INGEST} --json")) == (0, 3)
 
 
-def test_one_changed_line_of_a_shared_table_of_labels_costs_one_recording(own: Lab) -> None:
-    own.run(INGEST)
-    _label(own, ["cork", "foam", "cork"])
-    assert counts(own.run(f"{INGEST} --json")) == (1, 2)
+def test_one_changed_line_of_a_shared_table_of_labels_costs_one_recording(trial_lab: Lab) -> None:
+    trial_lab.run(INGEST)
+    _label(trial_lab, ["cork", "foam", "cork"])
+    assert counts(trial_lab.run(f"{INGEST} --json")) == (1, 2)
     assert [entry.attributes["material"] for entry in tacpipe.open("data/rec")] == ["cork", "foam", "cork"]
 
 
-def test_one_changed_file_costs_one_recording_and_is_not_taken_for_the_same(own: Lab) -> None:
-    own.run(INGEST)
-    labs.frame(seed=7).to_csv(own.folder / "own" / "trial_2" / "skin.csv", index=False)
-    refused = own.call(INGEST)
+def test_one_changed_file_costs_one_recording_and_is_not_taken_for_the_same(trial_lab: Lab) -> None:
+    trial_lab.run(INGEST)
+    labs.frame(seed=7).to_csv(trial_lab.folder / "own" / "trial_2" / "skin.csv", index=False)
+    refused = trial_lab.call(INGEST)
     assert refused.code == 2 and "trial-2" in refused.err
-    assert counts(own.run(f"{INGEST} --replace --json")) == (1, 2)
+    assert counts(trial_lab.run(f"{INGEST} --replace --json")) == (1, 2)
 
 
-def test_a_dry_run_describes_and_writes_nothing(own: Lab) -> None:
-    printed = own.run("ingest table own --layout layout.toml --dry-run").out
+def test_a_dry_run_describes_and_writes_nothing(trial_lab: Lab) -> None:
+    printed = trial_lab.run("ingest table own --layout layout.toml --dry-run").out
     for part in ("3 recordings", "100 Hz", "tactile, count, uint16", "label material: cork, felt"):
         assert part in printed
-    assert not (own.folder / "data").exists()
+    assert not (trial_lab.folder / "data").exists()
 
 
-def test_a_guess_needs_no_layout(own: Lab) -> None:
-    printed = own.run("ingest table own --guess").out
+def test_a_guess_needs_no_layout(trial_lab: Lab) -> None:
+    printed = trial_lab.run("ingest table own --guess").out
     assert 'files = "trial_{trial}/skin.csv"' in printed and 'file = "labels.csv"' in printed
 
 
@@ -112,7 +112,7 @@ columns = [{ match = "fx" }, { match = "taxel{taxel}", type = "uint16" }]
 """
 
 
-def many(lab: Lab, recordings: int, *, mixed: bool) -> dict[str, pd.DataFrame]:
+def write_shared_file(lab: Lab, recordings: int, *, mixed: bool) -> dict[str, pd.DataFrame]:
     """Write one file of many recordings, one after another or with their rows mixed; return these by name."""
     frames = {f"t{number:02d}": labs.frame(20 + number, seed=number) for number in range(recordings)}
     full = pd.concat([frame.assign(trial=name) for name, frame in frames.items()], ignore_index=True)
@@ -136,7 +136,7 @@ def test_a_file_of_many_recordings_is_read_as_often_for_many_as_for_one(
 
     monkeypatch.setattr(text.TextTable, "batches", counted)
     monkeypatch.setattr(text, "BLOCK_BYTES", 1000)
-    frames = many(lab, 5, mixed=mixed)
+    frames = write_shared_file(lab, 5, mixed=mixed)
     lab.run(INGEST)
     assert len(times) == 2  # one pass reads the names of the recordings, one their rows
     result = tacpipe.open("data/rec")
@@ -147,7 +147,7 @@ def test_a_file_of_many_recordings_is_read_as_often_for_many_as_for_one(
 
 
 def test_workers_share_one_cut_of_a_file_and_leave_nothing(lab: Lab) -> None:
-    frames = many(lab, 9, mixed=True)
+    frames = write_shared_file(lab, 9, mixed=True)
     assert counts(lab.run(f"{INGEST} --json --jobs 2")) == (9, 0)
     result = tacpipe.open("data/rec")
     assert {entry.name: entry.table("skin").column("taxel2").to_pylist() for entry in result} == {
@@ -157,7 +157,7 @@ def test_workers_share_one_cut_of_a_file_and_leave_nothing(lab: Lab) -> None:
 
 
 def test_a_wrong_cell_of_one_recording_of_many_is_named_by_its_line(lab: Lab) -> None:
-    many(lab, 3, mixed=False)
+    write_shared_file(lab, 3, mixed=False)
     path = lab.folder / "own" / "all.csv"
     lines = path.read_text().splitlines()
     cells = lines[30].split(",")
@@ -189,33 +189,37 @@ def test_a_wrong_cell_of_one_recording_of_many_is_named_by_its_line(lab: Lab) ->
     ],
 )
 def test_a_mistake_is_one_sentence_with_its_place(
-    own: Lab, change: Callable[[Path], object], code: int, parts: tuple[str, ...]
+    trial_lab: Lab, change: Callable[[Path], object], code: int, parts: tuple[str, ...]
 ) -> None:
-    change(own.folder)
-    ran = own.call(INGEST)
+    change(trial_lab.folder)
+    ran = trial_lab.call(INGEST)
     assert ran.code == code and all(part in ran.err for part in parts), ran.err
-    assert not (own.folder / "data/rec").exists()
+    assert not (trial_lab.folder / "data/rec").exists()
 
 
-def test_files_that_no_recording_is_read_from_are_named_at_each_run(own: Lab) -> None:
-    (own.folder / "own" / "trial_0" / "camera.mp4").write_bytes(b"video")
-    (own.folder / "own" / "trial_1" / "tactile.npz").write_bytes(b"array")
-    (own.folder / "own" / "notes" / "later").mkdir(parents=True)
-    labs.frame().to_csv(own.folder / "own" / "notes" / "later" / "skin.csv", index=False)
-    (own.folder / "own" / ".DS_Store").write_bytes(b"")
+def test_files_that_no_recording_is_read_from_are_named_at_each_run(trial_lab: Lab) -> None:
+    (trial_lab.folder / "own" / "trial_0" / "camera.mp4").write_bytes(b"video")
+    (trial_lab.folder / "own" / "trial_1" / "tactile.npz").write_bytes(b"array")
+    (trial_lab.folder / "own" / "notes" / "later").mkdir(parents=True)
+    labs.frame().to_csv(trial_lab.folder / "own" / "notes" / "later" / "skin.csv", index=False)
+    (trial_lab.folder / "own" / ".DS_Store").write_bytes(b"")
     for _ in range(2):  # the second run has nothing to compute
-        printed = own.run(INGEST).err
+        printed = trial_lab.run(INGEST).err
         notes = [line for line in printed.splitlines() if "not read" in line]
         assert [line.split(" file")[0] for line in notes] == ["tacpipe: 1 .csv", "tacpipe: 1 .mp4", "tacpipe: 1 .npz"]
         assert "notes/later/skin.csv" in notes[0] and "no `files` of the layout matches" in notes[0]
-    assert "camera.mp4" in own.run("ingest table own --layout layout.toml --dry-run").out
+    assert "camera.mp4" in trial_lab.run("ingest table own --layout layout.toml --dry-run").out
     assert "labels.csv" not in printed  # labels are read
 
 
 @pytest.mark.parametrize(("unit", "rate"), [("ms", "100,000 Hz"), ("us", "1e+08 Hz")])
-def test_stamps_in_a_wrong_unit_are_a_warning_with_the_rate_that_they_give(own: Lab, unit: str, rate: str) -> None:
-    assert "Hz" not in own.run(INGEST).err
-    (own.folder / "layout.toml").write_text(LAYOUT.replace('column = "time"', f'column = "time", unit = "{unit}"'))
-    printed = own.run(f"{INGEST} --replace").err
+def test_stamps_in_a_wrong_unit_are_a_warning_with_the_rate_that_they_give(
+    trial_lab: Lab, unit: str, rate: str
+) -> None:
+    assert "Hz" not in trial_lab.run(INGEST).err
+    (trial_lab.folder / "layout.toml").write_text(
+        LAYOUT.replace('column = "time"', f'column = "time", unit = "{unit}"')
+    )
+    printed = trial_lab.run(f"{INGEST} --replace").err
     assert rate in printed and "unit" in printed and "all 3 recordings" in printed
-    assert rate in own.run("ingest table own --layout layout.toml --dry-run").out
+    assert rate in trial_lab.run("ingest table own --layout layout.toml --dry-run").out

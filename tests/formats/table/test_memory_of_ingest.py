@@ -47,7 +47,7 @@ def rows(start: int, values: np.ndarray, recordings: int) -> pa.Table:
     return pa.table({"time": seconds, **({"trial": names} if recordings > 1 else {}), **columns})
 
 
-def written(path: Path, recordings: int = 1) -> None:
+def write_rows(path: Path, recordings: int = 1) -> None:
     values = np.random.default_rng(0).normal(size=BLOCK).round(6)
     output = (rows(start, values, recordings) for start in range(0, ROWS, BLOCK))
     first = next(output)
@@ -75,7 +75,7 @@ def ran(folder: Path, command: str) -> str:
 @pytest.mark.parametrize("name", ["all.csv", "all.parquet"])
 def test_a_file_larger_than_memory_is_described_and_read(tmp_path: Path, name: str) -> None:
     (tmp_path / "own").mkdir()
-    written(tmp_path / "own" / name)
+    write_rows(tmp_path / "own" / name)
     (tmp_path / "layout.toml").write_text(LAYOUT % "")
     assert "[streams.all]" in ran(tmp_path, "ingest table own --guess")
     assert f"{ROWS} rows" in ran(tmp_path, "ingest table own --layout layout.toml --dry-run")
@@ -88,7 +88,7 @@ def test_a_file_larger_than_memory_is_described_and_read(tmp_path: Path, name: s
 @linux
 def test_a_file_of_many_recordings_larger_than_memory_is_read(tmp_path: Path) -> None:
     (tmp_path / "own").mkdir()
-    written(tmp_path / "own" / "all.csv", recordings=4)
+    write_rows(tmp_path / "own" / "all.csv", recordings=4)
     (tmp_path / "layout.toml").write_text(LAYOUT % 'recording = "trial"')
     ran(tmp_path, "ingest table own --layout layout.toml -o rec")
     shards = sorted((tmp_path / "rec").rglob("arm.parquet"))

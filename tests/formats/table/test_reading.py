@@ -23,15 +23,15 @@ from tests.formats.table import labs
 T_NS = labs.START_S * 10**9 + np.arange(50) * 10_000_000
 
 
-def expect(found: pa.Table, frame: pd.DataFrame) -> None:
+def expect(table: pa.Table, frame: pd.DataFrame) -> None:
     """Compare a table that was read with what pandas wrote."""
-    assert found.column("t_ns").to_pylist() == T_NS.tolist()
+    assert table.column("t_ns").to_pylist() == T_NS.tolist()
     for taxel in range(1, 5):
-        column = found.column(f"taxel{taxel}")
+        column = table.column(f"taxel{taxel}")
         assert column.type == pa.uint16() and column.to_pylist() == frame[f"taxel{taxel}"].tolist()
-        assert found.schema.field(f"taxel{taxel}").metadata[b"taxel"] == str(taxel).encode()
-    assert np.array_equal(found.column("force_x_n").to_numpy(), frame["fx"].to_numpy())
-    assert found.schema.field("force_x_n").metadata[b"unit"] == b"N"
+        assert table.schema.field(f"taxel{taxel}").metadata[b"taxel"] == str(taxel).encode()
+    assert np.array_equal(table.column("force_x_n").to_numpy(), frame["fx"].to_numpy())
+    assert table.schema.field("force_x_n").metadata[b"unit"] == b"N"
 
 
 def test_a_csv_that_pandas_wrote_is_read_to_the_bit(tmp_path: Path) -> None:

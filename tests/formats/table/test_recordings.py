@@ -11,7 +11,7 @@ from tests.formats.table import labs
 SKIN = 'columns = [{ match = "x" }]\ntime = { column = "time" }'
 
 
-def made(folder: Path, *paths: str) -> Path:
+def write_files(folder: Path, *paths: str) -> Path:
     """Write files of a row each."""
     for path in paths:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -19,11 +19,11 @@ def made(folder: Path, *paths: str) -> Path:
     return folder
 
 
-def two(skin: str, arm: str, rest: str = "", arm_rest: str = "") -> str:
-    return f'[streams.skin]\nfiles = "{skin}"\n{SKIN}\n[streams.arm]\nfiles = "{arm}"\n{SKIN}\n{arm_rest}\n{rest}'
+def two(skin: str, arm: str, more_toml: str = "", arm_toml: str = "") -> str:
+    return f'[streams.skin]\nfiles = "{skin}"\n{SKIN}\n[streams.arm]\nfiles = "{arm}"\n{SKIN}\n{arm_toml}\n{more_toml}'
 
 
-def found(text: str, folder: Path) -> dict[str, dict[str, str]]:
+def find_sources(text: str, folder: Path) -> dict[str, dict[str, str]]:
     from tacpipe.formats.table import layout
 
     return {
@@ -33,21 +33,21 @@ def found(text: str, folder: Path) -> dict[str, dict[str, str]]:
 
 
 def test_files_with_the_same_placeholders_are_one_recording(tmp_path: Path) -> None:
-    made(tmp_path, "s1/t1/skin.csv", "s1/t1/arm.csv", "s1/t2/skin.csv", "s1/t2/arm.csv", "s1/notes.txt")
-    assert found(two("{subject}/{trial}/skin.csv", "{subject}/{trial}/arm.csv"), tmp_path) == {
+    write_files(tmp_path, "s1/t1/skin.csv", "s1/t1/arm.csv", "s1/t2/skin.csv", "s1/t2/arm.csv", "s1/notes.txt")
+    assert find_sources(two("{subject}/{trial}/skin.csv", "{subject}/{trial}/arm.csv"), tmp_path) == {
         f"s1-t{trial}": {"skin": f"s1/t{trial}/skin.csv", "arm": f"s1/t{trial}/arm.csv"} for trial in (1, 2)
     }
 
 
 def test_a_layout_names_recordings(tmp_path: Path) -> None:
-    made(tmp_path, "skin_07.csv", "arm_07.csv")
+    write_files(tmp_path, "skin_07.csv", "arm_07.csv")
     text = two("skin_{trial}.csv", "arm_{trial}.csv", '[recordings]\nname = "cup-{trial}"')
-    assert list(found(text, tmp_path)) == ["cup-07"]
+    assert list(find_sources(text, tmp_path)) == ["cup-07"]
 
 
 def test_one_file_holds_many_recordings(tmp_path: Path) -> None:
-    made(tmp_path, "all.csv")
-    layout = labs.of('recording = "trial"', '{ match = "x" }', "all.csv")
+    write_files(tmp_path, "all.csv")
+    layout = labs.skin_layout('recording = "trial"', '{ match = "x" }', "all.csv")
     assert [(source.name, source.episode) for source in recordings.find_recordings(layout, tmp_path)] == [
         ("a", "a"),
         ("b", "b"),
@@ -82,11 +82,11 @@ WRONG = {  # files; the layout; what the sentence must name
 def test_files_that_do_not_fit_the_layout_are_refused(tmp_path: Path, case: str) -> None:
     paths, text, parts = WRONG[case]
     with pytest.raises(UsageError) as error:
-        found(text, made(tmp_path, *paths))
+        find_sources(text, write_files(tmp_path, *paths))
     assert all(part in str(error.value) for part in parts), str(error.value)
 
 
 def test_a_recording_without_an_optional_stream_is_read(tmp_path: Path) -> None:
-    made(tmp_path, "skin_1.csv", "arm_1.csv", "skin_2.csv")
-    text = two("skin_{trial}.csv", "arm_{trial}.csv", arm_rest="optional = true")
-    assert [sorted(files) for files in found(text, tmp_path).values()] == [["arm", "skin"], ["skin"]]
+    write_files(tmp_path, "skin_1.csv", "arm_1.csv", "skin_2.csv")
+    text = two("skin_{trial}.csv", "arm_{trial}.csv", arm_toml="optional = true")
+    assert [sorted(files) for files in find_sources(text, tmp_path).values()] == [["arm", "skin"], ["skin"]]

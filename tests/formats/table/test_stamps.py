@@ -36,8 +36,8 @@ def test_more_decimals_than_nanoseconds_are_rounded() -> None:
     st.integers(0, 10**9 - 1),
     st.sampled_from([0, 1, 499_999_999, 500_000_000, 500_000_001, 999_999_999]) | st.integers(0, 10**9 - 1),
 )
-def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: int, beyond: int) -> None:
-    text = f"{whole}.{ns:09d}{beyond:09d}"
+def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(seconds: int, ns: int, beyond: int) -> None:
+    text = f"{seconds}.{ns:09d}{beyond:09d}"
     expected = int((Decimal(text) * 10**9).quantize(Decimal(1), ROUND_HALF_EVEN))
     column = pa.array(["0", text, "1.5"]).cast(stamps.DECIMAL).slice(1, 1)
     if abs(expected) <= YEAR_2262_NS:
@@ -48,8 +48,8 @@ def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: i
 
 
 @given(st.integers(0, 2**33), st.integers(0, 2**20 - 1))
-def test_float_seconds_are_read_as_near_as_the_float_is(whole: int, part: int) -> None:
-    value = whole + part / 2**20  # exact in float64
+def test_float_seconds_are_read_as_near_as_the_float_is(seconds: int, part: int) -> None:
+    value = seconds + part / 2**20  # exact in float64
     (result,) = stamps.nanoseconds(pa.array([value]), Time()).tolist()
     assert abs(result - Decimal(value).scaleb(9)) <= Decimal("0.5")
 

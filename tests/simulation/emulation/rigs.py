@@ -16,25 +16,27 @@ from tacpipe.recording.rig import Rig
 FOLDER = Path(__file__).parents[3] / "rigs"
 ALL_SENSORS = rig.read(FOLDER / "all-sensors.toml")
 FIRST_PAPER = rig.read(FOLDER / "first-paper.toml")
-PATIENCE_S = 300.0  # of a test that waits for what comes at once on an idle machine: only what hangs takes so long
+PATIENCE_S = 300.0  # Longest wait of a test. On an idle machine the result is immediate.
 
 
-def one(sensor: str, transport: str = "serial:/dev/ttyUSB0", options: str = "{}", emulate: str = "{}") -> Rig:
+def one_stream_rig(
+    sensor: str, transport: str = "serial:/dev/ttyUSB0", options: str = "{}", emulate: str = "{}"
+) -> Rig:
     """Return a rig of one stream, ``load``."""
     lines = ["[[stream]]", 'name = "load"', f'sensor = "{sensor}"', f'transport = "{transport}"']
     return rig.parse("\n".join([*lines, f"options = {options}", f"emulate = {emulate}"]))
 
 
-def awaited(found: Callable[[], Any]) -> Any:
-    """Return what ``found`` returns once it is true; fails when that takes too long."""
+def awaited(condition: Callable[[], Any]) -> Any:
+    """Return the first true result of ``condition``; fail if that takes too long."""
     until = time.monotonic() + PATIENCE_S
-    while not (value := found()):
+    while not (value := condition()):
         assert time.monotonic() < until, "what was awaited did not happen"
         time.sleep(0.01)
     return value
 
 
-def in_order(rows: AnyArray, among: AnyArray) -> bool:
-    """Return whether all of ``rows`` are found in ``among``, in this order, perhaps with others between."""
-    left = iter(among)
-    return len(rows) > 0 and all(any(np.array_equal(row, one) for one in left) for row in rows)
+def in_order(rows: AnyArray, sequence: AnyArray) -> bool:
+    """Return whether all of ``rows`` occur in ``sequence`` in this order, possibly with others in between."""
+    remaining = iter(sequence)
+    return len(rows) > 0 and all(any(np.array_equal(row, candidate) for candidate in remaining) for row in rows)

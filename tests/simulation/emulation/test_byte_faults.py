@@ -1,4 +1,4 @@
-"""Each fault does to the bytes what it says, is told in the ledger, and leaves everything else alone."""
+"""Each fault changes the bytes as described, is noted in the ledger, and leaves all other bytes unchanged."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ SECONDS = 20
 def planned(
     sensor: Sensor, faults: Faults, *, packets: bool = False, seed: int = 5
 ) -> tuple[list[Item], dict[int, bytes]]:
-    """Return what goes out in `SECONDS`, and each frame as it was made."""
+    """Return the items sent in `SECONDS`, and the sound frames by number."""
     source = Source(sensor, WORLD, Timing(sensor.rate_hz))
     plan = Plan(source, Pace(), faults, [seed], packets=packets)
     items: list[Item] = []
     frames: dict[int, bytes] = {}
     for block in range(round(SECONDS * sensor.rate_hz / source.rows)):
         items += plan.next_items()
-        made = one_by_one(sensor, sensor.encode(source.block(block)))
-        frames |= dict(zip(source.numbers(block).tolist(), made, strict=True))
+        sound_frames = one_by_one(sensor, sensor.encode(source.block(block)))
+        frames |= dict(zip(source.numbers(block).tolist(), sound_frames, strict=True))
     return items, frames
 
 
 def framed(sensor: Sensor, items: list[Item]) -> list[bytes]:
-    """Return the frames that the sensor's framer finds in what went out."""
+    """Return the frames that the sensor's framer finds in the sent bytes."""
     framer = sensor.framer()
     chunks = [(item.due_ns, item.data) for item in items if item.data]
     runs, _ = framer.feed(Chunks.of(chunks))
@@ -65,9 +65,9 @@ def test_without_faults_the_frames_go_out_as_they_were_made() -> None:
 
 def test_the_same_seed_harms_the_same_bytes() -> None:
     faults = Faults(noise=2, cut=2, flip=2, burst=2, drop=0.05)
-    once, again = (planned(OptoForce(rate_hz=100), faults)[0] for _ in range(2))
-    assert once == again
-    assert planned(OptoForce(rate_hz=100), faults, seed=6)[0] != once
+    first, second = (planned(OptoForce(rate_hz=100), faults)[0] for _ in range(2))
+    assert first == second
+    assert planned(OptoForce(rate_hz=100), faults, seed=6)[0] != first
 
 
 @pytest.mark.parametrize(
@@ -85,9 +85,9 @@ def test_harmed_frames_are_told_and_no_others_are_harmed(fault: Faults, cause: s
             assert bits.sum() == 1
     if cause == "cut":
         for item in harmed:
-            whole = frames[item.number]
-            assert 0 < len(item.data) < len(whole)
-            assert whole.startswith(item.data) or whole.endswith(item.data)
+            frame = frames[item.number]
+            assert 0 < len(item.data) < len(frame)
+            assert frame.startswith(item.data) or frame.endswith(item.data)
 
 
 def test_a_burst_reaches_over_frames() -> None:
@@ -107,12 +107,12 @@ def test_noise_is_put_between_frames() -> None:
 @pytest.mark.parametrize("sensor", [OptoForce(rate_hz=100), TfMini(), AnySkin()], ids=["sum16", "sum8", "no-sum"])
 def test_what_the_framer_gives_out_is_sound_or_known_to_be_invisible(sensor: Sensor) -> None:
     items, _ = planned(sensor, Faults(noise=1, cut=1, flip=1, burst=0.5, drop=0.01))
-    found = framed(sensor, items)
+    accepted = framed(sensor, items)
     sound = {item.data for item in items if item.cause == ""}
     invisible = [item for item in items if item.invisible]
-    false = [frame for frame in found if frame not in sound]
+    false = [frame for frame in accepted if frame not in sound]
     assert len(false) <= len(invisible)
-    assert len(found) > 0.8 * len(sound)
+    assert len(accepted) > 0.8 * len(sound)
     if isinstance(sensor, OptoForce):
         assert not invisible
 
@@ -165,8 +165,8 @@ def test_a_stall_holds_frames_up_and_loses_none() -> None:
     assert (np.diff(due) > 0.25e9).sum() >= 3
     numbers = [item.number for item in items]
     assert numbers == list(frames)[: len(numbers)]
-    held = of_cause(items, "stall")
-    assert all(item.data == frames[item.number] for item in held)
+    delayed = of_cause(items, "stall")
+    assert all(item.data == frames[item.number] for item in delayed)
 
 
 def test_an_unplugged_device_loses_its_frames_and_comes_back() -> None:
@@ -194,10 +194,10 @@ def test_a_clock_that_is_set_shows_it_from_then_on() -> None:
 
 @given(rate=st.floats(0.1, 50), cuts=st.lists(st.integers(0, 10_000_000_000), max_size=8))
 def test_moments_are_the_same_however_they_are_asked_for(rate: float, cuts: list[int]) -> None:
-    whole = Happening(rate, np.random.default_rng(1)).until(10_000_000_000)
+    expected = Happening(rate, np.random.default_rng(1)).until(10_000_000_000)
     parts = Happening(rate, np.random.default_rng(1))
-    found = [moment for cut in [*sorted(cuts), 10_000_000_000] for moment in parts.until(cut)]
-    assert found == whole
+    moments = [moment for cut in [*sorted(cuts), 10_000_000_000] for moment in parts.until(cut)]
+    assert moments == expected
 
 
 @given(seed=st.integers(0, 50), rate=st.floats(0, 20), drop=st.floats(0, 0.3))
@@ -207,7 +207,7 @@ def test_every_frame_is_told_of_once_whatever_goes_wrong(seed: int, rate: float,
     items, frames = planned(OptoForce(rate_hz=10), faults, seed=seed)
     numbers = [item.number for item in items if item.number >= 0]
     assert len(set(numbers)) == len(numbers)
-    late = set(frames) - set(numbers)  # held up beyond the end
+    late = set(frames) - set(numbers)  # The stall lasts beyond the end.
     assert not late or min(late) > max(frames) - 10 * (SECONDS if rate > 10 else 5)
 
 
@@ -217,7 +217,7 @@ def test_faults_are_read_from_a_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("nois=1", "there is no fault nois"),
         ("noise", "'noise' is not a fault"),
@@ -225,8 +225,8 @@ def test_faults_are_read_from_a_command_line() -> None:
         ("flip=-1", "below 0"),
     ],
 )
-def test_what_is_no_fault_is_refused(text: str, told: str) -> None:
-    with pytest.raises(UsageError, match=told):
+def test_what_is_no_fault_is_refused(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         parse(text)
 
 

@@ -35,24 +35,24 @@ def test_a_rig_is_served_until_it_is_stopped_and_the_ledger_is_left(tmp_path: Pa
         link.read(0.5)
         link.close()
         process.send_signal(signal.SIGINT)
-        told = process.stderr.read()
+        output = process.stderr.read()
         assert process.wait() == 0
-    assert "proximity: generic at serial:" in told
-    assert "robot: nobody listened" in told
+    assert "proximity: generic at serial:" in output
+    assert "robot: nobody listened" in output
     table = pq.read_table(tmp_path / "ledger" / "proximity.parquet")
     assert {"sent_ns", "number", "cause"} <= set(table.column_names)
-    left = json.loads((tmp_path / "ledger" / "proximity.json").read_text())
-    assert left["counts"]["sent"] > 0
-    assert [event["what"] for event in left["events"]] == ["connected"]
+    summary = json.loads((tmp_path / "ledger" / "proximity.json").read_text())
+    assert summary["counts"]["sent"] > 0
+    assert [event["what"] for event in summary["events"]] == ["connected"]
 
 
 def test_an_unknown_fault_is_a_usage_error(tmp_path: Path) -> None:
-    done = subprocess.run(
+    process = subprocess.run(
         [*COMMAND, str(FOLDER / "first-paper.toml"), "-o", str(tmp_path), "--faults", "gremlins=1"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 2
-    assert "there is no fault gremlins" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert process.returncode == 2
+    assert "there is no fault gremlins" in process.stderr
+    assert "Traceback" not in process.stderr

@@ -1,4 +1,4 @@
-"""What a host reads over each kind of link is what the ledger says was sent."""
+"""A host reads over each kind of link the samples that the ledger lists as sent."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tacpipe.simulation.emulation import perfect
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
-from tests.simulation.emulation.rigs import ALL_SENSORS, FIRST_PAPER, PATIENCE_S, awaited, in_order, one
+from tests.simulation.emulation.rigs import ALL_SENSORS, FIRST_PAPER, PATIENCE_S, awaited, in_order, one_stream_rig
 
 pytestmark = pytest.mark.rig
 
@@ -77,14 +77,14 @@ def reading(emulator: Emulator, name: str = "load") -> Iterator[Reader]:
         reader.link.close()
 
 
-def assert_sent(found: Samples, ledger: Ledger) -> None:
-    """Fail unless what was read was sent, in this order."""
+def assert_sent(received: Samples, ledger: Ledger) -> None:
+    """Fail unless the received samples were sent in this order."""
     sent = ledger.samples()
-    for read, known in zip(found.values, sent.values, strict=True):
-        if known.dtype != object:
-            assert in_order(read, known)
-    if found.seq is not None and sent.seq is not None:
-        assert set(found.seq.tolist()) <= set(sent.seq.tolist())
+    for received_block, sent_block in zip(received.values, sent.values, strict=True):
+        if sent_block.dtype != object:
+            assert in_order(received_block, sent_block)
+    if received.seq is not None and sent.seq is not None:
+        assert set(received.seq.tolist()) <= set(sent.seq.tolist())
 
 
 HOST = """
@@ -105,54 +105,54 @@ OVER_LINKS = [name for name in ALL_SENSORS.streams if name not in (*HID, "clouds
 
 @pytest.mark.parametrize("name", OVER_LINKS)
 def test_what_is_read_was_sent(name: str) -> None:
-    alone = Rig({name: ALL_SENSORS.streams[name]}, name)
-    with Emulator(alone) as emulator, reading(emulator, name) as reader:
-        found = reader.read(FRAMES)
-    assert len(found) > 0
-    assert_sent(found, emulator.ledger[name])
+    single_rig = Rig({name: ALL_SENSORS.streams[name]}, name)
+    with Emulator(single_rig) as emulator, reading(emulator, name) as reader:
+        received = reader.read(FRAMES)
+    assert len(received) > 0
+    assert_sent(received, emulator.ledger[name])
 
 
 def test_clouds_come_as_files() -> None:
-    alone = Rig({"clouds": ALL_SENSORS.streams["clouds"]}, "clouds")
-    with Emulator(alone) as emulator, reading(emulator, "clouds") as reader:
-        found = reader.read(2)
+    single_rig = Rig({"clouds": ALL_SENSORS.streams["clouds"]}, "clouds")
+    with Emulator(single_rig) as emulator, reading(emulator, "clouds") as reader:
+        received = reader.read(2)
     sent = emulator.ledger["clouds"].samples()
-    assert len(found) > 2000
-    first = np.flatnonzero((sent.values[0] == found.values[0][0]).all(axis=1))[0]
-    assert np.array_equal(found.values[0], sent.values[0][first : first + len(found)])
+    assert len(received) > 2000
+    first = np.flatnonzero((sent.values[0] == received.values[0][0]).all(axis=1))[0]
+    assert np.array_equal(received.values[0], sent.values[0][first : first + len(received)])
 
 
 def test_a_tap_listens_to_records() -> None:
-    alone = Rig({"tap": ALL_SENSORS.streams["tap"]}, "tap")
-    with Emulator(alone) as emulator, reading(emulator, "tap") as reader:
-        found = reader.read(5)
-    assert set(found.seq.tolist()) <= set(emulator.ledger["tap"].samples().seq.tolist())  # type: ignore[union-attr]
+    single_rig = Rig({"tap": ALL_SENSORS.streams["tap"]}, "tap")
+    with Emulator(single_rig) as emulator, reading(emulator, "tap") as reader:
+        received = reader.read(5)
+    assert set(received.seq.tolist()) <= set(emulator.ledger["tap"].samples().seq.tolist())  # type: ignore[union-attr]
 
 
 def test_the_rig_of_the_first_paper_is_served_as_a_whole() -> None:
-    found = {}
+    received = {}
     with Emulator(FIRST_PAPER) as emulator:
         for name in FIRST_PAPER.streams:
             with reading(emulator, name) as reader:
-                found[name] = reader.read(20)
-    for name, samples in found.items():
+                received[name] = reader.read(20)
+    for name, samples in received.items():
         assert_sent(samples, emulator.ledger[name])
 
 
 def test_a_bus_within_one_process_carries_can_frames() -> None:
-    asked = one("icub-skin", "can:virtual:emulated")
-    with Emulator(asked) as emulator, reading(emulator) as reader:
+    requested_rig = one_stream_rig("icub-skin", "can:virtual:emulated")
+    with Emulator(requested_rig) as emulator, reading(emulator) as reader:
         assert_sent(reader.read(5), emulator.ledger["load"])
 
 
 def test_a_link_of_bytes_shows_faults_as_the_ledger_tells_them() -> None:
     faults = Faults(noise=15, cut=15, flip=15, drop=0.02)
-    with Emulator(one("optoforce"), 1, faults) as emulator, reading(emulator) as reader:
-        found = reader.read(1500)
+    with Emulator(one_stream_rig("optoforce"), 1, faults) as emulator, reading(emulator) as reader:
+        received = reader.read(1500)
     ledger = emulator.ledger["load"]
     assert {"noise", "cut", "flip", "drop", "sent"} <= set(ledger.counts)
     assert reader.losses
-    assert_sent(found, ledger)  # its sum is of 16 bits: no harmed frame gets through here
+    assert_sent(received, ledger)  # The checksum has 16 bits, so no harmed frame gets through here.
     for row, data in ledger.harmed.items():
         entry = ledger.entry(row)
         assert entry.cause in ("noise", "cut", "flip")
@@ -162,10 +162,10 @@ def test_a_link_of_bytes_shows_faults_as_the_ledger_tells_them() -> None:
 
 def test_a_link_of_packets_shows_lost_doubled_and_swapped_ones() -> None:
     faults = Faults(drop=0.05, duplicate=0.05, reorder=0.05)
-    asked = one("ati-netft", "udp:192.168.1.1:49152", "{ rate_hz = 1000 }")
-    with Emulator(asked, 1, faults) as emulator, reading(emulator) as reader:
-        found = reader.read(800)
-    seq = found.seq
+    requested_rig = one_stream_rig("ati-netft", "udp:192.168.1.1:49152", "{ rate_hz = 1000 }")
+    with Emulator(requested_rig, 1, faults) as emulator, reading(emulator) as reader:
+        received = reader.read(800)
+    seq = received.seq
     assert seq is not None
     steps = np.diff(seq)
     assert (steps == 0).any() and (steps < 0).any() and (steps > 1).any()
@@ -187,8 +187,8 @@ def test_an_unplugged_device_is_lost_and_comes_back_under_its_address(name: str)
         emulator.replug(name)
         awaited(lambda: [event for event in emulator.ledger[name].events if event[1] == "replug"])
         with reading(emulator, name) as reader:
-            found = reader.read(10)
-    assert_sent(found, emulator.ledger[name])
+            received = reader.read(10)
+    assert_sent(received, emulator.ledger[name])
 
 
 @contextmanager
@@ -215,7 +215,7 @@ def until_lost(reader: Reader) -> None:
 
 
 def test_faults_unplug_by_themselves() -> None:
-    with Emulator(one("optoforce"), 2, Faults(unplug=3, unplug_s=0.1)) as emulator:
+    with Emulator(one_stream_rig("optoforce"), 2, Faults(unplug=3, unplug_s=0.1)) as emulator:
         reader = awaited(lambda: opened(emulator))
         with pytest.raises(LinkLostError):
             until_lost(reader)
@@ -227,7 +227,7 @@ def test_a_host_at_another_speed_reads_garbage() -> None:
     import serial
 
     with (
-        Emulator(one("optoforce")) as emulator,
+        Emulator(one_stream_rig("optoforce")) as emulator,
         serial.Serial(emulator.rig.streams["load"].address.place, 1_000_000) as port,
     ):
         port.write(next(emulator.rig.streams["load"].sensor.opening({})).send)
@@ -242,23 +242,23 @@ def test_a_host_at_another_speed_reads_garbage() -> None:
 def test_what_a_host_does_not_fetch_is_lost_and_told() -> None:
     import serial
 
-    with Emulator(one("optoforce")) as emulator:
+    with Emulator(one_stream_rig("optoforce")) as emulator:
         ledger = emulator.ledger["load"]
         with serial.Serial(emulator.rig.streams["load"].address.place, 1_000_000) as port:
             port.write(next(emulator.rig.streams["load"].sensor.opening({})).send)
             awaited(lambda: ledger.counts.get("overrun", 0) > 50)
-            kept = port.read(port.in_waiting)
+            received = port.read(port.in_waiting)
     frames = b"".join(ledger.frames())
-    assert kept[: len(kept) - 22] == frames[: len(kept) - 22]  # of a full queue the newest is lost
+    assert received[: len(received) - 22] == frames[: len(received) - 22]  # A full queue drops its newest bytes.
 
 
 def test_a_device_that_is_told_another_rate_keeps_to_it() -> None:
-    asked = one("optoforce", options="{ rate_hz = 100 }")
-    with Emulator(asked) as emulator, reading(emulator) as reader:
+    requested_rig = one_stream_rig("optoforce", options="{ rate_hz = 100 }")
+    with Emulator(requested_rig) as emulator, reading(emulator) as reader:
         reader.read(FRAMES)
         ledger = emulator.ledger["load"]
         link: Any = reader.link
-        faster = next(one("optoforce").streams["load"].sensor.opening({}))
+        faster = next(one_stream_rig("optoforce").streams["load"].sensor.opening({}))
         link.write(faster.send)
         awaited(lambda: len(ledger.sources) > 1)
         reader.read(4 * FRAMES)
@@ -267,75 +267,75 @@ def test_a_device_that_is_told_another_rate_keeps_to_it() -> None:
 
 
 def test_an_arm_sends_to_the_port_that_it_was_told() -> None:
-    with Emulator(one("franka", "tcp+udp:172.16.0.2:1337")) as emulator, reading(emulator) as reader:
-        found = reader.read(200)
+    with Emulator(one_stream_rig("franka", "tcp+udp:172.16.0.2:1337")) as emulator, reading(emulator) as reader:
+        received = reader.read(200)
     ledger = emulator.ledger["load"]
     sent = ledger.samples()
-    assert found.seq is not None and sent.seq is not None
-    rows = np.searchsorted(sent.seq, found.seq)
-    assert np.array_equal(sent.seq[rows], found.seq)
-    assert np.array_equal(sent.values[0][rows], found.values[0])
+    assert received.seq is not None and sent.seq is not None
+    rows = np.searchsorted(sent.seq, received.seq)
+    assert np.array_equal(sent.seq[rows], received.seq)
+    assert np.array_equal(sent.values[0][rows], received.values[0])
 
 
 def test_the_truth_of_two_runs_is_the_same() -> None:
-    asked = one("xela", "ws:127.0.0.1:5000")
+    requested_rig = one_stream_rig("xela", "ws:127.0.0.1:5000")
     with (
-        Emulator(asked, 4) as first,
-        Emulator(asked, 4) as second,
+        Emulator(requested_rig, 4) as first,
+        Emulator(requested_rig, 4) as second,
         reading(first) as reader,
-        reading(second) as other,
+        reading(second) as second_reader,
     ):
         sent = [emulator.ledger["load"] for emulator in (first, second)]
 
         def shared() -> bool:
-            for each in (reader, other):
-                each.take(each.link.read(0.1))
-            found = np.intersect1d(sent[0].column("number"), sent[1].column("number"))
-            return len(found) > 20
+            for client in (reader, second_reader):
+                client.take(client.link.read(0.1))
+            common = np.intersect1d(sent[0].column("number"), sent[1].column("number"))
+            return len(common) > 20
 
         awaited(shared)
     numbers = [ledger.column("number") for ledger in sent]
-    both = np.intersect1d(numbers[0], numbers[1])
-    rows = [np.flatnonzero(np.isin(known, both)) for known in numbers]
-    once, again = (ledger.samples(part) for ledger, part in zip(sent, rows, strict=True))
-    assert np.array_equal(once.values[0], again.values[0])
-    assert np.array_equal(once.t_device_ns, again.t_device_ns)  # type: ignore[arg-type]
+    common = np.intersect1d(numbers[0], numbers[1])
+    rows = [np.flatnonzero(np.isin(sent_numbers, common)) for sent_numbers in numbers]
+    first_samples, second_samples = (ledger.samples(part) for ledger, part in zip(sent, rows, strict=True))
+    assert np.array_equal(first_samples.values[0], second_samples.values[0])
+    assert np.array_equal(first_samples.t_device_ns, second_samples.t_device_ns)  # type: ignore[arg-type]
 
 
 def test_the_rig_file_with_the_made_addresses_is_read_back() -> None:
     with Emulator(FIRST_PAPER) as emulator:
-        found = rig.parse(rig.to_toml(emulator.rig))
-        assert found.streams["proximity"].address == emulator.rig.streams["proximity"].address
-    assert {name: stream.sensor for name, stream in found.streams.items()} == {
+        parsed = rig.parse(rig.to_toml(emulator.rig))
+        assert parsed.streams["proximity"].address == emulator.rig.streams["proximity"].address
+    assert {name: stream.sensor for name, stream in parsed.streams.items()} == {
         name: stream.sensor for name, stream in FIRST_PAPER.streams.items()
     }
-    assert found.master == FIRST_PAPER.master
-    assert found.labels == {**FIRST_PAPER.labels, "simulated": True}
+    assert parsed.master == FIRST_PAPER.master
+    assert parsed.labels == {**FIRST_PAPER.labels, "simulated": True}
 
 
 @pytest.mark.parametrize("keys", ["{ jiter_ms = 1 }", "{ finger = 3 }"])
 def test_a_key_of_emulate_that_is_none_is_refused(keys: str) -> None:
-    with pytest.raises(UsageError, match="emulate"), Emulator(one("optoforce", emulate=keys)):
+    with pytest.raises(UsageError, match="emulate"), Emulator(one_stream_rig("optoforce", emulate=keys)):
         pass
 
 
 def test_a_camera_cannot_be_emulated() -> None:
-    with pytest.raises(DeviceError, match="folder:"), Emulator(one("clouds", "camera:0")):
+    with pytest.raises(DeviceError, match="folder:"), Emulator(one_stream_rig("clouds", "camera:0")):
         pass
 
 
 @pytest.mark.skipif(shutil.which("umockdev-wrapper") is None, reason="umockdev is not installed")
 def test_hid_boards_are_read_by_hidapi(tmp_path: Path) -> None:
-    asked = Rig({name: ALL_SENSORS.streams[name] for name in HID}, HID[0])
-    with Emulator(asked, folder=tmp_path) as emulator:
+    requested_rig = Rig({name: ALL_SENSORS.streams[name] for name in HID}, HID[0])
+    with Emulator(requested_rig, folder=tmp_path) as emulator:
         (tmp_path / "rig.toml").write_text(rig.to_toml(emulator.rig))
-        done = subprocess.run(
+        process = subprocess.run(
             ["umockdev-wrapper", sys.executable, "-c", HOST, str(tmp_path / "rig.toml")],
             env={**os.environ, "UMOCKDEV_DIR": (tmp_path / "hid" / "root").read_text().strip()},
             capture_output=True,
             text=True,
             timeout=60,
         )
-    assert done.returncode == 0, done.stderr
-    reports = np.frombuffer(bytes.fromhex(done.stdout.strip()), np.uint8).reshape(-1, 64)
-    assert_sent(asked.streams["rawhid"].sensor.decode(reports), emulator.ledger["rawhid"])
+    assert process.returncode == 0, process.stderr
+    reports = np.frombuffer(bytes.fromhex(process.stdout.strip()), np.uint8).reshape(-1, 64)
+    assert_sent(requested_rig.streams["rawhid"].sensor.decode(reports), emulator.ledger["rawhid"])

@@ -16,7 +16,7 @@ TAKEN = np.arange(0, 20_000_000_000, 1_000_000)
 def test_frames_are_late_by_the_jitter_and_do_not_drift() -> None:
     late = due_ns(TAKEN, Pace(jitter_ms=0.1), 0, np.random.default_rng(0)) - TAKEN
     assert late.min() >= 0
-    assert 95_000 < late.mean() < 110_000  # those that wait for the one before are a few percent later
+    assert 95_000 < late.mean() < 110_000  # Frames that wait for the previous one are a few percent later.
     assert abs(late[-2000:].mean() - late[:2000].mean()) < 20_000
 
 
@@ -38,8 +38,8 @@ def test_frames_keep_their_order_and_never_go_out_before_they_were_taken(
 def test_a_bridge_sends_what_it_collected_together() -> None:
     due = due_ns(TAKEN, Pace(jitter_ms=0.0, burst_ms=16.0), 0, np.random.default_rng(0))
     assert (due % 16_000_000 == 0).all()
-    _, together = np.unique(due, return_counts=True)
-    assert set(together[1:-1].tolist()) == {16}
+    _, burst_sizes = np.unique(due, return_counts=True)
+    assert set(burst_sizes[1:-1].tolist()) == {16}
 
 
 @pytest.mark.parametrize("keys", [{"jitter_ms": -1.0}, {"burst_ms": -1.0}, {"finger": 3}])

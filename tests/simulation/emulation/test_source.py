@@ -1,4 +1,4 @@
-"""What emulated sensors see: one world for all, the same for the same seed, in units and types of their own."""
+"""Emulated sensors see one world, the same for the same seed, in their own units and types."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def test_the_same_seed_gives_the_same_values_in_whatever_order_blocks_are_asked_
     forward = Source(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
     backward = Source(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
     later = [backward.block(n).values[0] for n in (5, 2, 0)]
-    for n, found in zip((5, 2, 0), later, strict=True):
-        assert np.array_equal(forward.block(n).values[0], found)
-    other = Source(Xela(rate_hz=50), World(3), Timing(50), (4, 1))
-    assert not np.array_equal(other.block(0).values[0], later[-1])
+    for n, backward_block in zip((5, 2, 0), later, strict=True):
+        assert np.array_equal(forward.block(n).values[0], backward_block)
+    other_finger = Source(Xela(rate_hz=50), World(3), Timing(50), (4, 1))
+    assert not np.array_equal(other_finger.block(0).values[0], later[-1])
 
 
 def test_a_uskin_tells_the_force_of_the_contact() -> None:
@@ -48,18 +48,18 @@ def test_a_uskin_tells_the_force_of_the_contact() -> None:
     t_ns = source.timing.taken_ns(np.arange(len(counts)))
     pressed_n = taxels.forces(WORLD.skins[1], counts)[:, :, 2].sum(axis=1)
     true_n = WORLD.contact(t_ns, lambda scene: scene.contact.normal_n[:, 1])
-    held = true_n > 1
-    assert held.mean() > 0.5
+    touching = true_n > 1
+    assert touching.mean() > 0.5
     assert np.corrcoef(pressed_n, true_n)[0, 1] > 0.98
-    assert np.abs(pressed_n - true_n)[held].mean() < 0.25
+    assert np.abs(pressed_n - true_n)[touching].mean() < 0.25
 
 
 def test_the_drift_of_a_uskin_goes_on_from_block_to_block() -> None:
     source = Source(Xela(rate_hz=50), WORLD, Timing(50))
     ends = [source._drifted(n)[[0, -1]] for n in range(40)]
     steps = np.array([after[0] - before[1] for before, after in itertools.pairwise(ends)])
-    within = np.array([end[1] - end[0] for end in ends])
-    assert np.abs(steps).std() < np.abs(within).std()  # one step of 20 ms against those of half a second
+    block_drifts = np.array([end[1] - end[0] for end in ends])
+    assert np.abs(steps).std() < np.abs(block_drifts).std()  # one step of 20 ms against those of half a second
     assert np.abs(ends[-1][1]).mean() > np.abs(ends[0][1]).mean()
 
 
@@ -143,10 +143,10 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
         samples = CloudSource(sensor, Timing(2), (0,)).block(0)
     else:
         samples = Source(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
-    found = perfect.decoded(sensor, sensor.encode(samples))
-    assert len(found) == len(samples)
-    for sent, read in zip(samples.values, found.values, strict=True):
-        if sent.dtype.kind == "f":  # as exact as the wire: float32, or four digits
+    decoded_samples = perfect.decoded(sensor, sensor.encode(samples))
+    assert len(decoded_samples) == len(samples)
+    for sent, read in zip(samples.values, decoded_samples.values, strict=True):
+        if sent.dtype.kind == "f":  # The wire carries float32 values, or four digits.
             assert np.allclose(sent, read, atol=2e-4, rtol=1e-5)
         elif name != "tap":
             assert np.array_equal(sent, read)
@@ -188,13 +188,13 @@ def test_a_biotac_that_slides_sends_the_trials_of_the_simulated_rig_one_after_an
     sensor = BioTac()
     rig_ = Rig(materials=2, arm_every=0)
     source = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
-    other = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
+    second_source = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
     assert np.array_equal(
-        other.block(31).values[0], np.concatenate([source.block(n).values[0] for n in range(32)])[-50:]
+        second_source.block(31).values[0], np.concatenate([source.block(n).values[0] for n in range(32)])[-50:]
     )
-    whole = np.concatenate([source.block(n).values[0] for n in range(45)])
+    counts = np.concatenate([source.block(n).values[0] for n in range(45)])
     trials = [simulate_trial(4, index, rig_).streams["biotac"] for index in (0, 2)]
     rows = np.concatenate([np.column_stack([t.column(f.name).to_numpy() for f in sensor.fields()]) for t in trials])
-    assert np.array_equal(whole[: len(rows)], rows[: len(whole)])
+    assert np.array_equal(counts[: len(rows)], rows[: len(counts)])
     with pytest.raises(UsageError, match="biotac"):
         SlideSource(TfMini(), Timing(100), 4)

@@ -37,7 +37,7 @@ def test_can_frames_go_through_13_bytes_and_text(short: list[tuple[int, bytes]],
     piece = b"".join(joined(*frame) for frame in frames)
     assert split(piece) == frames
     lines = b"".join(line(*frame) for frame in frames).split(b"\r")[:-1]
-    assert b"".join(frame_of(one) for one in lines) == piece
+    assert b"".join(frame_of(text) for text in lines) == piece
 
 
 def test_python_can_reads_the_text() -> None:
@@ -47,9 +47,13 @@ def test_python_can_reads_the_text() -> None:
     port: serial.Serial = bus.serialPortOrig  # type: ignore[attr-defined]
     port.reset_input_buffer()
     port.write(line(0x440, b"\x40\xf0") + line(EXTENDED | 0x12345, b""))
-    found = [bus.recv(1.0), bus.recv(1.0)]
+    messages = [bus.recv(1.0), bus.recv(1.0)]
     bus.shutdown()
-    assert [(one.arbitration_id, one.is_extended_id, bytes(one.data)) for one in found if one is not None] == [
+    assert [
+        (message.arbitration_id, message.is_extended_id, bytes(message.data))
+        for message in messages
+        if message is not None
+    ] == [
         (0x440, False, b"\x40\xf0"),
         (0x12345, True, b""),
     ]
@@ -61,8 +65,8 @@ def test_other_commands_send_nothing(text: bytes) -> None:
 
 
 @given(st.lists(st.integers(0, 50), max_size=8), st.integers(0, 400))
-def test_what_is_taken_is_shared_out_in_order(sizes: list[int], taken: int) -> None:
-    parts = stretched(sizes, taken)
-    assert sum(parts) == min(taken, sum(sizes))
-    begun = [part < size for part, size in zip(parts, sizes, strict=True) if size]
-    assert begun == sorted(begun)
+def test_what_is_taken_is_shared_out_in_order(sizes: list[int], available: int) -> None:
+    parts = stretched(sizes, available)
+    assert sum(parts) == min(available, sum(sizes))
+    incomplete = [part < size for part, size in zip(parts, sizes, strict=True) if size]
+    assert incomplete == sorted(incomplete)

@@ -19,18 +19,18 @@ from tacpipe.arrays import AnyArray
 from tacpipe.recording.rig import Rig
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation.emulator import Emulator
-from tests.simulation.emulation.rigs import in_order, one
+from tests.simulation.emulation.rigs import in_order, one_stream_rig
 
 pytestmark = pytest.mark.rig
 
 FRAMES = 20
 
 
-def read(asked: Rig, client: Callable[[str], list[Any]]) -> tuple[AnyArray, Samples]:
-    """Return what a client that is given the port reads (frame, …), and what was sent."""
-    with Emulator(asked) as emulator:
-        found = client(emulator.rig.streams["load"].address.place)
-    return np.array(found), emulator.ledger["load"].samples()
+def read(requested_rig: Rig, client: Callable[[str], list[Any]]) -> tuple[AnyArray, Samples]:
+    """Return the readings of a client on the emulated port (frame, …), and the samples that were sent."""
+    with Emulator(requested_rig) as emulator:
+        readings = client(emulator.rig.streams["load"].address.place)
+    return np.array(readings), emulator.ledger["load"].samples()
 
 
 @pytest.mark.parametrize(("kind", "axes"), [(OptoForce16, 3), (OptoForce22, 6), (OptoForce34, 12)])
@@ -41,12 +41,12 @@ def test_optoforce_reads_counters_and_first_axis(kind: Any, axes: int) -> None:
         assert all(reading.valid_checksum for reading in readings)
         return [(reading.count, round(reading[2] / (FX_SCALE if axes != 6 else 1))) for reading in readings]
 
-    found, sent = read(one("optoforce", options=f"{{ axes = {axes} }}"), client)
+    received, sent = read(one_stream_rig("optoforce", options=f"{{ axes = {axes} }}"), client)
     assert sent.seq is not None
     first = sent.values[1][:, 0] if axes != 6 else np.zeros(len(sent), int)
     if axes == 6:
-        found[:, 1] = 0  # scaled by the sheet of one specimen
-    assert in_order(found, np.column_stack([sent.seq, first]))
+        received[:, 1] = 0  # scaled by the sheet of one specimen
+    assert in_order(received, np.column_stack([sent.seq, first]))
 
 
 def test_flexitac_reads_the_taxels() -> None:
@@ -54,9 +54,9 @@ def test_flexitac_reads_the_taxels() -> None:
         with FlexiTacSensor(port, baseline=0.0) as sensor:
             return [sensor.read().raw.ravel() for _ in range(FRAMES)]
 
-    found, sent = read(one("flexitac"), client)
-    assert found.max() > 0
-    assert in_order(found[2:], sent.values[0])  # its first ones may begin at a marker within a frame
+    received, sent = read(one_stream_rig("flexitac"), client)
+    assert received.max() > 0
+    assert in_order(received[2:], sent.values[0])  # The first frames may begin at a marker within a frame.
 
 
 def test_anyskin_reads_the_flux() -> None:
@@ -67,8 +67,8 @@ def test_anyskin_reads_the_flux() -> None:
         finally:
             sensor.close()
 
-    found, sent = read(one("anyskin"), client)
-    assert in_order(found[2:].astype(np.float32), sent.values[0])
+    received, sent = read(one_stream_rig("anyskin"), client)
+    assert in_order(received[2:].astype(np.float32), sent.values[0])
 
 
 def test_robotiq_reads_the_taxels_of_both_fingers() -> None:
@@ -81,10 +81,12 @@ def test_robotiq_reads_the_taxels_of_both_fingers() -> None:
         finally:
             sensor.close()
 
-    found, sent = read(one("robotiq"), client)
-    known = {tuple(row) for row in sent.values[0].tolist()}
-    assert {tuple(row) for row in found[2:].tolist()} <= known  # it tells nothing by which to know a frame read twice
-    assert len(found) == FRAMES
+    received, sent = read(one_stream_rig("robotiq"), client)
+    sent_rows = {tuple(row) for row in sent.values[0].tolist()}
+    assert {
+        tuple(row) for row in received[2:].tolist()
+    } <= sent_rows  # Frames have no number, so one that is read twice looks like two.
+    assert len(received) == FRAMES
 
 
 def test_paxini_reads_the_points() -> None:
@@ -93,12 +95,12 @@ def test_paxini_reads_the_points() -> None:
             frames = list(board.stream_auto_push(max_frames=FRAMES))
         return [next(iter(frame.distributed_forces.values())) for frame in frames]
 
-    found, sent = read(one("paxini"), client)
-    assert found.shape[2] == 3
+    received, sent = read(one_stream_rig("paxini"), client)
+    assert received.shape[2] == 3
     _, signed, along = sent.values
     planes = signed[:, 2:].reshape(len(sent), -1, 2).astype(int)
     points = np.concatenate([planes, along[:, 1:, None].astype(int)], axis=2)
-    assert in_order(found, points)
+    assert in_order(received, points)
 
 
 def test_the_modbus_client_polls_the_points() -> None:
@@ -106,5 +108,5 @@ def test_the_modbus_client_polls_the_points() -> None:
         with TactilePressureSDK(port) as sdk:
             return [sdk.pressure.read_fast() for _ in range(FRAMES)]
 
-    found, sent = read(one("modbus-tactile"), client)
-    assert np.array_equal(found, sent.values[0])
+    received, sent = read(one_stream_rig("modbus-tactile"), client)
+    assert np.array_equal(received, sent.values[0])

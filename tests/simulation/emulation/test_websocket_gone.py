@@ -14,7 +14,7 @@ from tacpipe.simulation.emulation import websocket
 class Gone(socket.socket):
     """A connection whose other end was closed."""
 
-    def shutdown(self, how: int) -> None:
+    def shutdown(self, mode: int) -> None:
         """Fail as the kernel does."""
         raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
 
