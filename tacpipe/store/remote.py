@@ -26,7 +26,7 @@ from tacpipe.store import layout, leases
 from tacpipe.store.backend import AT_ONCE, Backend, Entry, read_twice
 from tacpipe.store.leases import LEASE_BYTES, Run
 from tacpipe.store.remote_roots import RemoteRoots
-from tacpipe.store.store import AbsentError, MissingError, Object, read_limit, record_content, sound
+from tacpipe.store.store import AbsentError, MissingError, Object, parse_record, read_limit, record_content
 
 SNAPSHOTS = "snapshots"  # Keys of the records of each manifest, so that a pull reads only these
 _LISTED = 12  # looks that cost as much as a list of 1,000 names, on S3
@@ -324,9 +324,7 @@ class RemoteStore:
         def parse(content: bytes) -> dict[str, Any] | None:
             with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 regular.expect_parsed(key, len(content))
-                record: dict[str, Any] = json.loads(content)
-                if sound(record, key):
-                    return record
+                return parse_record(content, key)
             return None
 
         with contextlib.suppress(FileNotFoundError, regular.IrregularError):
