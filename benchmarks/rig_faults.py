@@ -23,9 +23,9 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tacpipe.simulation.emulation import byte_faults, serving
+from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.byte_faults import Faults, Item
-from tacpipe.simulation.emulation.emulator import UNPACED_HZ, Emulator, pace
+from tacpipe.simulation.emulation.emulator import PACKETS, UNPACED_HZ, Emulator, pace
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.transmission import Plan
 from tacpipe.testing import matching
@@ -67,7 +67,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     stream = emulator.rig_file.streams[name]
     its_pace, rate_hz = pace(emulator.rig_file, name), stream.sensor.rate_hz or UNPACED_HZ
     source = emulator.source(name, its_pace, rate_hz)
-    packets = stream.address.scheme in serving.PACKETS
+    packets = stream.address.scheme in PACKETS
     plan = Plan(source, its_pace, faults, [1], packets=packets)
     ledger, reading = Ledger(name), Reading(stream.sensor)
     ledger.sources.append(source)

@@ -312,7 +312,7 @@ def test_only_drafts_of_our_own_form_are_swept_from_a_dataset(tmp_path: Path) ->
 
 
 def test_an_emulated_port_replaces_and_removes_links_alone(tmp_path: Path) -> None:
-    from tacpipe.simulation.emulation.pty import Pty
+    from tacpipe.simulation.emulation.serial_port import Pty
     from tests.recording.test_reading import SENSOR
 
     for name in ("left", ".left"):

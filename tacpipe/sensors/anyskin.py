@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
-from tacpipe.sensors import number_texts, options, taxels
+from tacpipe.sensors import number_texts, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
@@ -45,17 +45,17 @@ class AnySkin(Sensor):
     baud: int = 115_200  # baud rate of the port; over USB any rate works
 
     def __post_init__(self) -> None:
-        options.within("anyskin", "magnetometers", self.magnetometers, 1, 200)
-        options.known("anyskin", "mode", self.mode, ("binary", "ascii"))
-        options.positive("anyskin", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.within("anyskin", "magnetometers", self.magnetometers, 1, 200)
+        sensor.known("anyskin", "mode", self.mode, ("binary", "ascii"))
+        sensor.positive("anyskin", rate_hz=self.rate_hz, baud=self.baud)
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01_temperature``, ``taxel01_x``, … of each magnetometer: float32, degrees and microteslas."""
         import pyarrow as pa
 
         fields = []
-        flux = taxels.fields(self.magnetometers, pa.float32(), "uT", axes="xyz")
-        for number, name in enumerate(taxels.numbered("taxel", self.magnetometers), start=1):
+        flux = sensor.fields(self.magnetometers, pa.float32(), "uT", axes="xyz")
+        for number, name in enumerate(sensor.numbered("taxel", self.magnetometers), start=1):
             metadata = {"unit": "degC", "quantity": "temperature", "taxel": str(number)}
             fields.append(pa.field(f"{name}_temperature", pa.float32(), metadata=metadata))
             fields += flux[3 * number - 3 : 3 * number]

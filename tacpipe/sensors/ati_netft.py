@@ -16,8 +16,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bytes, Floats
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Framer
-from tacpipe.sensors.packet_framer import PacketFramer
+from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:

@@ -14,8 +14,19 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from tacpipe.arrays import Bools, Bytes
-from tacpipe.sensors.framing import CUT, GARBLED, NOISE, START, UNCONFIRMED, Account, Chunks, Framing, Loss, Run
-from tacpipe.sensors.pending import Pending
+from tacpipe.sensors.framing import (
+    CUT,
+    GARBLED,
+    NOISE,
+    START,
+    UNCONFIRMED,
+    Account,
+    Chunks,
+    Framing,
+    Loss,
+    Pending,
+    Run,
+)
 
 AMBIGUOUS = 64  # frames that are kept while marks repeat in more than one place
 MOST_BYTES = 1 << 23  # looked at in one go, which bounds the memory of a check

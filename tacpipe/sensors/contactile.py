@@ -24,8 +24,8 @@ from tacpipe.sensors import pts
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
+from tacpipe.sensors.pts import FreshFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
-from tacpipe.sensors.stale import FreshFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from tacpipe.arrays import Bytes
-from tacpipe.sensors import options, taxels
+from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Line, Samples, Sensor
@@ -41,14 +41,14 @@ class FlexiTac(Sensor):
     baud: int = 2_000_000  # baud rate of the firmware
 
     def __post_init__(self) -> None:
-        options.positive("flexitac", rows=self.rows, columns=self.columns, rate_hz=self.rate_hz, baud=self.baud)
-        options.within("flexitac", "rows times columns", self.rows * self.columns, 1, MOST_TAXELS)
+        sensor.positive("flexitac", rows=self.rows, columns=self.columns, rate_hz=self.rate_hz, baud=self.baud)
+        sensor.within("flexitac", "rows times columns", self.rows * self.columns, 1, MOST_TAXELS)
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01`` to the last, row by row: uint8 counts of an ADC, up with pressure."""
         import pyarrow as pa
 
-        return taxels.grid(self.rows, self.columns, pa.uint8(), "count")
+        return sensor.grid(self.rows, self.columns, pa.uint8(), "count")
 
     def framer(self) -> Framer:
         """Return a framer that locks once the mark has repeated three times at the frame's size."""

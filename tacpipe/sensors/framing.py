@@ -7,6 +7,7 @@ give packets.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -122,3 +123,84 @@ class Framing:
     def summed(self) -> bool:
         """Return whether a single frame can be recognised."""
         return self.check is not None and not self.weak
+
+
+class Pending:
+    """A stretch of bytes that grows at its end and is cut off at its front. Places are counted within ``data``.
+
+    The chunks at hand are few as long as all is well, so they stand in lists: these are faster than arrays then.
+    """
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.base = 0  # how many bytes were cut off
+        self._ends: list[int] = []  # ends of chunks, counted from the first byte of the link
+        self._stamps: list[int] = []  # (chunk,), arrival
+
+    def append(self, chunks: Chunks) -> None:
+        """Take what came."""
+        end = self.base + len(self.data)
+        if len(chunks.size) == 1:
+            self._ends.append(end + len(chunks.data))
+            self._stamps.append(int(chunks.t_ns[0]))
+        else:
+            self._ends += (end + np.cumsum(chunks.size)).tolist()
+            self._stamps += chunks.t_ns.tolist()
+        self.data = self.data + chunks.data if self.data else chunks.data
+
+    def arrival(self, place: int) -> int:
+        """Return the arrival of the byte at ``place`` in ns."""
+        return self._stamps[bisect_right(self._ends, self.base + place)]
+
+    def arrivals(self, places: Times | range) -> Times:
+        """Return the arrival (byte,) of the bytes at ``places`` (byte,), one or more in rising order."""
+        first = bisect_right(self._ends, self.base + int(places[0]))
+        last = bisect_right(self._ends, self.base + int(places[-1]), first)
+        if first == last:  # all in one chunk
+            arrivals_ns = np.empty(len(places), dtype=np.int64)
+            arrivals_ns.fill(self._stamps[first])
+            return arrivals_ns
+        if isinstance(places, range):
+            places = np.arange(places.start, places.stop, places.step)
+        chunks = np.array(self._ends[first:last]).searchsorted(self.base + places, side="right")
+        return np.array(self._stamps[first : last + 1], dtype=np.int64)[chunks]
+
+    def cut(self, count: int) -> None:
+        """Cut the first ``count`` bytes off."""
+        self.data = self.data[count:]
+        self.base += count
+        removed = bisect_right(self._ends, self.base)
+        del self._ends[:removed], self._stamps[:removed]
+
+
+class PacketFramer:
+    """Takes each packet of a link for a frame: those of a known size whose check is right."""
+
+    def __init__(self, sizes: Sequence[int], check: Callable[[Bytes], Bools] | None = None) -> None:
+        self.sizes, self.check = frozenset(sizes), check
+        self.account = Account()
+
+    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+        """Return the packets that are frames, those of one size together, and the others as losses."""
+        self.account.received += len(chunks.data)
+        runs, losses = [], []
+        starts = np.cumsum(chunks.size) - chunks.size
+        edges = np.flatnonzero(np.diff(chunks.size)) + 1
+        for rows in np.split(np.arange(len(chunks.size)), edges):
+            if not len(rows):
+                continue
+            size, start = int(chunks.size[rows[0]]), int(starts[rows[0]])
+            good = np.full(len(rows), size in self.sizes)
+            frames = np.frombuffer(chunks.data, np.uint8, len(rows) * size, start).reshape(len(rows), size)
+            if good[0] and self.check is not None:
+                good &= self.check(frames)
+            if good.any():
+                runs.append(Run(frames if good.all() else frames[good], chunks.t_ns[rows[good]]))
+            losses += [Loss(int(t_ns), MALFORMED, 1, size) for t_ns in chunks.t_ns[rows[~good]]]
+            self.account.framed += int(good.sum()) * size
+            self.account.lost += int((~good).sum()) * size
+        return runs, losses
+
+    def flush(self) -> tuple[list[Run], list[Loss]]:
+        """Return nothing: a packet is whole or it is none."""
+        return [], []

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.framing import Framer
-from tacpipe.sensors.packet_framer import PacketFramer
+from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.signals import rotations
 

@@ -25,13 +25,11 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Int64s
 from tacpipe.errors import UsageError
-from tacpipe.sensors import layout, options, taxels
+from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.described import Board, DescribedSensor, device_ns
-from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.layout import Clock, Length, Number, Order, Place, Sequence, Sum
-from tacpipe.sensors.packet_framer import PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples
+from tacpipe.sensors.framing import Framer, Framing, PacketFramer
+from tacpipe.sensors.layout import Board, Clock, DescribedSensor, Length, Number, Order, Place, Sequence, Sum, device_ns
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,7 +59,7 @@ class Generic(DescribedSensor):
     baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
-        options.positive("generic", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.positive("generic", rate_hz=self.rate_hz, baud=self.baud)
         for name in ("marker", "tail", "start", "stop"):
             _bytes(name, getattr(self, name))
         if not (self.marker or self.tail or self.packets):
@@ -97,13 +95,13 @@ class Generic(DescribedSensor):
             layout.summed(self.sum, layout.referred(self._places, "sum", self.sum.number), self.size)
         if self.sequence is not None:
             place = layout.referred(self._places, "sequence", self.sequence.number)
-            options.within("generic", "width of the sequence in bits", 8 * place.width, 8, 32)
+            sensor.within("generic", "width of the sequence in bits", 8 * place.width, 8, 32)
             if not (self.sequence.modulus == 0 or 2 <= self.sequence.modulus <= place.range):
                 raise UsageError(
                     f"generic: the sequence has modulus = {self.sequence.modulus}; its number is {place.number.type}, so it "
                     f"must be between 2 and {place.range}, or 0 for that."
                 )
-            options.within("generic", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
+            sensor.within("generic", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
         if self.clock is not None:
             layout.referred(self._places, "clock", self.clock.number, "uif")
         if self.length is not None:
@@ -281,7 +279,7 @@ def _names(number: Number) -> list[tuple[str, dict[str, str]]]:
     """Return name and metadata of each channel that a number is."""
     metadata = {"unit": number.unit, "quantity": number.quantity}
     channels: list[tuple[str, dict[str, str]]] = []
-    names = [number.name] if number.count == 1 else taxels.numbered(number.name, number.count)
+    names = [number.name] if number.count == 1 else sensor.numbered(number.name, number.count)
     for place, name in enumerate(names, start=1):
         mine = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(place)}
         key = "axis" if number.quantity == "tactile" else "component"
@@ -294,3 +292,68 @@ def _bytes(name: str, text: str) -> bytes:
         return bytes.fromhex(text)
     except ValueError:
         raise UsageError(f'generic: {name} is {text!r}; it must be bytes in hexadecimal, such as "AA 55".') from None
+
+
+MARKER = b"\xab\xcd"
+SIZE = 64
+READINGS = 12
+BEHIND = len(MARKER) + 2 * READINGS  # place of the first zero
+FASTEST_HZ = 1000.0  # one report in each 1 ms frame of full-speed USB
+
+
+@dataclass(frozen=True)
+class RawHid(Sensor):
+    """A self-made board on raw HID, as Teensy's RawHID: reports of 64 bytes in the layout of the published example.
+
+    A report is ``AB CD``, twelve analog readings as big-endian uint16, zeros, and in the last two bytes a big-endian packet
+    counter. There is no sum: USB guards each report with a CRC. A board with another layout is described with ``generic``.
+    Source: TeensyRawHid.ino of hidapitester (public domain); 16C0:0486 is the product id of Teensy's RawHID.
+    """
+
+    summary: ClassVar[str] = "Self-made boards on raw HID (Teensy RawHID): twelve analog readings and a counter."
+    links: ClassVar[tuple[str, ...]] = ("hid",)
+    counter: ClassVar[int | None] = 1 << 16
+    usb_ids: ClassVar[tuple[str, ...]] = ("16c0:0486",)
+    usage_page: ClassVar[int | None] = 0xFFAB  # another interface of a Teensy is its console
+
+    rate_hz: float = 1000.0  # reports a second, at most 1000
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= FASTEST_HZ:
+            raise UsageError(
+                f"rawhid: rate_hz is {self.rate_hz:g}; full-speed USB carries more than 0 and at most 1000 reports a second."
+            )
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``analog01`` to ``analog12``, uint16 counts."""
+        import pyarrow as pa
+
+        return [
+            pa.field(f"analog{reading:02d}", pa.uint16(), metadata={"unit": "count", "quantity": "analog"})
+            for reading in range(1, READINGS + 1)
+        ]
+
+    def framer(self) -> Framer:
+        """Return a framer of reports that have their marker and zeros."""
+        return PacketFramer([SIZE], _is_report)
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the readings (frame, 12) and the board's counter."""
+        words = np.ascontiguousarray(frames[:, 2:]).view(">u2")  # (frame, word)
+        return Samples((words[:, :READINGS].astype(np.uint16),), seq=words[:, -1].astype(np.int64))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the reports of these samples."""
+        (readings,) = samples.values
+        assert samples.seq is not None
+        reports = np.zeros((len(readings), SIZE), dtype=np.uint8)
+        reports[:, :2] = np.frombuffer(MARKER, np.uint8)
+        reports[:, 2:BEHIND] = np.ascontiguousarray(readings, ">u2").view(np.uint8)
+        reports[:, -2:] = (samples.seq % (1 << 16)).astype(">u2")[:, None].view(np.uint8)
+        return reports
+
+
+def _is_report(frames: Bytes) -> Bools:
+    marked = (frames[:, :2] == np.frombuffer(MARKER, np.uint8)).all(axis=1)
+    zero: Bools = marked & ~frames[:, BEHIND:-2].any(axis=1)
+    return zero

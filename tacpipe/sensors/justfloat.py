@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Indices
 from tacpipe.errors import UsageError
-from tacpipe.sensors import options, taxels
+from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Line, Samples, Sensor
@@ -49,8 +49,8 @@ class JustFloat(Sensor):
     baud: int = 2_000_000  # baud rate of the port
 
     def __post_init__(self) -> None:
-        options.known("justfloat", "model", self.model, ("any", *FULAI))
-        options.positive("justfloat", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.known("justfloat", "model", self.model, ("any", *FULAI))
+        sensor.positive("justfloat", rate_hz=self.rate_hz, baud=self.baud)
         if self.model != "any":
             if self.channels or self.names:
                 raise UsageError(f"justfloat: the channels of a {self.model} are known; leave out channels and names.")
@@ -65,7 +65,7 @@ class JustFloat(Sensor):
                 f"justfloat: there are {len(self.names)} names for {self.channels} channels; give one a channel."
             )
         if not self.names:
-            options.within("justfloat", "channels", self.channels, 1, MOST_CHANNELS)
+            sensor.within("justfloat", "channels", self.channels, 1, MOST_CHANNELS)
 
     @property
     def floats(self) -> int:
@@ -86,7 +86,7 @@ class JustFloat(Sensor):
             return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]
         return [
             field.with_metadata({**field.metadata, b"quantity": self.quantity.encode()})
-            for field in taxels.fields(len(self.channel_places), pa.float32(), self.unit)
+            for field in sensor.fields(len(self.channel_places), pa.float32(), self.unit)
         ]
 
     def framer(self) -> Framer:

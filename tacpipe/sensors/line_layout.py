@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors import layout, options
+from tacpipe.sensors import layout, sensor
 
 Type = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -106,7 +106,7 @@ def cells(columns: tuple[Column, ...]) -> tuple[Cell, ...]:
             if cell.name in by_name:
                 _refuse(f"two columns are named {cell.name}; names must be unique")
             by_name[cell.name] = cell
-            options.within("lines", "count of columns", len(by_name), 1, MOST_CELLS)
+            sensor.within("lines", "count of columns", len(by_name), 1, MOST_CELLS)
     if not any(not cell.skip for cell in by_name.values()):
         _refuse("no column is a channel; list in columns what stands in a line, in its order")
     return tuple(by_name.values())
@@ -147,7 +147,7 @@ def _braces(pattern: str) -> list[_Braces]:
             continue
         if int(first) > int(last):
             _refuse(f"the braces {{{first}..{last}}} count down; write {{{last}..{first}}}")
-        options.within("lines", "count of columns", int(last) - int(first) + 1, 1, MOST_CELLS)
+        sensor.within("lines", "count of columns", int(last) - int(first) + 1, 1, MOST_CELLS)
         braces.append(_Braces(tuple(map(str, range(int(first), int(last) + 1))), numbered=True))
     return braces
 

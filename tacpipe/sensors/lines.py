@@ -27,9 +27,9 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.errors import UsageError
-from tacpipe.sensors import layout, line_layout, options
-from tacpipe.sensors.described import Board, DescribedSensor, device_ns
+from tacpipe.sensors import layout, line_layout, sensor
 from tacpipe.sensors.framing import Framer
+from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
 from tacpipe.sensors.line_layout import Cell, Clock, Column, Sum
 from tacpipe.sensors.line_layout import Sequence as Counter
 from tacpipe.sensors.line_parser import Parser, Table, sums
@@ -76,7 +76,7 @@ class Lines(DescribedSensor):
     baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
-        options.positive("lines", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.positive("lines", rate_hz=self.rate_hz, baud=self.baud)
         if not self.separator.isascii() or len(self.separator.strip()) > 1 or not self.separator:
             _refuse(f"separator is {self.separator!r}; it must be one character, or a space for spaces of any length")
         if self.separator.strip() and (
@@ -118,7 +118,7 @@ class Lines(DescribedSensor):
                     f"{role} has modulus = {name.modulus}; it must be between 2 and {_range(cell[1])}, or 0 for that"
                 )
         if self.sequence is not None:
-            options.within("lines", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
+            sensor.within("lines", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
         if not self._channels:
             _refuse("no column is a channel; list in columns what the board measures")
         if self.clock is not None:

@@ -14,10 +14,9 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Floats, Int64s, Times
 from tacpipe.sensors import layout
-from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.framing import Chunks, Pending
 from tacpipe.sensors.line_layout import Sum
 from tacpipe.sensors.line_parser import sums
-from tacpipe.sensors.pending import Pending
 
 FEWEST = 5  # lines that a guess takes
 MOST = 1000  # lines that are looked at

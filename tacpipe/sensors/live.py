@@ -21,8 +21,7 @@ from tacpipe.arrays import AnyArray, Bools, Bytes
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.printable import listed, plain
-from tacpipe.sensors.framing import Framer
-from tacpipe.sensors.packet_framer import PacketFramer
+from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Samples, Sensor
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import DeviceError
-from tacpipe.sensors import options, taxels
+from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
 from tacpipe.sensors.framing import Framer, Framing
@@ -54,16 +54,16 @@ class ModbusTactile(Sensor):
     baud: int = 4_000_000  # baud rate of the bus
 
     def __post_init__(self) -> None:
-        options.within("modbus-tactile", "address", self.address, 1, 247)
-        options.within("modbus-tactile", "points", self.points, 1, 2000)
-        options.known("modbus-tactile", "unit", self.unit, ("mN", "count"))
-        options.positive("modbus-tactile", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.within("modbus-tactile", "address", self.address, 1, 247)
+        sensor.within("modbus-tactile", "points", self.points, 1, 2000)
+        sensor.known("modbus-tactile", "unit", self.unit, ("mN", "count"))
+        sensor.positive("modbus-tactile", rate_hz=self.rate_hz, baud=self.baud)
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01`` to the last, uint16, millinewtons or counts."""
         import pyarrow as pa
 
-        return taxels.fields(self.points, pa.uint16(), self.unit)
+        return sensor.fields(self.points, pa.uint16(), self.unit)
 
     @property
     def header(self) -> bytes:

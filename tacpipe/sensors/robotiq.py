@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Indices, Int64s
 from tacpipe.errors import UsageError
-from tacpipe.sensors import options, taxels
+from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
@@ -75,19 +75,19 @@ class Robotiq(Sensor):
     baud: int = 115_200  # baud rate of the port
 
     def __post_init__(self) -> None:
-        options.within("robotiq", "fingers", self.fingers, 1, 2)
+        sensor.within("robotiq", "fingers", self.fingers, 1, 2)
         for part in self.parts:
-            options.known("robotiq", "parts", part, KINDS)
+            sensor.known("robotiq", "parts", part, KINDS)
         if not self.parts or len(set(self.parts)) < len(self.parts):
             raise UsageError(f"robotiq: parts are {self.parts}; name one or more of {', '.join(KINDS)}, each once.")
-        options.within("robotiq", "rate_hz", self.rate_hz, 1000 / 255, 1000)
-        options.within("robotiq", "tick_us", self.tick_us, 0, 1e6)
+        sensor.within("robotiq", "rate_hz", self.rate_hz, 1000 / 255, 1000)
+        sensor.within("robotiq", "tick_us", self.tick_us, 0, 1e6)
         if abs(self.period_ms - 1000 / self.rate_hz) > 1e-6:
             raise UsageError(
                 f"robotiq: rate_hz is {self.rate_hz:g}, a period of {1000 / self.rate_hz:g} ms; it must be one of whole "
                 f"milliseconds, such as {1000 / self.period_ms:g} Hz."
             )
-        options.positive("robotiq", baud=self.baud)
+        sensor.positive("robotiq", baud=self.baud)
 
     @property
     def period_ms(self) -> int:
@@ -249,7 +249,7 @@ def _fields(part: str, finger: int) -> list[pa.Field]:
 
     prefix, number = f"finger{finger}_", str(finger)
     if part == "static":
-        return taxels.grid(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)
+        return sensor.grid(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)
     if part == "timestamp":
         metadata = {"unit": "1", "quantity": "time", "finger": number}
         return [pa.field(f"{prefix}timestamp", pa.uint64(), metadata=metadata)]

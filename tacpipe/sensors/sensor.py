@@ -6,11 +6,12 @@ comment that is its help. Nothing here does input or output: a link carries the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tacpipe.arrays import AnyArray, Int64s, Times
+from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer
 
 if TYPE_CHECKING:
@@ -156,3 +157,60 @@ class Sensor:
     def device(self) -> Device:
         """Return the device's side, for the emulator."""
         return Device()
+
+
+def positive(sensor: str, **values: float) -> None:
+    """Raise `UsageError` for an option of ``sensor`` that is not above 0."""
+    for name, value in values.items():
+        if not 0 < value < float("inf"):
+            raise UsageError(f"{sensor}: {name} is {value:g}; it must be above 0.")
+
+
+def within(sensor: str, name: str, value: float, least: float, most: float) -> None:
+    """Raise `UsageError` for an option of ``sensor`` that is not between ``least`` and ``most``, these included."""
+    if not least <= value <= most:
+        raise UsageError(f"{sensor}: {name} is {value:g}; it must be between {least:g} and {most:g}.")
+
+
+def known(sensor: str, name: str, value: Any, among: Iterable[Any]) -> None:
+    """Raise `UsageError` for an option of ``sensor`` that is none of those ``among`` which it must be."""
+    allowed = list(among)
+    if value not in allowed:
+        raise UsageError(f"{sensor}: {name} is {value!r}; it must be one of {', '.join(map(str, allowed))}.")
+
+
+def numbered(name: str, count: int) -> list[str]:
+    """Return ``name`` with numbers from 1, of two digits at least.
+
+    >>> numbered("taxel", 2)
+    ['taxel01', 'taxel02']
+    """
+    digits = max(2, len(str(count)))
+    return [f"{name}{number:0{digits}d}" for number in range(1, count + 1)]
+
+
+def fields(count: int, kind: pa.DataType, unit: str, axes: str = "", prefix: str = "", **layout: str) -> list[pa.Field]:
+    """Return the fields ``taxel01`` to the last, or ``taxel01_x``, … where a taxel has ``axes``, each of this type.
+
+    ``prefix`` goes before each name, and ``layout`` into the metadata of each, next to ``taxel`` and ``axis``.
+    """
+    import pyarrow as pa
+
+    fields_of_taxels = []
+    for number, name in enumerate(numbered("taxel", count), start=1):
+        metadata = {"unit": unit, "quantity": "tactile", **layout, "taxel": str(number)}
+        fields_of_taxels += [
+            pa.field(f"{prefix}{name}_{axis}", kind, metadata={**metadata, "axis": axis}) for axis in axes
+        ]
+        fields_of_taxels += [] if axes else [pa.field(f"{prefix}{name}", kind, metadata=metadata)]
+    return fields_of_taxels
+
+
+def grid(rows: int, columns: int, kind: pa.DataType, unit: str, prefix: str = "", **layout: str) -> list[pa.Field]:
+    """Return the fields of taxels that stand in rows, row by row, with ``row`` and ``column`` from 1 in the metadata."""
+    return [
+        field.with_metadata(
+            {**field.metadata, b"row": b"%d" % (place // columns + 1), b"column": b"%d" % (place % columns + 1)}
+        )
+        for place, field in enumerate(fields(rows * columns, kind, unit, prefix=prefix, **layout))
+    ]

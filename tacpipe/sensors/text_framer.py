@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tacpipe.arrays import Bools
-from tacpipe.sensors.framing import CUT, GARBLED, MALFORMED, START, Account, Chunks, Loss, Run
-from tacpipe.sensors.pending import Pending
+from tacpipe.sensors.framing import CUT, GARBLED, MALFORMED, START, Account, Chunks, Loss, Pending, Run
 
 FEW = 8  # texts that are looked at one by one
 Check = Callable[[bytes], bool]

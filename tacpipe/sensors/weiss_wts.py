@@ -23,11 +23,10 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Counts, Int64s
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors import taxels
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor, grid
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -78,7 +77,7 @@ class WeissWts(Sensor):
         """Return ``taxel01``, … row by row, uint16 counts."""
         import pyarrow as pa
 
-        return taxels.grid(self.rows, self.columns, pa.uint16(), "count")
+        return grid(self.rows, self.columns, pa.uint16(), "count")
 
     def framer(self) -> Framer:
         """Return a framer of messages with their sum; those that are frames must have all cells of the matrix."""

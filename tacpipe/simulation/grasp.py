@@ -19,7 +19,7 @@ from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
-from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
+from tacpipe.simulation import depth_camera, fingertip_sp, grasp_truth, pinch
 from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, draw_thing, families, perform, read_sensors, sensors
 
 START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
@@ -44,10 +44,10 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
     streams = {"grasp": scene.grasp.table(t_ns)}
     moments_ns: dict[str, int] = {}
     if rig.raw:
-        course = pinch_course.course(t_ns, rng)
+        course = pinch.course(t_ns, rng)
         neighbour = draw_thing(seed, index + 1 + int(rng.integers(1_000)), rig)
-        view = tabletop.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
-        streams |= tabletop.tables(view)
+        view = depth_camera.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
+        streams |= depth_camera.tables(view)
         streams["biotac_sp"] = _readings_over_time(hand, scene, readings, course, rig, rng)
         moments_ns = course.moments_ns
     else:
@@ -83,7 +83,7 @@ def _readings_over_time(
     hand: fingertip_sp.Sensors,
     scene: Scene,
     readings: Readings,
-    course: pinch_course.Course,
+    course: pinch.Course,
     rig: Rig,
     rng: np.random.Generator,
 ) -> pa.Table:

@@ -15,9 +15,9 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.simulation import antipodal, depth_camera, fingertip_sp, household, pinch
+from tacpipe.simulation.bodies import Ellipsoid
 from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.household import Thing
-from tacpipe.simulation.primitives import Ellipsoid
 
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.simulation.bow import Bow
-from tacpipe.simulation.primitives import Box, Ellipsoid, Frustum, Shape
+from tacpipe.simulation.bodies import Bow, Box, Ellipsoid, Frustum, Shape
 
 FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
 MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}

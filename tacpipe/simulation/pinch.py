@@ -5,6 +5,9 @@ the torque of its joints allows, the less the wider the hand is open, or, on sof
 F = min(F_max, k s), with k = 2 E R of a flat punch as wide as the tip (K. L. Johnson, *Contact Mechanics*, Cambridge
 1985, section 3.8) and s by how much fingers close beyond touch. The two forces differ by what the table's friction and
 the arm hold, as in published grasps, where the pressures of the two fingers go their own ways.
+
+The width and depth of a contact follow Hertz, with the equations of chapter 4 of the same book. Arrays of any shape are
+taken together; forces are in newton, lengths in metres, curvatures in 1/m, moduli in pascal.
 """
 
 from __future__ import annotations
@@ -12,12 +15,43 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from tacpipe.arrays import Floats
+from tacpipe.arrays import Floats, Times
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.simulation import hertz
+from tacpipe.simulation import faults
+from tacpipe.simulation.bodies import principal_curvatures
 from tacpipe.simulation.depth_camera import Placed
-from tacpipe.simulation.primitives import principal_curvatures
+
+
+def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:
+    """Return the radius of the sphere that touches a plane as a spherical tip does a surface, metres.
+
+    ``curvatures_1_m`` are the surface's two principal curvatures (..., 2). Each adds to the tip's own; the radius is
+    the geometric mean of both relative ones, equation (4.25) with R_e = (R' R'')^(1/2). For a sphere of radius R it is
+    1 / (1/tip + 1/R). Raises `ValueError` where the surface is hollowed out so much that the tip does not reach its
+    ground.
+    """
+    relative = 1 / tip_m + np.asarray(curvatures_1_m, np.float64)
+    if (relative <= 0).any():
+        raise ValueError(f"A tip of {tip_m} m does not fit into a hollow of {relative.min() - 1 / tip_m:.4g} 1/m.")
+    return np.asarray(1 / np.sqrt(relative.prod(axis=-1)))
+
+
+def effective_modulus_pa(skin_pa: float, compliance_1_pa: float) -> float:
+    """Return E* of a skin on an object, pascal: 1/E* = 1/E_skin + compliance, which is 0 for a rigid object."""
+    return 1 / (1 / skin_pa + compliance_1_pa)
+
+
+def contact_radius_m(force_n: ArrayLike, radius_m: ArrayLike, modulus_pa: float) -> Floats:
+    """Return a = (3 F R / 4 E*)^(1/3), metres, equation (4.22); 0 where there is no force."""
+    return np.asarray(np.cbrt(3 * np.asarray(force_n, np.float64) * np.asarray(radius_m) / (4 * modulus_pa)))
+
+
+def indentation_m(contact_m: ArrayLike, radius_m: ArrayLike) -> Floats:
+    """Return by how much both bodies together give way, a^2 / R, metres, equation (4.23)."""
+    return np.asarray(np.asarray(contact_m, np.float64) ** 2 / np.asarray(radius_m))
+
 
 TIP_M = 0.0067  # radius of a fingertip, an assumption
 SKIN_PA = 1.0e6  # modulus of its skin, an assumption
@@ -113,10 +147,10 @@ def pressed(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
 
     Of the whole indentation the skin takes the share E* / E_skin: both bodies give way in proportion to compliance.
     """
-    radius = hertz.effective_radius_m(TIP_M, situation.curvatures_1_m)
-    modulus = hertz.effective_modulus_pa(SKIN_PA, situation.compliance_1_pa)
-    contact = hertz.contact_radius_m(force_n, radius, modulus)
-    return contact, hertz.indentation_m(contact, radius) * modulus / SKIN_PA
+    radius = effective_radius_m(TIP_M, situation.curvatures_1_m)
+    modulus = effective_modulus_pa(SKIN_PA, situation.compliance_1_pa)
+    contact = contact_radius_m(force_n, radius, modulus)
+    return contact, indentation_m(contact, radius) * modulus / SKIN_PA
 
 
 def centre(situation: Situation, hidden: Unseen) -> Floats:
@@ -131,3 +165,32 @@ def centre(situation: Situation, hidden: Unseen) -> Floats:
     at = np.array(CENTRE_M) + TIP_M * lean
     at[:, 1, 1] += hidden.side_m
     return np.asarray(at)
+
+
+RATE_HZ = 100.0  # rate of readings
+FREE_S, CLOSING_S, HELD_S, RELEASE_S, AFTER_S = (0.8, 1.4), (0.3, 0.6), (0.8, 1.4), 0.2, 0.5
+JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the host
+
+
+@dataclass(frozen=True)
+class Course:
+    """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
+
+    t_ns: Times
+    fraction: Floats
+    moments_ns: dict[str, int]  # contact: first touch; hold: the force is reached; release: it begins to fall
+
+
+def course(start_ns: int, rng: np.random.Generator) -> Course:
+    """Return a course that starts at ``start_ns``; how long each part lasts is random."""
+    free_s, closing_s, held_s = (float(rng.uniform(*limits)) for limits in (FREE_S, CLOSING_S, HELD_S))
+    knots_s = np.cumsum([free_s, closing_s, held_s, RELEASE_S])
+    true_s = np.arange(round((knots_s[-1] + AFTER_S) * RATE_HZ)) / RATE_HZ
+    fraction = np.interp(true_s, knots_s, (0.0, 1.0, 1.0, 0.0))
+    true_ns = np.rint(true_s * 1e9).astype(np.int64)
+    moments = zip(("contact", "hold", "release"), knots_s, strict=False)
+    return Course(
+        start_ns + faults.arrivals(true_ns, JITTER_NS, rng),
+        fraction**2 * (3 - 2 * fraction),  # smooth start and stop
+        {name: start_ns + round(1e9 * float(at_s)) for name, at_s in moments},
+    )

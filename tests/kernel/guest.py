@@ -73,7 +73,7 @@ def reader() -> dict[str, Any]:
     from tacpipe.links import ports
     from tacpipe.links.link import LinkLostError, parse
     from tacpipe.links.opening import open_link
-    from tacpipe.sensors.rawhid import RawHid
+    from tacpipe.sensors.generic import RawHid
 
     with subprocess.Popen(
         [sys.executable, "-B", __file__, "board"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

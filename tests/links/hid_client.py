@@ -13,7 +13,7 @@ from tacpipe.links import ports
 from tacpipe.links.link import LinkLostError, parse
 from tacpipe.links.opening import open_link
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.rawhid import RawHid
+from tacpipe.sensors.generic import RawHid
 
 
 def main(count: int, *, until_lost: bool) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import hid, ports
-from tacpipe.sensors.rawhid import RawHid
+from tacpipe.sensors.generic import RawHid
 
 HERE = Path(__file__).parent
 SYSTEM_PYTHON = "/usr/bin/python3"

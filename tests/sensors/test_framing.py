@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.sensors import checks, framing
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Chunks, Framing, Loss, Run
-from tacpipe.sensors.packet_framer import PacketFramer
+from tacpipe.sensors.framing import Chunks, Framing, Loss, PacketFramer, Run
 from tacpipe.sensors.text_framer import LineFramer
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Chunks, Loss, Run
-from tacpipe.sensors.icub_skin import IcubSkin
-from tacpipe.sensors.scans import CAN, can_frame
+from tacpipe.sensors.icub_skin import CAN, IcubSkin, can_frame
 from tests.sensors import described, made
 
 PATCH = IcubSkin(board=9, triangles=(0, 1, 5))

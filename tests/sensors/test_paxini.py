@@ -12,9 +12,8 @@ from paxini_sdk import protocol, registers, sensor_registry
 from paxini_sdk.boards.high_speed import AutoPushConfig, AutoPushFrame, HighSpeedHandBoard
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.paxini import SLOTS, VARIANTS, Paxini, pushed
-from tacpipe.sensors.paxini_board import REPLY, message, write
-from tacpipe.sensors.paxini_board import read as asked
+from tacpipe.sensors.paxini import REPLY, SLOTS, VARIANTS, Paxini, message, pushed, write
+from tacpipe.sensors.paxini import read as asked
 from tacpipe.sensors.sensor import Samples
 from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
 

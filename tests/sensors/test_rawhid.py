@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors.rawhid import RawHid
+from tacpipe.sensors.generic import RawHid
 from tests.sensors import made
 
 BY_HAND = bytes.fromhex(

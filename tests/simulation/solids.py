@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tacpipe.arrays import Floats
-from tacpipe.simulation.bow import Bow
-from tacpipe.simulation.primitives import Box, Ellipsoid, Frustum, Shape
+from tacpipe.simulation.bodies import Bow, Box, Ellipsoid, Frustum, Shape
 
 BOX = Box(np.array([0.02, 0.03, 0.045]))
 ELLIPSOID = Ellipsoid(np.array([0.02, 0.03, 0.05]))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.simulation.hertz import contact_radius_m, effective_modulus_pa, effective_radius_m, indentation_m
+from tacpipe.simulation.pinch import contact_radius_m, effective_modulus_pa, effective_radius_m, indentation_m
 
 POSITIVE = st.floats(1e-3, 1e3)
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tacpipe.simulation.bow import Bow
-from tacpipe.simulation.primitives import Frustum, principal_curvatures
+from tacpipe.simulation.bodies import Bow, Frustum, principal_curvatures
 from tests.simulation.solids import (
     BALL,
     BOW,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tacpipe.simulation import depth_camera, tabletop
+from tacpipe.simulation import depth_camera
 from tests.simulation import solids
 
 
@@ -20,7 +20,7 @@ def test_what_lies_beside_an_object_may_first_be_tried_where_the_camera_does_not
         return (range(0), range(0)) if len(tried) == 1 else find_window(candidate)
 
     monkeypatch.setattr(depth_camera, "window", window)
-    neighbour = tabletop._place_neighbour(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
+    neighbour = depth_camera._place_neighbour(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
 
     assert len(tried) > 1 and neighbour is tried[-1]
     apart_m = np.linalg.norm(neighbour.origin_m - placed.origin_m)

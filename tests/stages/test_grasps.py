@@ -15,7 +15,7 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.simulation.tabletop import OBJECT
+from tacpipe.simulation.depth_camera import OBJECT
 from tests.clouds.scene_fakes import Scene, scene
 
 START_NS = 1_561_629_162_000_000_000

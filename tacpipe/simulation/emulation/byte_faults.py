@@ -8,15 +8,82 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from tacpipe.arrays import Times
 from tacpipe.errors import UsageError
 from tacpipe.plugins import params
-from tacpipe.sensors.sensor import Sensor
-from tacpipe.simulation.emulation import undetectable_faults
-from tacpipe.simulation.emulation.poisson_events import Happening
+from tacpipe.sensors.framing import Chunks, Run
+from tacpipe.sensors.sensor import Frames, Sensor
+from tacpipe.sensors.text_framer import LineFramer
+
+CAN_BYTES = 13  # size of a CAN frame of a link
+NEIGHBOURS = 8  # sound frames on either side: more than any framer needs to lock
+
+
+def passes(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: bytes) -> bool:
+    """Return whether ``harmed``, sent instead of ``frames[row]``, makes the framer give out what it would not have."""
+    before = _sample(frames, range(row - NEIGHBOURS, row), row)
+    after = _sample(frames, range(row + 1, row + 1 + NEIGHBOURS), row)
+    sound = set(_given_out(sensor, [*before, frames[row], *after]))
+    return any(frame not in sound for frame in _given_out(sensor, [*before, harmed, *after]))
+
+
+def _given_out(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
+    framer = sensor.framer()
+    chunks = [chunk for piece in pieces for chunk in _chunks(sensor, piece)]
+    runs, _ = framer.feed(Chunks.of(list(enumerate(chunks))))
+    return [frame for run in runs + framer.flush()[0] for frame in of_run(run)]
+
+
+def _chunks(sensor: Sensor, piece: bytes) -> list[bytes]:
+    """Return what a link gives of a frame: of a CAN bus, frames of 13 bytes."""
+    if sensor.links != ("can",):
+        return [piece]
+    return [piece[start : start + CAN_BYTES] for start in range(0, len(piece), CAN_BYTES)]
+
+
+def of_run(run: Run) -> list[bytes]:
+    """Return the frames of a run one by one."""
+    return [bytes(frame) for frame in run.frames]
+
+
+def one_by_one(sensor: Sensor, frames: Frames) -> list[bytes]:
+    """Return what `Sensor.encode` gave as one piece of bytes a frame, as they go out: lines with their ends."""
+    if isinstance(frames, np.ndarray):
+        size, content = frames.shape[1], np.ascontiguousarray(frames).tobytes()
+        return [content[start : start + size] for start in range(0, len(content), size)]
+    if isinstance(sensor.framer(), LineFramer):
+        return [frame if frame.endswith(b"\n") else frame + b"\r\n" for frame in frames]
+    return list(frames)
+
+
+def _sample(frames: Sequence[bytes], rows: range, but: int) -> list[Any]:
+    """Return the frames in these rows, others of the block where they reach beyond it."""
+    count = len(frames)
+    return [frames[row % count] for row in rows if row % count != but % count]
+
+
+class Happening:
+    """Moments, ns, at which something happens ``rate_hz`` times a second on average; the same seed gives the same."""
+
+    def __init__(self, rate_hz: float, rng: np.random.Generator) -> None:
+        self._rate_hz, self._rng = rate_hz, rng
+        self._next_ns = self._step(0)
+
+    def _step(self, now_ns: float) -> float:
+        return now_ns + self._rng.exponential(1e9 / self._rate_hz) if self._rate_hz > 0 else float("inf")
+
+    def until(self, t_ns: int) -> list[int]:
+        """Return the moments before ``t_ns`` that were not asked for yet."""
+        events = []
+        while self._next_ns < t_ns:
+            events.append(int(self._next_ns))
+            self._next_ns = self._step(self._next_ns)
+        return events
+
 
 SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE = (
     "", "noise", "cut", "flip", "burst", "drop", "duplicate", "reorder", "unplug", "replug", "overrun", "baud", "stall",
@@ -144,7 +211,7 @@ class Harm:
     def _mark_undetectable(self, items: list[Item], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
-                items[row] = item._replace(invisible=undetectable_faults.passes(self.sensor, frames, row, item.data))
+                items[row] = item._replace(invisible=passes(self.sensor, frames, row, item.data))
 
     def _lose(self, items: list[Item]) -> list[Item]:
         if not self.faults.drop:
@@ -220,3 +287,28 @@ def _row(items: Sequence[Item], at_ns: int) -> int:
         middle = (low + high) // 2
         low, high = (middle + 1, high) if items[middle].due_ns < at_ns else (low, middle)
     return low
+
+
+def no_steps(t_ns: Times) -> Times:
+    """Return by how much a clock that is never set has been set until ``t_ns`` (time,): 0."""
+    return np.zeros_like(t_ns)
+
+
+class ClockSteps:
+    """Steps of one size at random moments; calling it states by how much the clock has been set until then."""
+
+    def __init__(self, rate_hz: float, step_ms: float, seed: Sequence[int]) -> None:
+        self._happening = Happening(rate_hz, np.random.default_rng([*seed, 5]))
+        self._rng = np.random.default_rng([*seed, 6])
+        self._step_ns = round(step_ms * 1e6)
+        self.moments_ns: list[int] = []
+        self._sums = np.zeros(1, dtype=np.int64)
+
+    def __call__(self, t_ns: Times) -> Times:
+        """Return the sum of the steps before ``t_ns`` (time,), ns."""
+        for moment in self._happening.until(int(t_ns.max(initial=0))):
+            self.moments_ns.append(moment)
+            step_ns = self._step_ns if self._rng.random() < 0.5 else -self._step_ns
+            self._sums = np.append(self._sums, self._sums[-1] + step_ns)
+        summed: Times = self._sums[np.searchsorted(np.array(self.moments_ns, dtype=np.int64), t_ns, side="left")]
+        return summed

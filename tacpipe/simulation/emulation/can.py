@@ -15,7 +15,7 @@ from typing import Any
 from tacpipe.links.link import Address
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.pty import Pty
+from tacpipe.simulation.emulation.serial_port import Pty
 
 FRAME = struct.Struct("<IB8s")
 EXTENDED = 1 << 31

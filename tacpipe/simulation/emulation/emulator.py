@@ -20,20 +20,76 @@ from typing import Self
 
 import numpy as np
 
+from tacpipe.errors import DeviceError
 from tacpipe.plugins import params
 from tacpipe.recording.rig import Rig, Stream
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation import faults as clocks
 from tacpipe.simulation import pick_and_move
-from tacpipe.simulation.emulation import serving
-from tacpipe.simulation.emulation.byte_faults import Faults
-from tacpipe.simulation.emulation.clock_steps import ClockSteps, no_steps
+from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, no_steps
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.pacing import Pace
 from tacpipe.simulation.emulation.source import Sampled, Source, Timing
 from tacpipe.simulation.emulation.transmission import Plan, Transmission
 from tacpipe.simulation.emulation.world import World
+
+PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder")  # links that keep frames apart
+
+
+def endpoint(stream: Stream, folder: Path) -> Endpoint:
+    """Return the device's end of a stream's link, served from now on; ``folder`` is for pseudo-terminals and files.
+
+    Raises `DeviceError` for a link that cannot be emulated.
+    """
+    scheme = stream.address.scheme
+    if scheme == "serial":
+        from tacpipe.simulation.emulation.serial_port import Pty
+
+        return Pty(stream.sensor, _device(folder, stream.name))
+    if scheme == "udp":
+        return _udp(stream)
+    if scheme in ("tcp", "tcp+udp"):
+        from tacpipe.simulation.emulation.tcp import Tcp, TcpUdp
+
+        return TcpUdp(stream.sensor) if scheme == "tcp+udp" else Tcp(stream.sensor)
+    if scheme == "ws":
+        from tacpipe.simulation.emulation.websocket import Websocket
+
+        return Websocket(stream.sensor)
+    if scheme == "can":
+        from tacpipe.simulation.emulation.can import Slcan, VirtualCan
+
+        if stream.address.place.startswith("virtual:"):
+            return VirtualCan(stream.sensor, stream.address.place.removeprefix("virtual:"))
+        return Slcan(stream.sensor, _device(folder, stream.name))
+    if scheme == "folder":
+        from tacpipe.simulation.emulation.endpoint import Folder
+
+        return Folder(stream.sensor, folder / "files" / stream.name)
+    if scheme == "hid":
+        from tacpipe.simulation.emulation.hid import Hid
+
+        return Hid(stream.sensor, stream.address, folder / "hid")
+    raise DeviceError(
+        f"{stream.name}: {stream.address} cannot be emulated; clouds can be, by a folder: folder:{folder / 'files'}."
+    )
+
+
+def _udp(stream: Stream) -> Endpoint:
+    from tacpipe.simulation.emulation.udp import HOST, Udp, free_port
+
+    host, _, _ = stream.address.place.partition("?")[0].rpartition(":")
+    if stream.sensor.listens or not host:
+        return Udp(stream.sensor, (HOST if host else "", free_port()))
+    return Udp(stream.sensor)
+
+
+def _device(folder: Path, name: str) -> Path:
+    devices = (folder / "dev").absolute()
+    devices.mkdir(parents=True, exist_ok=True)
+    return devices / name
+
 
 LOOK_NS = 20_000_000  # period of checks for events without a descriptor
 FILL_S = 0.1  # period of checks whether to plan more frames
@@ -87,7 +143,7 @@ class Emulator:
             self.folder.mkdir(parents=True, exist_ok=True)
             endpoints: dict[str, Endpoint] = {}
             for name, stream in self.rig_file.streams.items():
-                endpoints[name] = serving.endpoint(stream, self.folder)
+                endpoints[name] = endpoint(stream, self.folder)
                 resources.callback(endpoints[name].close)
             self._resources = resources.pop_all()
         self.epoch_ns = time.monotonic_ns()
@@ -126,7 +182,7 @@ class Emulator:
         self._commands.append((name, True))
 
     def _transmission(self, stream: Stream, its_pace: Pace, endpoint: Endpoint) -> Transmission:
-        packets = stream.address.scheme in serving.PACKETS
+        packets = stream.address.scheme in PACKETS
         rate_hz = stream.sensor.rate_hz or UNPACED_HZ
 
         def planned(rate: float, start_ns: int) -> Plan:

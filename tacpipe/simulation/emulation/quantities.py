@@ -1,24 +1,60 @@
 """Compute each quantity that a field may have from the simulated world, in SI units.
 
-`tacpipe.simulation.emulation.scales` turns it into what a device sends.
+`tacpipe.simulation.emulation.quantities` turns it into what a device sends.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import Floats, Times
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
-from tacpipe.simulation.emulation import pad as pad_of_taxels
 from tacpipe.simulation.emulation.world import World
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+WIDTH_M = 0.03  # width of a pad along both axes
+SIGMA_M = 0.005  # standard deviation of the Gaussian that distributes the pressure
+
+
+def places(taxels: int) -> Floats:
+    """Return where taxels lie on the pad (taxel, 2), m from its centre: row by row of a grid as square as can be.
+
+    >>> places(2).tolist()
+    [[0.0, -0.0075], [0.0, 0.0075]]
+    """
+    rows = next(count for count in range(math.isqrt(taxels), 0, -1) if taxels % count == 0)
+    columns = taxels // rows
+    row, column = np.divmod(np.arange(taxels), columns)
+    return WIDTH_M * np.column_stack([(row + 0.5) / rows - 0.5, (column + 0.5) / columns - 0.5])
+
+
+def pressed(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
+    """Return the force on each taxel (time, taxel, axis), N: shear along x and y, pressure along z."""
+    normal_n = world.contact(t_ns, lambda scene: scene.contact.normal_n[:, finger])
+    moved_m = world.contact(t_ns, lambda scene: scene.contact.displacement_m)
+    load_n = world.contact(t_ns, lambda scene: scene.contact.force_n[:, ::2]) / 2
+    centre_m = world.skins[finger].centre_m + np.clip(moved_m, -WIDTH_M / 2, WIDTH_M / 2)
+    distance2 = ((places(taxels) - centre_m[:, None]) ** 2).sum(axis=2)  # (time, taxel)
+    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * SIGMA_M**2))
+    fraction /= fraction.sum(axis=1, keepdims=True)
+    force: Floats = fraction[:, :, None] * np.column_stack([load_n, normal_n])[:, None]
+    return force
+
+
+def peak_fraction(taxels: int) -> float:
+    """Return the fraction of the force that the taxel under its centre bears, of so many."""
+    distance2 = (places(taxels) ** 2).sum(axis=1)
+    weight = np.exp((distance2.min() - distance2) / (2 * SIGMA_M**2))
+    return float(weight.max() / weight.sum())
 
 
 CLEARANCE_M = 0.12  # distance from the wrist's proximity sensor to the object without slip
@@ -71,7 +107,7 @@ def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
     for number, pad_name in enumerate(pads):
         rows = [row for row, (pad, _) in enumerate(places) if pad == pad_name]
         taxels = list(dict.fromkeys(places[row][1] for row in rows))
-        force = pad_of_taxels.pressed(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
+        force = pressed(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
         columns = [taxels.index(places[row][1]) for row in rows]
         axes = [schema.AXES.index(axis_of(fields[row]) or "z") for row in rows]
         values[:, rows] = force[:, columns, axes]
@@ -211,3 +247,80 @@ QUANTITIES: dict[str, Callable[[View, Sequence[pa.Field]], Floats]] = {
         [view.world.contact(view.t_ns, lambda scene: np.full(len(scene.path.t_ns), scene.grasp.mass_kg))] * len(fields)
     ),
 }
+
+
+UNITS = {  # size of each unit in SI units or °C
+    "m": 1.0, "mm": 1e3, "cm": 1e2, "um": 1e6, "rad": 1.0, "deg": 180 / np.pi, "N": 1.0, "mN": 1e3, "N m": 1.0,
+    "N mm": 1e3, "mN m": 1e3, "m/s": 1.0, "mm/s": 1e3, "rad/s": 1.0, "deg/s": 180 / np.pi, "m/s^2": 1.0, "m/s²": 1.0,
+    "g": 1 / 9.81, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "kg": 1.0, "degC": 1.0, "°C": 1.0,
+}  # fmt: skip
+COUNTS = {
+    "uint8": 200.0,
+    "int8": 100.0,
+    "uint16": 3000.0,
+    "int16": 3000.0,
+    "uint32": 1e5,
+    "int32": 1e6,
+}
+FLOAT_COUNTS = 100.0  # the same, of fields that are floats
+FULL = {  # full range of a device of counts, SI
+    "tactile": 12.0, "magnetic_flux_density": 12.0, "displacement": 12.0, "static_pressure": 10.0, "vibration": 0.5,
+    "force": 15.0, "torque": 1.0, "temperature": 60.0, "acceleration": 20.0, "angular_velocity": 5.0, "proximity": 0.5,
+    "distance": 0.5, "velocity": 2.0, "joint_position": 3.2, "joint_velocity": 3.0, "joint_torque": 90.0, "position": 1.0,
+    "signal_strength": 3000.0, "length": 0.5, "finger_width": 0.1,
+    "deflection": 10.0, "external_torque": 90.0,
+}  # fmt: skip
+SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities of one taxel among others
+NOISE = 0.002  # standard deviation as a fraction of what a device is made for
+AIMED = ("target_position", "target_orientation")  # values that a controller computes exactly
+SILENT = (
+    "time",
+    "status",
+    "sequence",
+    "label",
+    "mask",
+    "orientation",
+    "mass",
+    "friction",
+    *AIMED,
+)  # quantities without noise
+
+
+def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator) -> list[AnyArray]:
+    """Return the column (time,) of each field, in its own type, of what the world shows (time, field), SI."""
+    full = FULL.get(quantity, 1.0)
+    if quantity in SHARED:  # a device with many taxels is made for less on each
+        full *= peak_fraction(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
+    noise = 0.0 if quantity in SILENT else NOISE * full
+    noisy = values + noise * rng.standard_normal(values.shape) if noise else values
+    return [_column(field, column, full, quantity) for field, column in zip(fields, noisy.T, strict=True)]
+
+
+def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyArray:
+    kind = np.dtype(field.type.to_pandas_dtype())
+    scale = unit_scale(metadata_of(field, "unit") or "1")
+    if scale is None and quantity in FULL:
+        full_scale = COUNTS.get(kind.name, FLOAT_COUNTS)
+        middle = (
+            full_scale if kind.kind == "u" and axis_of(field) in ("x", "y") else 0.0
+        )  # offset for signed values in an unsigned type
+        values = middle + values * (full_scale / full)
+    else:
+        values = values * (scale or 1.0)
+    if kind.kind in "iu":
+        limits = np.iinfo(kind)
+        values = np.rint(values).clip(limits.min, limits.max)
+    column: AnyArray = values.astype(kind)
+    return column
+
+
+def unit_scale(unit: str) -> float | None:
+    """Return how many of ``unit`` make one of SI, None for counts; a number before the unit is what one count is.
+
+    >>> unit_scale("mN"), unit_scale("0.1 N"), unit_scale("count")
+    (1000.0, 10.0, None)
+    """
+    match = re.fullmatch(r"(?:([0-9.e+-]+) )?(.*)", unit)
+    if match is None or match[2] not in UNITS:
+        return None
+    return UNITS[match[2]] / float(match[1] or 1.0)

@@ -16,9 +16,9 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Counts, Floats, Int64s, Times
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.simulation import faults, pick_and_move, proximity, taxels
-from tacpipe.simulation.emulation import quantities, scales
-from tacpipe.simulation.emulation.clock_steps import no_steps
+from tacpipe.simulation import faults, pick_and_move, taxels
+from tacpipe.simulation.emulation import quantities
+from tacpipe.simulation.emulation.byte_faults import no_steps
 from tacpipe.simulation.emulation.quantities import View
 from tacpipe.simulation.emulation.world import World
 
@@ -131,11 +131,11 @@ class Source:
             up_m = view.world.contact(view.t_ns, lambda scene: scene.contact.displacement_m[:, 1])
             kinds = [channel.type.to_pandas_dtype() for channel in fields]
             return {
-                number: proximity.readings(up_m, 1.0, rng).astype(kind)
+                number: pick_and_move.proximity_readings(up_m, 1.0, rng).astype(kind)
                 for number, kind in zip(group, kinds, strict=True)
             }
         values = quantities.look(quantity, view, fields)
-        return dict(zip(group, scales.sent(quantity, values, fields, rng), strict=True))
+        return dict(zip(group, quantities.sent(quantity, values, fields, rng), strict=True))
 
     def _uskin(self, view: View, block: int, rng: np.random.Generator) -> Counts:
         """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""

@@ -11,12 +11,11 @@ import numpy as np
 
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults, pacing
-from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, Item
+from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, Item, one_by_one
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.pacing import Pace
 from tacpipe.simulation.emulation.source import Sampled
-from tacpipe.simulation.emulation.undetectable_faults import one_by_one
 
 AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
 IDLE_NS = 20_000_000  # period of checks of a stream without a receiver

@@ -16,14 +16,11 @@ from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
-from tacpipe.simulation.emulation import byte_faults, undetectable_faults
-from tacpipe.simulation.emulation.byte_faults import Faults, Item, parse
-from tacpipe.simulation.emulation.clock_steps import ClockSteps
+from tacpipe.simulation.emulation import byte_faults
+from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, Happening, Item, of_run, one_by_one, parse
 from tacpipe.simulation.emulation.pacing import Pace
-from tacpipe.simulation.emulation.poisson_events import Happening
 from tacpipe.simulation.emulation.source import Source, Timing
 from tacpipe.simulation.emulation.transmission import Plan
-from tacpipe.simulation.emulation.undetectable_faults import of_run, one_by_one
 from tacpipe.simulation.emulation.world import World
 
 WORLD = World(1)
@@ -128,9 +125,9 @@ def test_two_bits_that_cancel_out_in_a_sum_are_invisible() -> None:
     rows = list(frames.values())[:40]
     changed = bytearray(rows[20])
     changed[2], changed[4] = (changed[2] + 1) % 256, (changed[4] - 1) % 256
-    assert undetectable_faults.passes(TfMini(), rows, 20, bytes(changed))
+    assert byte_faults.passes(TfMini(), rows, 20, bytes(changed))
     changed[4] = (changed[4] + 2) % 256
-    assert not undetectable_faults.passes(TfMini(), rows, 20, bytes(changed))
+    assert not byte_faults.passes(TfMini(), rows, 20, bytes(changed))
 
 
 def test_dropped_frames_leave_gaps_in_the_counter() -> None:

@@ -23,10 +23,9 @@ from tacpipe.recording import rig
 from tacpipe.recording.rig import Rig
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.simulation.emulation import perfect
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.simulation.emulation.ledger import Ledger, joined
 from tests.simulation.emulation.rigs import ALL_SENSORS, FIRST_PAPER, PATIENCE_S, awaited, in_order, one_stream_rig
 
 pytestmark = pytest.mark.rig
@@ -61,9 +60,7 @@ class Reader:
             if self.sensor.request():
                 self.link.write(self.sensor.request())
             self.take(self.link.read(0.2))
-        return perfect.joined(
-            [self.sensor.decode(run.frames) for run in self.runs], [len(run.frames) for run in self.runs]
-        )
+        return joined([self.sensor.decode(run.frames) for run in self.runs], [len(run.frames) for run in self.runs])
 
 
 @contextmanager

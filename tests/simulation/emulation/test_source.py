@@ -17,8 +17,8 @@ from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.signals import kinematics
 from tacpipe.simulation import pick_and_move, taxels
-from tacpipe.simulation.emulation import joints, perfect
-from tacpipe.simulation.emulation.scales import unit_scale
+from tacpipe.simulation.emulation import joints, ledger
+from tacpipe.simulation.emulation.quantities import unit_scale
 from tacpipe.simulation.emulation.slide_source import SlideSource
 from tacpipe.simulation.emulation.source import Source, Timing
 from tacpipe.simulation.emulation.world import CYCLE_NS, World
@@ -143,7 +143,7 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
         samples = CloudSource(sensor, Timing(2), (0,)).block(0)
     else:
         samples = Source(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
-    decoded_samples = perfect.decoded(sensor, sensor.encode(samples))
+    decoded_samples = ledger.decoded(sensor, sensor.encode(samples))
     assert len(decoded_samples) == len(samples)
     for sent, read in zip(samples.values, decoded_samples.values, strict=True):
         if sent.dtype.kind == "f":  # The wire carries float32 values, or four digits.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.simulation.emulation.can import EXTENDED, frame_of, joined, line, split
 from tacpipe.simulation.emulation.endpoint import stretched
-from tacpipe.simulation.emulation.uart import garbled
+from tacpipe.simulation.emulation.serial_port import garbled
 
 
 @given(st.binary(max_size=200), st.sampled_from([9600, 115_200, 1_000_000]))

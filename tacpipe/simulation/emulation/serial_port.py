@@ -1,7 +1,8 @@
-"""A serial device on a pseudo-terminal, behind a symbolic link that stays when the device is unplugged and comes back.
+"""Serve a serial device on a pseudo-terminal, behind a symbolic link that stays while the device is unplugged.
 
 A pseudo-terminal takes bytes as fast as they come and keeps some thousands of them. What it has no room for is lost, as in
-the buffer of a UART that nobody reads. While no host has the port open, nothing is sent.
+the buffer of a UART that nobody reads. While no host has the port open, nothing is sent. A host that opens the port with
+another speed than the device's reads garbled bytes.
 """
 
 from __future__ import annotations
@@ -15,11 +16,42 @@ import tty
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.simulation.emulation import byte_faults, uart
+from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.endpoint import stretched
+
+IDLE_BITS = 30  # number of idle bits after the last byte
+
+
+def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+    """Return what is read at ``read_baud`` of bytes that were sent at ``sent_baud``, 8 bits, no parity, one stop bit.
+
+    A byte begins where the line falls; where no stop bit is found, it is kept all the same, as Linux does by default.
+
+    >>> garbled(b"touch", 9600, 9600)
+    b'touch'
+    >>> garbled(b"UUUU", 9600, 19200) == b"UUUU"
+    False
+    """
+    bits = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")  # (byte, bit)
+    framed = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)])
+    line = np.append(framed.ravel(), np.ones(IDLE_BITS + round(12 * sent_baud / read_baud), np.uint8))
+    width = sent_baud / read_baud  # length of a received bit in sent bits
+    middles = (1.5 + np.arange(8)) * width
+    low = np.flatnonzero(line == 0)
+    received, place = [], 0.0
+    while (row := int(np.searchsorted(low, np.floor(place)))) < len(low):
+        start = max(place, float(low[row]))
+        received.append(np.packbits(line[np.floor(start + middles).astype(int)], bitorder="little")[0])
+        place = start + 9.5 * width
+        if place >= len(line) - 12 * width:
+            break
+    return bytes(received)
+
 
 TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
 TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
@@ -100,7 +132,7 @@ class Pty:
             self.peers = []
             return []
         if self.wrong_baud():
-            data = uart.garbled(data, self._baud, self.sensor.baud)
+            data = garbled(data, self._baud, self.sensor.baud)
         return [(self._port, heard) for heard in self.understood(data)]
 
     def look(self) -> list[tuple[Port, bytes]]:
@@ -124,7 +156,7 @@ class Pty:
         on_the_line = [self.on_the_line(piece) for piece in pieces]
         self.garbling = self.wrong_baud()
         if self.garbling:
-            on_the_line = [uart.garbled(piece, self.sensor.baud, self._baud) for piece in on_the_line]
+            on_the_line = [garbled(piece, self.sensor.baud, self._baud) for piece in on_the_line]
         count = 0
         with contextlib.suppress(BlockingIOError):
             count = os.write(self._master, b"".join(on_the_line))
