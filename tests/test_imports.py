@@ -46,7 +46,7 @@ def test_help_imports_nothing_heavy(tmp_path: Path, words: str) -> None:
 
 
 def test_help_of_a_stage_imports_none_of_what_runs_stages(tmp_path: Path) -> None:
-    running = {f"tacpipe.engine.{name}" for name in ("pipeline", "by_recording", "estimate", "grid")}
+    running = {f"tacpipe.engine.{name}" for name in ("pipeline", "by_recording", "grid")}
     assert imported_modules(tmp_path, "synchronize --help") & running == set()
 
 

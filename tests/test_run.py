@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from tacpipe.cli import run
-from tacpipe.engine.chains import chain as chains
+from tacpipe.engine import chains
 from tacpipe.errors import UsageError
 from tests.conftest import Lab, tacpipe
 
@@ -311,11 +311,9 @@ def test_each_stage_of_this_project_comes_after_those_whose_outputs_it_reads() -
 
 
 def test_names_with_values_that_are_missing_are_named() -> None:
-    from tacpipe.engine.chains import template
-
     with pytest.raises(UsageError, match=r"a\.c"):
-        template.filled("${a.c}", {"a": {"b": 1}}, "dvc.yaml")
-    assert template.filled(r"\${a} ${a}", {"a": False}, "dvc.yaml") == "${a} false"
+        chains.fill_template("${a.c}", {"a": {"b": 1}}, "dvc.yaml")
+    assert chains.fill_template(r"\${a} ${a}", {"a": False}, "dvc.yaml") == "${a} false"
 
 
 @pytest.mark.long

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.engine.shared import SharedFiles
+from tacpipe.engine.execution import SharedFiles
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import Draft
 from tacpipe.store.store import Store

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tacpipe.cli import addresses, stages
-from tacpipe.engine.chains import chain as chains
-from tacpipe.engine.chains.chain import Chain, ChainStage
+from tacpipe.engine import chains
+from tacpipe.engine.chains import Chain, ChainStage
 from tacpipe.errors import DONE, INTERRUPTED
 from tacpipe.io import progress, terminal, termination
 from tacpipe.plugins import registry

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.engine import processor
-from tacpipe.engine.executors import forking
+from tacpipe.engine.executors import local
 from tacpipe.io import termination
 from tacpipe.training import devices
 
@@ -93,14 +93,14 @@ class StageProcesses:
         """Start a command of stage ``name``, which has none running; ``together`` commands share the cores."""
         if self._context is None:
             with processor.shared_by(self.jobs):  # The process that forks passes its environment on.
-                self._context = forking.context(self._modules)
+                self._context = local.start_fork_server(self._modules)
         words = command if isinstance(command, str) else list(command)
         self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
         gpu = devices.gpu_for(self._slots[name])
         variables = processor.each_of(self.jobs) | processor.jobs_of(together) | gpu
         arguments = words, str(Path.cwd()), variables, *map(str, self._output_paths(self._slots[name]))
         process = self._context.Process(target=_run, args=arguments)
-        with termination.deferred(), forking.without_main():
+        with termination.deferred(), local.without_main():
             process.start()
         self._running[name] = process
 

@@ -157,9 +157,9 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
 
 def _estimate(requests: Sequence[Request]) -> None:
     """Print the estimated training time of the missing models, if it can be estimated."""
-    from tacpipe.engine import estimate
+    from tacpipe.engine import grid
 
-    sentence = estimate.estimate_duration(requests, requests[0].jobs)
+    sentence = grid.estimate_duration(requests, requests[0].jobs)
     if sentence is not None:
         terminal.note(f"tacpipe: {sentence}")
 

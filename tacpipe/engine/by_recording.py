@@ -1,25 +1,28 @@
-"""Stages that work recording by recording: each result from the store, or by running the stage on that recording."""
+"""Run stages recording by recording: take each result from the store, or run the stage on that recording."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import merging, pages
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.executor import Chosen
+from tacpipe.engine.keys import Done, Task
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request
-from tacpipe.engine.task import Done, Task
 from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
-from tacpipe.io.hashing import digest
+from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.plugins import registry
 from tacpipe.store import records
+from tacpipe.store.location import locate
 from tacpipe.store.store import Store
 
 Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
@@ -50,7 +53,7 @@ class ByRecording:
         record per group is read, and one for each recording of the changed group. Results of many recordings are kept
         in pages.
         """
-        entries, name, stage = source.included, step["stage"], execution.stage_of(step["stage"])
+        entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
         answered: list[Answer | _RecordingGroup] = []
         missing: list[Task] = []
         stored: dict[str, Mapping[str, Any]] = {}  # Records of groups that are incomplete
@@ -282,3 +285,22 @@ def error(exit_code: int, sentence: str) -> TacpipeError:
 
 def _lines(bad: Mapping[str, str]) -> str:
     return "\n".join(f"  {recording}: {bad[recording]}" for recording in sorted(bad))
+
+
+def run_chain_of_model(recordings: Dataset, model: Dataset) -> Dataset:
+    """Run the remaining stages of a model's chain on recordings and return the result.
+
+    Stored results are reused, and new ones are stored, as with ``tacpipe predict``. Both datasets
+    must be open. Raises `UsageError` where the recordings went through other stages, `TacpipeError` where one of them
+    cannot be read.
+    """
+    assert recordings.path is not None and model.path is not None
+    source = recordings.source
+    selected = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
+    dataset_dirs = (str(recordings.path), str(model.path))
+    store = locate(recordings.path, model.path)
+    manifests = [source.content_digest, bytes_digest(model.source.content)]
+    with Chosen("", 0) as chosen, store.at_work(manifests):
+        mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)
+        replayed = mapping.replay(selected, model.source, dataset_dirs, str(recordings.path))
+    return Dataset(replayed, execution.reader(store, dataset_dirs))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.datasets.manifest import VALUES, Manifest
 from tacpipe.engine import execution, provenance
 from tacpipe.engine.execution import Scratch
-from tacpipe.engine.task import Done, Task
+from tacpipe.engine.keys import Done, Task
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
@@ -167,7 +167,7 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
     started = time.perf_counter()
     replace = task.replace or record is not None
     with registry.collect_packages() as packages:
-        stage = execution.stage_of(task.name)
+        stage = registry.load_step(task.name)
         code = provenance.code(stage)  # The file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
     origin = {**provenance.describe(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}

@@ -1,4 +1,4 @@
-"""How a stage is run for a key: arguments out of an identity, then the stage, then objects."""
+"""Run a stage for a key: prepare its arguments from an identity, call it, and store what it returns."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,11 +18,10 @@ from tacpipe.datasets.dataset import Dataset, Reader, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import provenance
-from tacpipe.engine.shared import SharedFiles
-from tacpipe.engine.task import Task
-from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
-from tacpipe.io import memory, regular
-from tacpipe.io.files import Hashed, write_whole
+from tacpipe.engine.keys import Task
+from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_input_error
+from tacpipe.io import files, memory, regular
+from tacpipe.io.files import Draft, Hashed, move, present, write_whole
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
@@ -30,6 +30,38 @@ from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
+
+_MOST_BYTES = 1 << 20  # Longest error message
+
+
+@dataclass(frozen=True)
+class SharedFiles:
+    """The shared files of the run that a store works for, among its drafts: a collection sweeps those of dead runs."""
+
+    store: Store
+
+    def file(self, content_key: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for the JSON value ``content_key``, now or earlier in any process.
+
+        Raises the errors of ``make``; an input error is stored and raised again for each caller.
+        """
+        key = digest({"run": self.store.run, "of": content_key})
+        path, failed = (self.store.draft(digest([key, part])[:32]) for part in ("made", "failed"))
+        with self.store.leases.hold(key, "the recordings of a file"):
+            if present(failed):
+                raise TacpipeError(regular.content(failed, _MOST_BYTES, follow=False).decode())
+            if not present(path):
+                name = self.store.draft()
+                with files.new_draft(name, self.store.root) as draft:
+                    try:
+                        make(draft)
+                    except TacpipeError as error:
+                        if is_input_error(error):
+                            self.store.write_file(failed, str(error).encode())
+                        raise
+                    move(name, path)
+        return Path(path)
+
 
 _CODE = "code"  # the file of a workspace with the digest of the code that writes its checkpoints
 log = logging.getLogger(__name__)
@@ -56,7 +88,7 @@ def execute(
 
     With ``followed``, the progress of a training is reported to trackers and the display.
     """
-    stage, stage_name = stage_of(task.name), registry.stage_name(task.name)
+    stage, stage_name = registry.load_step(task.name), registry.stage_name(task.name)
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments if followed else {}):
         try:
@@ -86,18 +118,6 @@ def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[s
     files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
     files |= {name: vars(sink.put_written(returned.written[name])) for name in sorted(returned.written)}
     return {"recordings": recordings, "files": files}
-
-
-def stage_of(name: str) -> AnyStage:
-    """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``, and so with parts."""
-    stage = registry.load(registry.stage_name(name))
-    if name.endswith(registry.FIT):
-        assert stage.fit is not None
-        return stage.fit
-    if name.endswith(registry.PART):
-        assert stage.part is not None
-        return stage.part
-    return stage
 
 
 def differences(stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> list[str]:
@@ -184,12 +204,12 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
     obstacle = ""
     for identity, made_by in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
-        if acquired or stage_of(identity["stage"]).source:
+        if acquired or registry.load_step(identity["stage"]).source:
             raise DamagedError(
                 f"{problem} It is the recording {path}, which cannot be recomputed: restore it with `tacpipe store pull`"
                 f"{'' if acquired else ', or ingest it again'}."
             )
-        stage = stage_of(identity["stage"])
+        stage = registry.load_step(identity["stage"])
         if stage.version != identity["version"]:
             obstacle = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
@@ -331,7 +351,7 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
 @contextmanager
 def watching(task: Task) -> Iterator[Sequence[following.Follower]]:
     """Yield the followers in this process of a training in another process; none if the stage trains nothing."""
-    if stage_of(task.name).argument("Workspace") is None:
+    if registry.load_step(task.name).argument("Workspace") is None:
         yield ()
         return
     store = opened(task.store)

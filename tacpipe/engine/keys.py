@@ -1,21 +1,51 @@
-"""Identities: what a key is the digest of, for shards, for whole datasets and for runs."""
+"""Compute identities, of which keys are digests, of shards, datasets and runs; define the tasks that compute results."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
-from tacpipe.engine import execution
-from tacpipe.engine.task import Task
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
+from tacpipe.training.devices import AUTO, Device
 
 _MOST_TRIALS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Task:
+    """One key to make: all that a worker process needs."""
+
+    store: str  # its path or address
+    name: str  # Name of the stage
+    identity: Mapping[str, Any]
+    recording: str = ""
+    files: Mapping[str, str] | None = None  # Files of a published source: name to path
+    dataset_dirs: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
+    replace: bool = False  # the old record names objects that are gone
+    dry: bool = False  # compute and compare, store nothing
+    rerun: bool = False  # compute although a result is stored
+    device: Device = AUTO  # the device that networks are trained on
+    run: str = ""  # the lease of the run that it is part of
+
+
+@dataclass(frozen=True)
+class Done:
+    """Outcome of a task: a record, or the error of the recording."""
+
+    recording: str
+    record: Mapping[str, Any] | None
+    error: str = ""
+    exit_code: int = 0
+    is_new: bool = True  # False if another process was faster
+    at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -65,7 +95,7 @@ def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Ent
 
 def shard_tasks(store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> list[Task]:
     """Return one task per included recording of ``source`` for the map stage of a link of a chain."""
-    stage = execution.stage_of(step["stage"])
+    stage = registry.load_step(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
     name_argument = stage.argument("RecordingName")

@@ -123,7 +123,7 @@ def _other_package(package: str, counts: Mapping[str, int]) -> str:
 def _other_code(name: str, counts: Mapping[str, int]) -> str:
     """Return the warning if results of a stage were computed by other code (``counts`` by code); else an empty string."""
     try:
-        stage = execution.stage_of(name)
+        stage = registry.load_step(name)
     except TacpipeError:  # The plug-in was removed; its results stay valid
         return ""
     now = provenance.code(stage)

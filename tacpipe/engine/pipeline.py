@@ -17,11 +17,11 @@ from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.executors.executor import Chosen
+from tacpipe.engine.keys import Task
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.output import Unread
 from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Inputs, Request
-from tacpipe.engine.task import Task
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest

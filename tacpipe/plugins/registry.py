@@ -246,6 +246,18 @@ def load(name: str) -> AnyStage:
     return loaded
 
 
+def load_step(name: str) -> AnyStage:
+    """Return what is run under this name: a stage, or its fit, as ``compress.pca.fit`` is the fit of ``compress.pca``."""
+    stage = load(stage_name(name))
+    if name.endswith(FIT):
+        assert stage.fit is not None
+        return stage.fit
+    if name.endswith(PART):
+        assert stage.part is not None
+        return stage.part
+    return stage
+
+
 def tasks() -> list[str]:
     """Return the names of all tasks."""
     return sorted(entry_points()[TASKS])

@@ -39,9 +39,9 @@ def opened(recordings: Dataset | Recording, chain: Chain | None) -> Dataset:
     if chain is None or list(recordings.source.chain) == list(chain.steps):
         return recordings
     _check(chain.steps, recordings)
-    from tacpipe.engine import continuation
+    from tacpipe.engine import by_recording
 
-    return continuation.continued(recordings, chain.model)
+    return by_recording.run_chain_of_model(recordings, chain.model)
 
 
 def _check(expected: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe.engine.executors import agreement, dask
-from tacpipe.engine.task import Task
+from tacpipe.engine.executors import dask
+from tacpipe.engine.keys import Task
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Apart
 from tests.executors.test_ends import records, start_command, wait_for_one_more
@@ -65,8 +65,8 @@ def test_a_worker_with_other_versions_is_refused_in_one_sentence(
     lab: Apart, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
-    versions = agreement.local_versions
-    monkeypatch.setattr(agreement, "local_versions", lambda stage: {**versions(stage), "numpy": "0.1"})
+    versions = dask.local_versions
+    monkeypatch.setattr(dask, "local_versions", lambda stage: {**versions(stage), "numpy": "0.1"})
     ran = lab.inside(f"scale data/rec -o data/out --executor {scheduler}")
     assert ran.code == 2
     assert "(here 0.1)" in ran.err

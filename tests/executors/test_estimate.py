@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.engine import estimate
+from tacpipe.engine import grid
 from tacpipe.training.following import Network
 from tests.conftest import Lab
 
@@ -17,11 +17,11 @@ TRAIN = "train forward data/segments --split data/split --hidden 8 --epochs 2"
 def test_what_is_left_of_all_networks_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 10.0, 11.0, 13.0, 15.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    stopwatch = estimate._Stopwatch()
+    stopwatch = grid._Stopwatch()
     stopwatch.begin(Network(epochs=20, number=2, count=3), [{}] * 5)
     stopwatch.batch(0.1, lambda: 0.0)  # the first one is not counted
     stopwatch.batch(0.2, lambda: 0.0)
-    with pytest.raises(estimate._TimedError):
+    with pytest.raises(grid._TimedError):
         stopwatch.batch(0.3, lambda: 0.0)
     epoch_s = (15 - 11) / 0.2
     assert stopwatch.all_s == pytest.approx(10 + epoch_s * (15 + 20))

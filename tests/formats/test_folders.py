@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tacpipe.datasets import paths, recording_names
 from tacpipe.engine import computing
-from tacpipe.engine.task import Done, Task
+from tacpipe.engine.keys import Done, Task
 from tacpipe.errors import UsageError
 from tacpipe.formats.published import PREFIX, trials, valid
 from tacpipe.io import files, regular

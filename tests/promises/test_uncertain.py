@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe.engine import execution
 from tacpipe.errors import DAMAGED, FAILED
+from tacpipe.plugins import registry
 from tests.conftest import forget, tacpipe, write_plugin
 from tests.promises import damages, specimen
 from tests.promises.counts import count
@@ -94,9 +94,9 @@ def test_a_lost_shard_that_cannot_be_made_as_it_was_is_said_so_and_a_rerun_makes
 
 def after_stage_call(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None], times: int = 1) -> None:
     """Let something happen once a stage has been called, right after it returned."""
-    honest = execution.stage_of
+    honest = registry.load_step
 
-    def stage_of(name: str) -> Any:
+    def load_step(name: str) -> Any:
         stage = honest(name)
 
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -109,7 +109,7 @@ def after_stage_call(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None
 
         return _Calling(stage, call)
 
-    monkeypatch.setattr(execution, "stage_of", stage_of)
+    monkeypatch.setattr(registry, "load_step", load_step)
 
 
 class _Calling:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import computing
-from tacpipe.engine.task import Done, Task
+from tacpipe.engine.keys import Done, Task
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location, records

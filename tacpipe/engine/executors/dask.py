@@ -26,12 +26,12 @@ from queue import Queue
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.engine import execution, processor, provenance
-from tacpipe.engine.executors import agreement, chunks
-from tacpipe.engine.task import Done, Task
+from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks
+from tacpipe.engine.keys import Done, Task
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
 from tacpipe.io.hashing import digest
-from tacpipe.plugins import extras
+from tacpipe.plugins import extras, registry
 from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import Store
@@ -39,6 +39,36 @@ from tacpipe.training import following
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+
+
+def local_versions(stage: str) -> dict[str, Any]:
+    """Return the versions that must agree for a task of ``stage`` to be computed by another process.
+
+    Raises `UsageError` where there is no such stage.
+    """
+    stage_object = registry.load(registry.stage_name(stage))
+    environment = provenance.describe(0.0)
+    python = ".".join(environment["python"].split(".")[:2])
+    code = provenance.code(stage_object)
+    return {
+        "Python": python,
+        **environment["libraries"],
+        f"stage {registry.stage_name(stage)}": f"version {stage_object.version}{f', code {code[:12]}' if code else ''}",
+    }
+
+
+def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
+    """Return the differences between a ``worker`` and this process, in words.
+
+    >>> unlike({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
+    ['numpy 1.26 (here 2.1)', 'no torch (here 2.13)']
+    """
+    return [
+        f"{name} {worker[name]} (here {value})" if name in worker else f"no {name} (here {value})"
+        for name, value in local.items()
+        if worker.get(name) != value
+    ]
+
 
 NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 _MOST = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
@@ -107,9 +137,9 @@ class Dask:
         """
         if not tasks:
             return
-        versions = agreement.local_versions(tasks[0].name)
+        versions = local_versions(tasks[0].name)
         workers = max(len(self._workers()), self._expected)
-        task_chunks = [[_absolute(task) for task in chunk] for chunk in chunks.divide(tasks, workers, _MOST)]
+        task_chunks = [[_absolute(task) for task in chunk] for chunk in divide_into_chunks(tasks, workers, _MOST)]
         summary = f"{len(tasks)} tasks were given to {workers} workers"
         with (
             self._followed(tasks) as topic,
@@ -315,11 +345,11 @@ def _work(
             lease = _lease(tasks[0])
         except TacpipeError as error:
             return error
-        return chunks.computed(compute, [replace(task, run=lease) for task in tasks])
+        return compute_chunk(compute, [replace(task, run=lease) for task in tasks])
 
 
 def _check(name: str, versions: Mapping[str, Any], task: Task) -> None:
-    differences = agreement.unlike(versions, agreement.local_versions(task.name))
+    differences = unlike(versions, local_versions(task.name))
     if differences:
         raise UsageError(
             f"Worker {name} would not compute what this computer does: {'; '.join(differences)}. Install the same there."

@@ -1,23 +1,106 @@
-"""The executor that is used unless another is asked for: this process, or workers on this computer."""
+"""Compute tasks in this process or on workers of this computer, which is the default executor.
+
+Workers are forked from one process that has imported modules and has done nothing else, so each starts in milliseconds. They
+take several tasks at a time, so that progress is shown without much overhead.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tacpipe.engine import processor
-from tacpipe.engine.executors import chunks, forking
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import termination
+from tacpipe.io import memory, termination
 from tacpipe.training import devices
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+    from multiprocessing.context import ForkServerContext
 
 Task = TypeVar("Task")
 Done = TypeVar("Done")
+_A_WORKER = 8  # how often a worker comes back for more: progress against overhead
+
+
+def divide_into_chunks(tasks: Sequence[Task], workers: int, max_size: int | None = None) -> list[Sequence[Task]]:
+    """Divide the tasks into chunks of the same size, several per worker, of at most ``max_size`` tasks.
+
+    >>> divide_into_chunks("abcdefg", 1, 3), [len(chunk) for chunk in divide_into_chunks(range(64), 2)]
+    (['a', 'b', 'c', 'd', 'e', 'f', 'g'], [4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4])
+    """
+    size = max(1, len(tasks) // (workers * _A_WORKER))
+    size = size if max_size is None else min(size, max_size)
+    return [tasks[start : start + size] for start in range(0, len(tasks), size)]
+
+
+def compute_each(compute: Callable[[Task], Done], tasks: Sequence[Task]) -> Iterator[Done]:
+    """Yield ``compute(task)`` for each task, or ``compute.compute_all(tasks)``, which may overlap tasks, if it exists."""
+    batch_compute: Callable[[Sequence[Task]], Iterator[Done]] | None = getattr(compute, "compute_all", None)
+    return map(compute, tasks) if batch_compute is None else batch_compute(tasks)
+
+
+def compute_chunk(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
+    """Return ``compute(task)`` of each task; or a mistake in a stage, to be raised where the stage was asked for.
+
+    That exception can be pickled, and a note of it holds the traceback.
+    """
+    try:
+        with memory.raising_shortage():
+            return list(compute_each(compute, chunk))
+    except Exception as error:
+        import pickle
+        import traceback
+
+        text = traceback.format_exc()
+        try:
+            portable: Exception = pickle.loads(pickle.dumps(error))
+        except Exception:
+            portable = RuntimeError(f"{type(error).__name__}: {error}")
+        portable.add_note(f"in a worker process:\n{text}")
+        return portable
+
+
+def start_fork_server(preload: Sequence[str]) -> ForkServerContext:
+    """Start the fork server, which imports the modules ``preload``, and return the context that starts processes.
+
+    A process starts one server, with the modules of the first call. SIGINT is blocked in the server and in the processes
+    that it forks, because this process handles Ctrl-C. Modules that do not exist are skipped.
+    """
+    import multiprocessing
+    import signal
+    from multiprocessing import forkserver, resource_tracker
+
+    memory.require_library("pyarrow")  # Each process loads it
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(list(preload))
+    resource_tracker.ensure_running()  # It unblocks signals, so it starts before they are blocked
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return server
+
+
+@contextlib.contextmanager
+def without_main() -> Iterator[None]:
+    """Have a process that starts in the block not import the program's main module, of which workers need nothing.
+
+    A script that calls `tacpipe.run` at its top level would otherwise run once more in each worker.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
 _POOL_FROM = 8  # starting workers costs more than a few shards
 
 
@@ -35,7 +118,7 @@ class Local:
         """
         jobs = min(self.jobs, len(tasks))
         in_this_process = jobs <= 1 or len(tasks) < self._pool_from
-        return chunks.compute_each(compute, tasks) if in_this_process else _run(compute, tasks, jobs, preload)
+        return compute_each(compute, tasks) if in_this_process else _run(compute, tasks, jobs, preload)
 
 
 @contextlib.contextmanager
@@ -49,7 +132,7 @@ def connected(address: str, jobs: int) -> Iterator[Local]:
 def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
     from multiprocessing.connection import wait  # 10 ms that a hit does not pay
 
-    pending = chunks.divide(tasks, jobs)
+    pending = divide_into_chunks(tasks, jobs)
     workers: dict[Connection, Connection] = {}
     try:
         _start(jobs, preload, workers)
@@ -72,14 +155,14 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
 
 def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connection]) -> None:
     """Start ``jobs`` workers; add the connection to each, and the one that keeps it alive, to ``workers``."""
-    context = forking.context(preload)
+    server = start_fork_server(preload)
     for number in range(jobs):
-        ours, theirs = context.Pipe()
-        alive, life = context.Pipe(duplex=False)
+        ours, theirs = server.Pipe()
+        alive, life = server.Pipe(duplex=False)
         workers[ours] = life
         # a worker that received half of its task would report that
-        with termination.deferred(), _death_told(), forking.without_main():
-            context.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
+        with termination.deferred(), _death_told(), without_main():
+            server.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
         theirs.close()
         alive.close()
 
@@ -91,7 +174,7 @@ def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> No
     while True:
         try:
             compute, chunk = tasks.recv()
-            tasks.send(chunks.computed(compute, chunk))
+            tasks.send(compute_chunk(compute, chunk))
         except (EOFError, OSError):
             return
 

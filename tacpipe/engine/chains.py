@@ -1,18 +1,109 @@
-"""The stages of a ``dvc.yaml`` file, and the order in which they run: each after those whose outputs it reads."""
+"""Read chains of commands from a ``dvc.yaml`` file: their stages, what each reads and writes, and their order.
+
+Texts in which ``${name}`` represents a value are filled in as DVC fills them in. A stage runs after those whose outputs it
+reads.
+"""
 
 from __future__ import annotations
 
 import posixpath
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from tacpipe.engine.chains import template
 from tacpipe.errors import UsageError
 from tacpipe.io import regular, yaml_text
 from tacpipe.printable import excerpt, listed, plain
+
+_FIELD = re.compile(r"(?<!\\)\$\{(?P<name>.*?)\}")
+_PART = re.compile(r"[^.\[\]]+")
+Values = Mapping[str, Any]
+
+
+def fill_template(value: Any, values: Values, place: str) -> Any:
+    """Return ``value`` with each ``${name}`` in its texts replaced; a text that is only such a name becomes its value.
+
+    Errors state ``place``. Raises `UsageError` for a name that has no value, and for a list or a mapping within a text.
+
+    >>> fill_template(["${a.b[1]}", "x-${a.c}"], {"a": {"b": [1, 2], "c": True}}, "dvc.yaml")
+    [2, 'x-true']
+    """
+    if isinstance(value, Mapping):
+        return {fill_template(key, values, place): fill_template(item, values, place) for key, item in value.items()}
+    if isinstance(value, list):
+        return [fill_template(item, values, place) for item in value]
+    if not isinstance(value, str):
+        return value
+    single = _FIELD.fullmatch(value)
+    if single is not None:
+        return _value(single["name"], values, place)
+    text = _FIELD.sub(lambda match: _as_text(match["name"], values, place), value)
+    return text.replace(r"\${", "${")
+
+
+def expand(definition: Mapping[str, Any], values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
+    """Yield the stages of a definition: the part of each name after ``@``, the template and its values.
+
+    A definition without ``foreach`` and ``matrix`` is one stage, with an empty part. Raises `UsageError` where
+    ``foreach`` is not a list or mapping, or ``matrix`` not a mapping of lists.
+    """
+    if "foreach" in definition:
+        for key, stage_values in _foreach_items(fill_template(definition["foreach"], values, place), place):
+            yield key, definition.get("do"), {**values, **stage_values}
+    elif "matrix" in definition:
+        template = {name: value for name, value in definition.items() if name != "matrix"}
+        for key, item in _combinations(fill_template(definition["matrix"], values, place), place):
+            yield key, template, {**values, "item": item, "key": key}
+    else:
+        yield "", definition, values
+
+
+def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Values]]:
+    if isinstance(items, Mapping):
+        yield from ((_text(key), {"key": _text(key), "item": item}) for key, item in items.items())
+    elif isinstance(items, list):
+        nested = any(isinstance(item, Mapping | list) for item in items)
+        yield from ((_text(number if nested else item), {"item": item}) for number, item in enumerate(items))
+    else:
+        raise UsageError(f"{place}: foreach is {excerpt(items)}; it must be a list or a mapping.")
+
+
+def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Values]]:
+    if not isinstance(axes, Mapping) or not all(isinstance(items, list) for items in axes.values()):
+        raise UsageError(f"{place}: matrix is {excerpt(axes)}; it must be a mapping of lists.")
+    for chosen in product(*(enumerate(items) for items in axes.values())):
+        choice = dict(zip(axes, chosen, strict=True))
+        parts = [
+            f"{axis}{number}" if isinstance(item, Mapping | list) else _text(item)
+            for axis, (number, item) in choice.items()
+        ]
+        yield "-".join(parts), {axis: item for axis, (_, item) in choice.items()}
+
+
+def _as_text(name: str, values: Values, place: str) -> str:
+    value = _value(name, values, place)
+    if isinstance(value, Mapping | list):
+        raise UsageError(f"{place}: ${{{name}}} is {excerpt(value)}, which `tacpipe run` does not put into a text.")
+    return _text(value)
+
+
+def _value(name: str, values: Values, place: str) -> Any:
+    value: Any = values
+    for part in _PART.findall(name):
+        try:
+            value = value[int(part)] if isinstance(value, Sequence) and not isinstance(value, str) else value[part]
+        except (LookupError, TypeError, ValueError):
+            raise UsageError(f"{place}: ${{{name}}} has no value; give it one in params.yaml or under vars.") from None
+    return value
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
 
 PARAMS = "params.yaml"  # Its values can be used in every text
 _OUTPUTS = ("outs", "metrics", "plots")
@@ -112,7 +203,7 @@ def _stages(file: Path) -> Iterator[ChainStage]:
                 if key not in definition:
                     raise UsageError(f"{place}: foreach and do belong together, and it has no {key}.")
             _check(definition["do"], _STAGE, f"{place}, do")
-        for key, stage_definition, stage_values in template.expand(definition, values, place):
+        for key, stage_definition, stage_values in expand(definition, values, place):
             yield _stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
 
 
@@ -143,10 +234,10 @@ def _fits(value: Any, schema: Any) -> bool:
     return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
-def _stage(name: str, definition: Mapping[str, Any], values: template.Values, file: Path, place: str) -> ChainStage:
+def _stage(name: str, definition: Mapping[str, Any], values: Values, file: Path, place: str) -> ChainStage:
     values = _values(file, definition.get("vars", []), values, place)
     used = {key: definition[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in definition}
-    resolved = template.filled(used, values, place)
+    resolved = fill_template(used, values, place)
     commands = resolved["cmd"] if isinstance(definition.get("cmd"), list) else [resolved.get("cmd")]
     if not commands or not all(isinstance(command, str) for command in commands):
         raise UsageError(f"{place}: its cmd is {excerpt(resolved.get('cmd'))}; it must be {_EXPECTED['cmd']}.")
@@ -187,7 +278,7 @@ def _is_within(path: str, folder: str) -> bool:
     return posixpath.isabs(folder) and posixpath.commonpath([path, folder]) == folder
 
 
-def _values(file: Path, entries: Sequence[Any], before: template.Values, place: str) -> template.Values:
+def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> Values:
     """Return the values that texts may use: those of ``before``, and over them those of ``vars``."""
     values = dict(before)
     for entry in entries:
@@ -199,7 +290,7 @@ def _values(file: Path, entries: Sequence[Any], before: template.Values, place: 
     return values
 
 
-def _merged(before: template.Values, over: template.Values) -> dict[str, Any]:
+def _merged(before: Values, over: Values) -> dict[str, Any]:
     merged = {
         key: _merged(before[key], value)
         if isinstance(value, Mapping) and isinstance(before.get(key), Mapping)
