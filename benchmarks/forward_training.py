@@ -35,7 +35,9 @@ def _line(folder: Path, rounds: int, batch: int, latents: int) -> timing.Line:
         with tempfile.TemporaryDirectory(dir=folder) as workspace:
             loop.train(
                 lambda: _load_weights(RecurrentForward(latents, STATES, HIDDEN), first),
-                loop.Windows(loop.Part(WINDOWS, _loss(rows, latents)), loop.Part(1, _loss(rows, latents)), batch),
+                loop.WindowTraining(
+                    loop.WindowSet(WINDOWS, _loss(rows, latents)), loop.WindowSet(1, _loss(rows, latents)), batch
+                ),
                 schedule,
                 Path(workspace),
             )

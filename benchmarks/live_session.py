@@ -70,7 +70,7 @@ def watch_memory(session: subprocess.Popen[str], memory_mb_over_time: dict[str, 
 def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], dict[str, list[tuple[float, float]]]]:
     """Run a session; return what it printed and its memory over time."""
     (port,) = free_ports(1)
-    world = World(SEED, pick_and_move.Rig(effort=EFFORT))
+    world = World(SEED, pick_and_move.PickRig(effort=EFFORT))
     sys.setswitchinterval(SWITCH_S)
     memory: dict[str, list[tuple[float, float]]] = {"recorder": [], "model": []}
     with Emulator(rigs.read(RIG), SEED, folder=folder / "emulated", world=world) as emulator:

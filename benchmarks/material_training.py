@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from tacpipe.models.minirocket import MinirocketClassifier
-from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
-from tacpipe.tasks.material.losses import JointWork, Pairs, ScaledSlides, Weights
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape, RecurrentAutoencoder
+from tacpipe.tasks.material.losses import BatchPairs, JointWork, ScaledSlides, Weights
 from tacpipe.training import loop
 
 SLIDES, CLASSES, BATCH, RATE = 600, 20, 32, 5e-4
-SHAPES = {"biotac": Shape(19, CLASSES), "roboskin": Shape(60, CLASSES, header="cnn")}
+SHAPES = {"biotac": AutoencoderShape(19, CLASSES), "roboskin": AutoencoderShape(60, CLASSES, header="cnn")}
 FRAMES = {"biotac": 400, "roboskin": 75}
 WEIGHTS = Weights(align_from=0)
 FIT_S = 30.0  # seconds that the MiniRocket classifier may take on two cores
@@ -49,7 +49,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
 class _Plain(nn.Module):
     """The paper's network as one would write it, batches first."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: AutoencoderShape) -> None:
         super().__init__()
         self.shape = shape
         self.grid = shape.header == "cnn"
@@ -169,7 +169,9 @@ def _felt(name: str) -> ScaledSlides:
 
 def _work(felt: Mapping[str, ScaledSlides]) -> JointWork:
     one_each = {name: ScaledSlides(slides.frames[:1], slides.classes[:1]) for name, slides in felt.items()}
-    return JointWork(felt, one_each, Pairs({name: slides.classes for name, slides in felt.items()}, BATCH), WEIGHTS)
+    return JointWork(
+        felt, one_each, BatchPairs({name: slides.classes for name, slides in felt.items()}, BATCH), WEIGHTS
+    )
 
 
 def _ours() -> nn.ModuleDict:

@@ -20,14 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording.reading import Batch, Reading
+from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import Faults, Item
+from tacpipe.simulation.emulation.byte_faults import Faults, SentItem
 from tacpipe.simulation.emulation.emulator import PACKETS, UNPACED_HZ, Emulator, pace
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.transmission import Plan
+from tacpipe.simulation.emulation.transmission import TransmissionPlan
 from tacpipe.testing import matching
 
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
@@ -68,8 +68,8 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     its_pace, rate_hz = pace(emulator.rig_file, name), stream.sensor.rate_hz or UNPACED_HZ
     source = emulator.source(name, its_pace, rate_hz)
     packets = stream.address.scheme in PACKETS
-    plan = Plan(source, its_pace, faults, [1], packets=packets)
-    ledger, reading = Ledger(name), Reading(stream.sensor)
+    plan = TransmissionPlan(source, its_pace, faults, [1], packets=packets)
+    ledger, reading = Ledger(name), LinkReader(stream.sensor)
     ledger.sources.append(source)
     batches: list[Batch] = []
     harmed: Counter[str] = Counter()
@@ -92,7 +92,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     return _compare_with_sent(name, ledger, batches, reading, dict(harmed))
 
 
-def _chunks(item: Item, *, packets: bool) -> Chunks:
+def _chunks(item: SentItem, *, packets: bool) -> Chunks:
     """Return an item as a link would give it; a link of bytes in two pieces."""
     half = len(item.data) // 2
     pieces = [item.data] if packets or not half else [item.data[:half], item.data[half:]]
@@ -100,7 +100,7 @@ def _chunks(item: Item, *, packets: bool) -> Chunks:
 
 
 def _compare_with_sent(
-    name: str, ledger: Ledger, batches: list[Batch], reading: Reading, harmed: dict[str, int]
+    name: str, ledger: Ledger, batches: list[Batch], reading: LinkReader, harmed: dict[str, int]
 ) -> Outcome:
     """Hold samples against what was sent: in the order of their sending, by all that they say."""
     sent = ledger.samples()
@@ -137,7 +137,7 @@ def _compare_with_sent(
     )  # fmt: skip
 
 
-def _keys(samples: Samples | Batch, reading: Reading) -> list[bytes]:
+def _keys(samples: Samples | Batch, reading: LinkReader) -> list[bytes]:
     """Return for each sample all that it says, its counter as the frame holds it."""
     modulus = reading.sensor.counter
     columns = [column for block in samples.values for column in block.T]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.engine import Comparison, Row
+    from tacpipe.comparison.engine import Comparison, ComparisonRow
 
 ROOT = Path(__file__).parents[1]
 CONSTANT = "constant"  # predictor of touch
@@ -93,7 +93,7 @@ def main_entries(comparison: Comparison) -> list[Entry]:
     return [entry(name, row, comparison) for name, row in chosen.items()]
 
 
-def entry(name: str, row: Row, comparison: Comparison) -> Entry:
+def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
     """Return a row with the value that its table states: skill over the constant for touch, else the score of its task."""
     from tacpipe.comparison import engine
 
@@ -104,7 +104,7 @@ def entry(name: str, row: Row, comparison: Comparison) -> Entry:
     return name, (value.mean, value.low, value.high), row.n
 
 
-def label(row: Row) -> str:
+def label(row: ComparisonRow) -> str:
     """Return a method's name, whether it is a paper's network, and its epochs where they are fewer than they could be."""
     shortened, paper = schedule(row)
     name = row.name.replace(f" ({shortened})", "").replace(f" · {shortened}", "") if shortened else row.name
@@ -113,7 +113,7 @@ def label(row: Row) -> str:
     return " · ".join(filter(None, [name, shortened]))
 
 
-def schedule(row: Row) -> tuple[str, bool]:
+def schedule(row: ComparisonRow) -> tuple[str, bool]:
     """Return a model's epochs as "10 of 16 epochs" where the full schedule has more, and whether that is a paper's."""
     from tacpipe.plugins import params as params_of
     from tacpipe.plugins import registry

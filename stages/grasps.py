@@ -63,7 +63,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
-    from tacpipe.clouds.segmentation import Limits, object_rows
+    from tacpipe.clouds.segmentation import SegmentationLimits, object_rows
 
     streams = {name: recording.table(name) for name in recording.streams}
     if set(FINISHED) <= set(streams) and "biotac_sp" not in streams:
@@ -76,7 +76,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
             f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams scene and grasp, and "
             f"biotac_sp once it was made, or {', '.join(FINISHED)} if its object is cut out already. Give such recordings."
         )
-    limits = Limits(
+    limits = SegmentationLimits(
         plane_m=params.plane_mm / 1e3,
         plane_fraction=params.plane_fraction,
         plane_trials=params.plane_trials,
@@ -108,7 +108,7 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
-    from tacpipe.signals.contact import Limits, contact_row, settled_rows
+    from tacpipe.signals.contact import ContactLimits, contact_row, settled_rows
 
     fields = biotac_sp.fields()
     missing = [field.name for field in fields if field.name not in stream.column_names]
@@ -117,7 +117,7 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
             f"The stream biotac_sp lacks {len(missing)} of {len(fields)} columns, as {missing[0]}. Record both "
             f"fingers whole."
         )
-    limits = Limits(params.rest_s, params.on_count, params.settle_s, params.settled_count)
+    limits = ContactLimits(params.rest_s, params.on_count, params.settle_s, params.settled_count)
     t_ns = stream.column("t_ns").to_numpy()  # (time,)
     names = [column for target in biotac_sp.TARGETS if target.startswith("pdc") for column in biotac_sp.columns(target)]
     pressure = np.column_stack([stream.column(name).to_numpy() for name in names]).astype(np.float64)  # (time, finger)

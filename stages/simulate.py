@@ -66,12 +66,12 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 
     Example: tacpipe simulate forward --trials 12 --duration-s 6 -o data/recordings
     """
-    from tacpipe.simulation.pick_and_move import Rig, simulate_trial
+    from tacpipe.simulation.pick_and_move import PickRig, simulate_trial
 
     values = asdict(params)
     del values["trials"]
     seed = values.pop("seed")
-    return simulate_trial(seed, trial, Rig(**values))
+    return simulate_trial(seed, trial, PickRig(**values))
 
 
 @dataclass(frozen=True)
@@ -108,12 +108,12 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
 
     Example: tacpipe simulate material --trials 96 --materials 4 -o data/touched
     """
-    from tacpipe.simulation.slide import Rig, simulate_trial
+    from tacpipe.simulation.slide import SlideRig, simulate_trial
 
     values = asdict(params)
     del values["trials"]
     seed = values.pop("seed")
-    return simulate_trial(seed, trial, Rig(**values))
+    return simulate_trial(seed, trial, SlideRig(**values))
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,9 @@ def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
     Example: tacpipe simulate touch --trials 96 --objects 1 -o data/pinched
     """
     from tacpipe.simulation.grasp import simulate_trial
-    from tacpipe.simulation.grasp_scene import Rig
+    from tacpipe.simulation.grasp_scene import GraspRig
 
     values = asdict(params)
     del values["trials"]
     seed = values.pop("seed")
-    return simulate_trial(seed, trial, Rig(**values))
+    return simulate_trial(seed, trial, GraspRig(**values))

@@ -92,7 +92,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     rate_hz = _rate_hz(recording.name, t_ns)
     contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
     still_rows, patch_count = round(params.still_s * rate_hz), params.patch_mm * params.count_per_mm
-    limits = slip.Limits(
+    limits = slip.SlipLimits(
         on_sigma=params.on_sigma,
         off_sigma=params.off_sigma,
         on_rows=params.on_frames,

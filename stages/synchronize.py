@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Int64s, Times
     from tacpipe.datasets.dataset import Recording
-    from tacpipe.synchronization.streams import Stream
+    from tacpipe.synchronization.streams import TimedStream
 
 
 IN_MEMORY = 1 << 25  # bytes of finished columns, beyond which they are put aside in a temporary file
@@ -108,7 +108,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     } or recorded_streams
     hold_values = params.values == "hold"
     storage = MappedArrays(IN_MEMORY)
-    placed: dict[str, Stream] = {}
+    placed: dict[str, TimedStream] = {}
     for name, stored in signal_streams.items():
         placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
         stored.forget()
@@ -160,7 +160,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _on_grid(
-    params: Params, stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
+    params: Params, stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
 ) -> list[tuple[pa.Field, Any]]:
     """Return field and values of a stream's channels on the grid, and of its masks; ground truth has none."""
     from tacpipe.synchronization import columns

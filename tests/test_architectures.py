@@ -25,13 +25,13 @@ from subprocess import run  # which no file of a model may name through this mod
 from typing import Any, Literal
 
 from tacpipe.plugins.constraints import PositiveInt
-from tacpipe.tasks.forward.params import Forward
-from tacpipe.tasks.material.params import Estimator, Material, Network
+from tacpipe.tasks.forward.params import ForwardModelParams
+from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
 from tacpipe.tasks.touch.params import Patches
 
 
 @dataclass(frozen=True)
-class Plain(Forward):
+class Plain(ForwardModelParams):
     """A linear map of the last row."""
 
     architecture: Literal["plain"] = "plain"  # plain: a linear map
@@ -57,7 +57,7 @@ class Plain(Forward):
 
 
 @dataclass(frozen=True)
-class Scores(Network):
+class Scores(NetworkParams):
     """The mean of each channel, weighed."""
 
     architecture: Literal["scores"] = "scores"
@@ -139,14 +139,14 @@ class Flat(Patches):
 
 
 @dataclass(frozen=True)
-class Unfinished(Material):
+class Unfinished(MaterialModelParams):
     """A classifier that nothing fits."""
 
     architecture: Literal["unfinished"] = "unfinished"
 
 
 @dataclass(frozen=True)
-class Majority(Material):
+class Majority(MaterialModelParams):
     """Names the most frequent material of each sensor."""
 
     architecture: Literal["majority"] = "majority"
@@ -158,7 +158,7 @@ class Majority(Material):
 
 
 @dataclass(frozen=True)
-class Double(Forward):
+class Double(ForwardModelParams):
     """A name that the library has."""
 
     architecture: Literal["double", "gru"] = "double"
@@ -314,7 +314,7 @@ def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_byt
 
     params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
-    fitted, refitted = (estimators.Fitted.fit(params, frames, materials) for _ in range(2))
+    fitted, refitted = (estimators.FittedEstimator.fit(params, frames, materials) for _ in range(2))
     content = estimators.packed({"biotac": fitted}, params)
     assert content == estimators.packed({"biotac": refitted}, params)
     assert b"pickle" not in content
@@ -333,7 +333,7 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
 
     params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
-    content = estimators.packed({"biotac": estimators.Fitted.fit(params, frames, materials)}, params)
+    content = estimators.packed({"biotac": estimators.FittedEstimator.fit(params, frames, materials)}, params)
     rng = np.random.default_rng(0)
     for _ in range(40):
         changed = bytearray(content)
@@ -359,7 +359,7 @@ def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts
 
     frames, materials = slides(0)
     forest, trusting = (build_train_params("material", architecture=name) for name in ("forest", "trusting"))
-    fitted = {"biotac": estimators.Fitted.fit(forest, frames, materials)}
+    fitted = {"biotac": estimators.FittedEstimator.fit(forest, frames, materials)}
     with pytest.raises(TacpipeError, match=r"sklearn\.tree\._tree\.Tree"):
         estimators.packed(fitted, forest)
     content = estimators.packed(fitted, trusting)
@@ -375,7 +375,7 @@ def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None
 
     params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
-    fitted = estimators.Fitted.fit(params, frames, materials)
+    fitted = estimators.FittedEstimator.fit(params, frames, materials)
     with pytest.raises(TacpipeError, match=r"30 slides are \(8, 4\)"):
         dataclasses.replace(fitted, features=lambda values: values.mean(axis=0)).scores(frames)
     with pytest.raises(TacpipeError, match="not all finite"):
@@ -385,12 +385,12 @@ def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None
 def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package: Path) -> None:
     import torch
 
-    from tacpipe.models.recurrent_autoencoder import Shape
+    from tacpipe.models.recurrent_autoencoder import AutoencoderShape
     from tacpipe.tasks.material import networks
     from tacpipe.tasks.touch import members
 
     scores = build_train_params("material", architecture="scores")
-    scores_network = networks.build(scores, Shape(channels=4, classes=3))
+    scores_network = networks.build(scores, AutoencoderShape(channels=4, classes=3))
     networks.check(scores_network, scores, torch.zeros(5, 8, 4), 3)
     with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
         networks.check(scores_network, scores, torch.zeros(5, 8, 4), 4)
@@ -414,10 +414,11 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
 
 def test_reports_name_an_architecture_as_its_class_states_it_and_others_by_their_choice(package: Path) -> None:
     from tacpipe.plugins import architectures
-    from tacpipe.tasks.material.params import Material
+    from tacpipe.tasks.material.params import MaterialModelParams
 
     titles = [
-        architectures.title(Material, name) for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")
+        architectures.title(MaterialModelParams, name)
+        for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")
     ]
     assert titles == ["RAEC", "X-LSTM", "statistics", "nearest", "uninstalled"]
 

@@ -101,7 +101,7 @@ def test_what_is_announced_while_a_collection_is_at_it_is_put_back(lab: Lab, mon
     age(lab)
     looks = 0
 
-    def looking(store: Store, *arguments: object, **options: object) -> garbage.Live:
+    def looking(store: Store, *arguments: object, **options: object) -> garbage.LiveObjects:
         nonlocal looks
         looks += 1
         if looks == 2:  # everything was moved aside by now

@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.cli import headline_table
 from tacpipe.metrics import headline
-from tacpipe.metrics.headline import Headline, Row
+from tacpipe.metrics.headline import Headline, HeadlineRow
 
 ONE = Headline(
     "forward",
@@ -19,8 +19,8 @@ ONE = Headline(
     ("MAE t+1",),
     "counts",
     "the squared error",
-    Row("net", (7.5,)),
-    (Row("ridge", (8.25,)), Row("persistence", (9.0,))),
+    HeadlineRow("net", (7.5,)),
+    (HeadlineRow("ridge", (8.25,)), HeadlineRow("persistence", (9.0,))),
     "skill",
     0.1,
     0.02,
@@ -85,7 +85,7 @@ def test_several_are_better_together_only_where_each_is() -> None:
 
 
 def test_headlines_are_read_as_they_were_written() -> None:
-    undefined = headline_with(gain=float("nan"), model=Row("net", (float("nan"),)))
+    undefined = headline_with(gain=float("nan"), model=HeadlineRow("net", (float("nan"),)))
     (first, second) = headline.read(headline.write([ONE, undefined]))
     assert first == ONE
     assert math.isnan(second.gain) and math.isnan(second.model.values[0])
@@ -109,7 +109,7 @@ def test_the_table_has_the_model_above_its_best_baseline_and_how_the_interval_wa
 
 def test_the_table_fits_the_width_and_keeps_the_error_that_ranks_and_the_interval() -> None:
     columns = ("MAE t+1", "MAE t+3", "MAE t+5", "MAE t+10", "vs persistence")
-    rows = [Row(name, (5.7, 13.39, 21.85, 40.87, 0.3803)) for name in ("taxelwise · raw", "last_value_linear")]
+    rows = [HeadlineRow(name, (5.7, 13.39, 21.85, 40.87, 0.3803)) for name in ("taxelwise · raw", "last_value_linear")]
     wide = headline_with(
         columns=columns, model=rows[0], baselines=(rows[1],), method="taxelwise · raw", low=-0.068, high=0.025
     )

@@ -61,7 +61,7 @@ from dataclasses import dataclass
 
 from tacpipe import Dataset, Result, stage
 from tacpipe.comparison.specification import TaskReport
-from tacpipe.report.blocks import Fold, Note
+from tacpipe.report.blocks import Fold, SmallPrint
 from tacpipe.tasks.task import Task
 
 
@@ -74,7 +74,7 @@ class WeighingReport(TaskReport):
     title = "weights of objects"
 
     def folds(self, context):
-        return [Fold("Scales", [Note(f"{len(context.bare)} scales")])]
+        return [Fold("Scales", [SmallPrint(f"{len(context.bare)} scales")])]
 
 
 class Weighing(Task):

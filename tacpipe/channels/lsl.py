@@ -48,7 +48,7 @@ MOST_BYTES = 1 << 24  # largest size of a description
 
 
 @dataclass(frozen=True)
-class Channel:
+class LslChannel:
     """One channel of a stream."""
 
     name: str  # an identifier, unique in its stream
@@ -66,14 +66,14 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Description:
+class LslDescription:
     """The description that a stream states."""
 
     name: str
     kind: str  # its type, as "EEG" or "Markers"
     format: str  # key of `FORMATS`
     rate_hz: float  # 0: irregular
-    channels: tuple[Channel, ...]
+    channels: tuple[LslChannel, ...]
     source_id: str = ""
     uid: str = ""
     host: str = ""
@@ -89,7 +89,7 @@ class Description:
         return FORMATS[self.format]
 
 
-def parse(text: str | bytes) -> Description:
+def parse(text: str | bytes) -> LslDescription:
     """Return the description in an ``<info>`` of LSL.
 
     Raises `TacpipeError` for what is not one: no XML, no such format, a count of channels or a rate that is none.
@@ -115,12 +115,12 @@ def parse(text: str | bytes) -> Description:
         raise TacpipeError(f"its nominal_srate is {excerpt(rate)}, not a rate in hertz")
     texts = {name: root.findtext(name, "").strip() for name in ("name", "type", "source_id", "uid", "hostname")}
     channels = _channels(root.findall("desc/channels/channel"), int(count), texts["type"], text=form == "string")
-    return Description(
+    return LslDescription(
         texts["name"], texts["type"], form, rate_hz, channels, texts["source_id"], texts["uid"], texts["hostname"]
     )
 
 
-def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[Channel, ...]:
+def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[LslChannel, ...]:
     """Return ``count`` channels: as described where there are as many descriptions, or else numbered."""
     labels = [element.findtext("label", "").strip() for element in described] if len(described) == count else []
     if not all(labels) or not labels:
@@ -135,10 +135,12 @@ def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: b
         quantity, component = _quantity("" if element is None else element.findtext("type", ""), kind, labels[place])
         unit_name = UNITS.get(unit.lower(), unit)
         if text:
-            channels.append(Channel(name, "1", "text"))
+            channels.append(LslChannel(name, "1", "text"))
             continue
         taxel = TAXEL.fullmatch(labels[place].lower()) if quantity == "tactile" and described else None
-        channels.append(Channel(name, unit_name, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ())))
+        channels.append(
+            LslChannel(name, unit_name, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ()))
+        )
     return tuple(channels)
 
 

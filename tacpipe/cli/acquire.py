@@ -122,7 +122,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, trials, triggers
     from tacpipe.recording.recorder import Recorder, complete_rig
-    from tacpipe.recording.watch import View
+    from tacpipe.recording.watch import RigView
 
     for value, option, choices in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in choices:
@@ -136,7 +136,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
     recorder = Recorder(complete_rig(rig))
-    with EndRequest() as is_over, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+    with EndRequest() as is_over, recorder.open(), RigView(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(is_over)
         recorded, lost = trials.run(recorder, store, plan, view, is_over)
     for recording in recorded if not quiet else ():

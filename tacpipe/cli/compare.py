@@ -15,7 +15,7 @@ from tacpipe.comparison import engine
 from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.io.terminal import Group, Row, Table
+from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics import headline
 from tacpipe.store.location import locate
 
@@ -37,7 +37,7 @@ class Compared:
     pooled: bool
     places: Mapping[str, str] = field(default_factory=dict)  # Paths of datasets by manifest digest
 
-    def paths(self, row: engine.Row) -> list[str]:
+    def paths(self, row: engine.ComparisonRow) -> list[str]:
         """Return the paths of the results of a row."""
         places = {id(result): path for path, result in self.results.items()}
         return [places[id(run.dataset)] for run in row.method.runs]
@@ -47,7 +47,7 @@ class Compared:
         used = {path for comparison in self.comparisons for row in comparison.rows for path in self.paths(row)}
         return [path for path in self.results if path not in used]
 
-    def differing(self, rows: Iterable[engine.Row]) -> dict[str, list[str]]:
+    def differing(self, rows: Iterable[engine.ComparisonRow]) -> dict[str, list[str]]:
         """Return the columns in which rows of methods differ, by name: settings, data, and without pooling the result."""
         all_rows = list(rows)
         names = dict.fromkeys(name for row in all_rows for name in row.differing)
@@ -79,7 +79,7 @@ class Compared:
             "rows": [self._row(comparison, row) for row in comparison.rows],
         }
 
-    def _row(self, comparison: Comparison, row: engine.Row) -> dict[str, Any]:
+    def _row(self, comparison: Comparison, row: engine.ComparisonRow) -> dict[str, Any]:
         model = row.kind in ("model", "variant", "control") and row.predictor.startswith("model")
         return {
             "name": row.name,
@@ -117,7 +117,7 @@ class Compared:
         writer.writerows(flat)
         return text.getvalue().rstrip("\n")
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[TerminalTable]:
         """Return one table per task, kind of errors and unit: methods the best first, below them their best baseline."""
         by_columns: dict[tuple[str, ...], list[Comparison]] = {}
         for comparison in self.comparisons:
@@ -127,7 +127,7 @@ class Compared:
             )
         return [self._table(comparisons) for comparisons in by_columns.values()]
 
-    def _table(self, comparisons: Sequence[Comparison]) -> Table:
+    def _table(self, comparisons: Sequence[Comparison]) -> TerminalTable:
         measure = comparisons[0].measure
         competing = [[row for row in comparison.rows if _competes(row)] for comparison in comparisons]
         all_rows = [row for rows in competing for row in rows]
@@ -150,26 +150,26 @@ class Compared:
                     f"{row.n:,}",
                     *([str(row.runs)] if pooled else []),
                 ]
-                lines.append(Row(cells, _style(row)))
+                lines.append(TerminalRow(cells, _style(row)))
                 index += 1
             best = comparison.best_baseline
             if best is not None:
                 empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
                 cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
-                lines.append(Row(cells, "dim"))
+                lines.append(TerminalRow(cells, "dim"))
                 for reference in (
                     row for row in comparison.of("baseline") if row.name == measure.reference and row is not best
                 ):
                     cells = [reference.name, *[""] * len(differing), *map(headline.number, reference.values), *empty]
-                    lines.append(Row(cells, "dim"))
+                    lines.append(TerminalRow(cells, "dim"))
             groups.append(
-                Group(comparison.question.where if len(comparisons) > 1 or comparison.question.where else "", lines)
+                RowGroup(comparison.question.where if len(comparisons) > 1 or comparison.question.where else "", lines)
             )
         first = 1 + len(differing)
         errors = list(range(first, first + len(measure.columns)))
         spare = [*errors[1:-2], *errors[-2:-1], *errors[:1]] if len(errors) > 2 else errors[:1] * (len(errors) > 1)
         texts = [0, *range(1, first), *([heads.index("vs")] if names_baselines else [])]
-        return Table(heads, groups, self._caption(comparisons), spare=list(dict.fromkeys(spare)), left=texts)
+        return TerminalTable(heads, groups, self._caption(comparisons), spare=list(dict.fromkeys(spare)), left=texts)
 
     def _caption(self, comparisons: Sequence[Comparison]) -> str:
         measure = comparisons[0].measure
@@ -211,17 +211,17 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     return compared
 
 
-def _competes(row: engine.Row) -> bool:
+def _competes(row: engine.ComparisonRow) -> bool:
     """Return whether a row is of a trained method: a model, or a control that was trained too."""
     return row.kind == "model" or (row.kind == "control" and row.predictor == "model")
 
 
-def _first_name(row: engine.Row) -> str:
+def _first_name(row: engine.ComparisonRow) -> str:
     name = row.method.runs[0].method
     return f"{name} (control)" if row.kind == "control" else name
 
 
-def _gain(row: engine.Row, measure: str) -> list[str]:
+def _gain(row: engine.ComparisonRow, measure: str) -> list[str]:
     if not row.baseline:
         return [headline.NONE, headline.NONE]
     low, high = (headline.signed(value, measure) for value in (row.gain.low, row.gain.high))
@@ -229,7 +229,7 @@ def _gain(row: engine.Row, measure: str) -> list[str]:
     return [headline.signed(row.gain.mean, measure), interval]
 
 
-def _style(row: engine.Row) -> str:
+def _style(row: engine.ComparisonRow) -> str:
     return {headline.BETTER: "green", headline.WORSE: "red"}.get(row.gain.verdict, "")
 
 

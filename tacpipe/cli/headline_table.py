@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tacpipe.datasets import manifest
 from tacpipe.io import terminal
-from tacpipe.io.terminal import Group, Row, Table
+from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
@@ -33,7 +33,7 @@ def method(task: object, stored: object) -> str:
     return str(params_of.with_current_names(f"train.{task}", {"architecture": stored})["architecture"])
 
 
-def table(headlines: Sequence[Headline]) -> Table:
+def table(headlines: Sequence[Headline]) -> TerminalTable:
     """Return the table of one headline or more: under each part the model, and below it its best baseline."""
     first = headlines[0]
     heads = ["", *first.columns, first.measure, "95 % interval", "n"]
@@ -42,17 +42,21 @@ def table(headlines: Sequence[Headline]) -> Table:
         styles = {headline.BETTER: "green", headline.WORSE: "red"}
         gain = [headline.signed(entry.gain, entry.measure) if entry.best else headline.NONE, headline.bounds(entry)]
         cells = [entry.method, *map(headline.number, entry.model.values), gain[0], gain[1] or headline.NONE]
-        rows = [Row([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
+        rows = [TerminalRow([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
         if entry.best:
             values = map(headline.number, entry.best.values)
             rows.append(
-                Row([f"vs {entry.best.name.replace('_', ' ')}", *values, "", _VERDICTS[entry.verdict], ""], "dim")
+                TerminalRow(
+                    [f"vs {entry.best.name.replace('_', ' ')}", *values, "", _VERDICTS[entry.verdict], ""], "dim"
+                )
             )
             baselines = [row for row in entry.table_baselines if row is not entry.best]
-            rows += [Row([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
-        groups.append(Group(entry.where, rows))
+            rows += [TerminalRow([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
+        groups.append(RowGroup(entry.where, rows))
     errors = list(range(1, len(first.columns)))  # Results are ranked by the last column.
-    return Table(heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)])
+    return TerminalTable(
+        heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)]
+    )
 
 
 def caption(headlines: Sequence[Headline]) -> str:

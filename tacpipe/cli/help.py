@@ -48,7 +48,7 @@ SECTIONS = {  # Commands in the order in which ``tacpipe --help`` lists them. St
 PLUG_INS = "Plug-ins"
 
 
-class Command(TyperCommand):
+class PanelCommand(TyperCommand):
     """A command whose help shows its options in panels: the one an option names, else that of `PANELS`."""
 
     brief = False  # True shows only the common options.
@@ -124,13 +124,13 @@ class Command(TyperCommand):
             formatter.write(f"\n{hidden} more {'option' if hidden == 1 else 'options'}: {ctx.command_path} --help\n")
 
 
-class BriefCommand(Command):
+class BriefCommand(PanelCommand):
     """A command whose help is that of ``-h``."""
 
     brief = True
 
 
-class Group(TyperGroup):
+class HelpGroup(TyperGroup):
     """A group of commands whose help shows the complete summary of each."""
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
@@ -219,10 +219,10 @@ def _brief_record(param: Any, ctx: Any) -> tuple[str, str]:
 
 def apply(program: typer.Typer, *, brief: bool) -> None:
     """Give every command and group of ``program`` this help, the one of ``-h`` where ``brief`` is true."""
-    program.info.cls = Group
+    program.info.cls = HelpGroup
     for group in program.registered_groups:
-        group.cls = Group
+        group.cls = HelpGroup
         if group.typer_instance is not None:
             apply(group.typer_instance, brief=brief)
     for command in program.registered_commands:
-        command.cls = BriefCommand if brief else Command
+        command.cls = BriefCommand if brief else PanelCommand

@@ -134,7 +134,7 @@ def _run(
     from tacpipe.live import session
     from tacpipe.recording import appending, trials
     from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.watch import View
+    from tacpipe.recording.watch import RigView
     from tacpipe.store import location
 
     store = location.locate(*([] if output is None else [output]))
@@ -152,7 +152,7 @@ def _run(
         EndRequest() as is_over,
         session.run_model(recorder, prepared.options, is_over) as supervisor,
         recorder.open(),
-        View(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
+        RigView(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(is_over)
         if plan is not None and supervisor.alarms.get("levels"):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.errors import UsageError
-from tacpipe.io.terminal import Group, Row, Table
+from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
 
@@ -50,7 +50,7 @@ class StreamFigures(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class Column:
+class StreamColumn:
     """A column, and the stream that it belongs to."""
 
     stream: str
@@ -61,7 +61,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Interval:
+class ShownInterval:
     """A gap of a stream, or a time in which a label of rows has one value; in seconds since the start of the recording."""
 
     name: str  # Name of the stream or of the label
@@ -71,7 +71,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Event:
+class RecordedEvent:
     """An event that was recorded, in seconds since the start of the recording."""
 
     time_s: float
@@ -90,10 +90,10 @@ class RecordingOverview:
     start_ns: int | None
     duration_s: float | None
     streams: Mapping[str, StreamFigures]
-    columns: Sequence[Column]
-    gaps: Sequence[Interval]
-    label_spans: Sequence[Interval]
-    events: Sequence[Event]
+    columns: Sequence[StreamColumn]
+    gaps: Sequence[ShownInterval]
+    label_spans: Sequence[ShownInterval]
+    events: Sequence[RecordedEvent]
     attributes: Mapping[str, Any]
 
     def to_json(self) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
     opened = _open(dataset)
     recording = opened[name]
     figures: dict[str, StreamFigures] = {}
-    columns: list[Column] = []
+    columns: list[StreamColumn] = []
     clocks: list[streams.Clocks] = []
     gaps: list[Span] = []
     label_spans: list[Span] = []
@@ -159,7 +159,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
         columns,
         _intervals(gaps, origin_ns),
         _intervals(label_spans, origin_ns),
-        [Event((event.t_ns - origin_ns) / 1e9, event.stream, event.text) for event in events],
+        [RecordedEvent((event.t_ns - origin_ns) / 1e9, event.stream, event.text) for event in events],
         dict(recording.attributes),
     )
 
@@ -170,12 +170,12 @@ def _open(dataset: Path) -> Dataset:
     return tacpipe.open(dataset)
 
 
-def _columns(stream: str, schema: pa.Schema) -> list[Column]:
+def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
     from tacpipe.traces.curves import described
 
     about = {field.name: described(field) for field in schema}
     return [
-        Column(
+        StreamColumn(
             stream or about[field.name].get("stream", ""),
             field.name,
             about[field.name].get("quantity", ""),
@@ -194,9 +194,9 @@ def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
     return pa.table([stored.column(name) for name in names], pa.schema([stored.schema.field(name) for name in names]))
 
 
-def _intervals(marked: Sequence[Span], origin_ns: int) -> list[Interval]:
+def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
     return [
-        Interval(span.lane, span.text, (span.start_ns - origin_ns) / 1e9, (span.stop_ns - origin_ns) / 1e9)
+        ShownInterval(span.lane, span.text, (span.start_ns - origin_ns) / 1e9, (span.stop_ns - origin_ns) / 1e9)
         for span in marked
     ]
 
@@ -281,15 +281,15 @@ def _streams_text(recording: RecordingOverview) -> str:
         values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz")]
         cells = ["" if value is None else f"{value:,}" for value in values]
         rows.append(
-            Row((shown(stream) or "-", *cells, gaps_text(figures), repeated, str(figures.get("saturated", ""))))
+            TerminalRow((shown(stream) or "-", *cells, gaps_text(figures), repeated, str(figures.get("saturated", ""))))
         )
     notes = [RATES, _MEAN_RATES] if recording.start_ns is not None else []
     if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
         notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")
-    return Table(heads, [Group("", rows)], caption=" ".join(notes)).text()
+    return TerminalTable(heads, [RowGroup("", rows)], caption=" ".join(notes)).text()
 
 
-def _columns_table(columns: Sequence[Column], full: bool) -> Table:
+def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable:
     """Return a table of the columns by stream; neighbours that differ only in their names share a row."""
     groups = []
     for stream, members in groupby(columns, lambda column: column.stream):
@@ -299,9 +299,9 @@ def _columns_table(columns: Sequence[Column], full: bool) -> Table:
         ):
             names = [shown(column.name) for column in alike]
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
-            rows.append(Row((text, str(len(names)), *(shown(value) for value in about[:3]))))
-        groups.append(Group(shown(stream) or "-", rows))
-    return Table(("column", "count", "quantity", "unit", "type"), groups, left=(0, 2, 3, 4))
+            rows.append(TerminalRow((text, str(len(names)), *(shown(value) for value in about[:3]))))
+        groups.append(RowGroup(shown(stream) or "-", rows))
+    return TerminalTable(("column", "count", "quantity", "unit", "type"), groups, left=(0, 2, 3, 4))
 
 
 def _gaps_text(recording: RecordingOverview, full: bool) -> str:
@@ -319,7 +319,7 @@ def _gaps_text(recording: RecordingOverview, full: bool) -> str:
     return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
 
 
-def _intervals_text(label_spans: Sequence[Interval], full: bool) -> str:
+def _intervals_text(label_spans: Sequence[ShownInterval], full: bool) -> str:
     lines = []
     for label in dict.fromkeys(span.name for span in label_spans):
         places = [
@@ -331,7 +331,7 @@ def _intervals_text(label_spans: Sequence[Interval], full: bool) -> str:
     return "\n".join(["labels of rows", *(f"  {shown(line)}" for line in lines)]) if lines else ""
 
 
-def _events_text(events: Sequence[Event], full: bool) -> str:
+def _events_text(events: Sequence[RecordedEvent], full: bool) -> str:
     lines = [f"  {event.time_s:.3f} s  {shown(f'{event.stream}: {event.text}')}" for event in events]
     retained = lines if full else lines[:_LISTED]
     ending = [f"  … and {len(lines) - len(retained)} more (--full)"] if len(lines) > len(retained) else []

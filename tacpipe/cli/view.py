@@ -16,7 +16,7 @@ from tacpipe.plugins import extras
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.plugins.stage import Attribute
-    from tacpipe.viewer.contents import Contents
+    from tacpipe.viewer.contents import DrawnContents
 
 EXAMPLE = (
     "\n\nTaxels at the cursor, streams, contacts, labels, gaps, the arm, clouds and cameras on one time axis. Several "
@@ -130,7 +130,7 @@ def _chosen(
     return opened.select(*names, split=split, role=role, fold=fold, labels=required_labels)
 
 
-def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[Contents]:
+def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[DrawnContents]:
     """Yield the contents of each recording. Raises `UsageError` for a recording with nothing to draw."""
     from tacpipe.viewer import contents
 

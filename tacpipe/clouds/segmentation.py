@@ -25,7 +25,7 @@ SAMPLED = 10_000  # points that state a plane as well as all of a view do
 
 
 @dataclass(frozen=True)
-class Limits:
+class SegmentationLimits:
     """Limits of the table, of one object, and of the grasped object."""
 
     plane_m: float  # largest distance of a point from its plane, larger where points spread more
@@ -39,7 +39,7 @@ class Limits:
     outlier_deviations: float  # standard deviations of that distance above its mean, beyond which a point is stray
 
 
-def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Indices:
+def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: int = 0) -> Indices:
     """Return which points of a view (point,) are the grasped object, in their order; the camera is at the origin.
 
     Raises `TacpipeError` where no table is found, nothing stands on it, nothing that stands there is near
@@ -74,7 +74,7 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> In
     return object_points
 
 
-def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -> Floats:
+def table_plane(points_m: Floats, grasp: Grasp, limits: SegmentationLimits, seed: int = 0) -> Floats:
     """Return the table's plane (normal and offset, 4): of the large ones behind the middle of the grasp the nearest.
 
     The normal has length 1 and points to the camera's side, where the grasp lies. Sides of the object are not a table: the
@@ -130,7 +130,7 @@ def _cloud(library: Any, points_m: Floats) -> Any:
     return library.geometry.PointCloud(library.utility.Vector3dVector(points_m))
 
 
-def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
+def _largest_plane(points_m: Floats, limits: SegmentationLimits, seed: int) -> Floats:
     """Return the plane (4,) that the most points (point, xyz) lie in, derived from `SAMPLED` of them."""
     sampled = points_m
     if len(points_m) > SAMPLED:
@@ -145,7 +145,7 @@ def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
     return normalised if normalised[3] >= 0 else -normalised
 
 
-def _clusters(points_m: Floats, limits: Limits) -> Int64s:
+def _clusters(points_m: Floats, limits: SegmentationLimits) -> Int64s:
     """Return the number of the cluster of each point (point,), -1 for those of none with ``object_points``."""
     if not len(points_m):
         return np.zeros(0, dtype=np.int64)
@@ -156,7 +156,7 @@ def _clusters(points_m: Floats, limits: Limits) -> Int64s:
     return np.where(sizes[labels + 1] >= limits.object_points, labels, -1)
 
 
-def _inliers(points_m: Floats, limits: Limits) -> Indices:
+def _inliers(points_m: Floats, limits: SegmentationLimits) -> Indices:
     """Return which points (point, xyz) are not a stray ones."""
     with open3d() as library:
         _, inliers = _cloud(library, points_m).remove_statistical_outlier(

@@ -38,7 +38,7 @@ GRADIENT_CLIP = 1.0  # largest norm of the gradient, without unit, as of the for
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkShape:
     """One of the networks to try: hidden layers of the encoder, mirrored in the decoder, and how Adam steps."""
 
     hidden: tuple[int, ...]
@@ -48,7 +48,7 @@ class Network:
 
 def networks(
     frames: int, hidden: str, search: int, learning_rate: float = 1e-3, weight_decay: float = 1e-5
-) -> list[Network]:
+) -> list[NetworkShape]:
     """Return the networks to try: the first ``search`` of those that there are or, where it is 0, that of ``hidden``.
 
     ``hidden`` is text such as ``64,32``; empty, it is that of the class of ``frames``. Raises `TacpipeError`
@@ -66,9 +66,9 @@ def networks(
     if search and hidden:
         raise TacpipeError(f"hidden is {hidden!r} and search is {search}, which tries its own. Give one of them.")
     if not search:
-        return [Network(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
+        return [NetworkShape(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
     tried = [
-        Network(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
+        NetworkShape(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
         for fast, decay in STEPS
         for shape in SHAPES
     ]
@@ -77,7 +77,7 @@ def networks(
 
 def fit(
     rows: TrainingRows,
-    tried: Sequence[Network],
+    tried: Sequence[NetworkShape],
     schedule: loop.Schedule,
     workspace: Path,
     *,
@@ -151,7 +151,7 @@ def _stack(widths: Sequence[int], bias: bool) -> nn.Sequential:
 def _trained(
     learned: Tensor,
     watched: Tensor,
-    network: Network,
+    network: NetworkShape,
     schedule: loop.Schedule,
     workspace: Path,
     place: tuple[int, int],  # index and number among the networks that are tried
@@ -160,16 +160,16 @@ def _trained(
 ) -> loop.Trained:
     widths, (index, count) = (learned.shape[1], *network.hidden, components), place
 
-    def part(rows: Tensor) -> loop.Part:
+    def part(rows: Tensor) -> loop.WindowSet:
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
             picked = rows[indices]
             return nn.functional.mse_loss(model(picked), picked)
 
-        return loop.Part(len(rows), loss)
+        return loop.WindowSet(len(rows), loss)
 
     return loop.train(
         lambda: _Mirrored(widths, bias=representation == codecs.LEVELS).to(learned.device),
-        loop.Windows(part(learned), part(watched), schedule.batch),
+        loop.WindowTraining(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace / f"{index:02d}",
         weight_decay=network.weight_decay,
@@ -183,7 +183,7 @@ def _lowest(trained: loop.Trained) -> float:
     return min(float(line["val_loss"]) for line in trained.history)
 
 
-def _record(network: Network, trained: loop.Trained) -> dict[str, Any]:
+def _record(network: NetworkShape, trained: loop.Trained) -> dict[str, Any]:
     """Return the record of a network in the search; no seconds, which are never the same."""
     return {
         "hidden": list(network.hidden),

@@ -26,7 +26,7 @@ NAMES = ("reconstruction", "latent_covariance", "search")
 DIGITS = 6  # stored digits; beyond them the order of additions matters, which the number of threads changes
 
 
-class Fitted(Protocol):
+class RowCodec(Protocol):
     """A codec that reads rows as `tacpipe.codecs.codec.inputs` makes them."""
 
     @property
@@ -40,13 +40,13 @@ class Fitted(Protocol):
         """Return the counts that latents decode to."""
 
 
-def reconstructions(codec: Fitted, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, dict[str, float]]:
+def reconstructions(codec: RowCodec, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, dict[str, float]]:
     """Return the errors on each part, of rows (row, frames * channel) in pieces; a part without rows is left out."""
     errors_by_part = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
     return {name: errors for name, errors in errors_by_part.items() if errors}
 
 
-def reconstruction(codec: Fitted, pieces: Iterable[AnyFloats]) -> dict[str, float]:
+def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> dict[str, float]:
     """Return the errors of encoding and decoding rows (row, frames * channel), and their number; nothing of no rows."""
     rows, squares, deviations, width = 0, 0.0, 0.0, len(codec.scale_count)
     for inputs in pieces:

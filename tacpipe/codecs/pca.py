@@ -28,7 +28,7 @@ from tacpipe.codecs.codec import (
     latent_names,
 )
 from tacpipe.codecs.measures import Moments
-from tacpipe.codecs.training_rows import Rows, held_out, warn_of_still
+from tacpipe.codecs.training_rows import CodecRows, held_out, warn_of_still
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
@@ -155,7 +155,7 @@ def fit(
 
 
 def fit_and_measure(
-    rows: Rows, *, components: int = 20, variance: float = 0.0, representation: str = codecs.LEVELS
+    rows: CodecRows, *, components: int = 20, variance: float = 0.0, representation: str = codecs.LEVELS
 ) -> PCA:
     """Return the codec fitted on ``rows`` of all recordings, with its measures; they are read twice, in pieces.
 

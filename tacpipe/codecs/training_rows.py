@@ -24,7 +24,7 @@ HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured 
 log = logging.getLogger(__name__)
 
 
-class Rows(Protocol):
+class CodecRows(Protocol):
     """Rows that codecs are fitted on, by recording: finite, in contact, and outside of gaps."""
 
     @property

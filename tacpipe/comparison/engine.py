@@ -10,7 +10,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grouped, separate, spread
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Question, Settings, grouped, separate, spread
 from tacpipe.comparison.specification import Kind, TaskReport, by_task, report_on
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ComparisonRow:
     """How one predictor does on one question."""
 
     name: str
@@ -56,24 +56,24 @@ class Comparison:
     task: str
     question: Question
     measure: Measure
-    rows: tuple[Row, ...]
+    rows: tuple[ComparisonRow, ...]
 
-    def of(self, *kinds: Kind) -> list[Row]:
+    def of(self, *kinds: Kind) -> list[ComparisonRow]:
         """Return the rows of some kinds, the best first."""
         return [row for row in self.rows if row.kind in kinds]
 
     @property
-    def models(self) -> list[Row]:
+    def models(self) -> list[ComparisonRow]:
         """The methods, the best first."""
         return self.of("model")
 
     @property
-    def best(self) -> Row | None:
+    def best(self) -> ComparisonRow | None:
         """The best method."""
         return next(iter(self.models), None)
 
     @property
-    def best_baseline(self) -> Row | None:
+    def best_baseline(self) -> ComparisonRow | None:
         """The baseline that the best method is compared with."""
         name = self.best.baseline if self.best else ""
         baselines = self.of("baseline")
@@ -146,7 +146,7 @@ def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Me
     return methods_by_unit
 
 
-def questions_of(runs: Sequence[Run]) -> list[Question]:
+def questions_of(runs: Sequence[ComparedRun]) -> list[Question]:
     """Return the questions that any run was evaluated on by their places, those of one place as most runs order them."""
     ordered = sorted(runs, key=lambda run: -len(run.questions))
     return sorted(
@@ -188,7 +188,7 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
     rows = [_row(*entry, question, measure, pairs, picked) for entry, pairs in zip(entries, ranked, strict=True)]
     sign = -1 if measure.rises else 1
 
-    def place(row: Row) -> tuple[bool, float, str]:
+    def place(row: ComparisonRow) -> tuple[bool, float, str]:
         return math.isnan(row.score.mean), sign * row.score.mean, row.name
 
     return Comparison(task.name, question, measure, tuple(sorted(rows, key=place)))
@@ -205,7 +205,7 @@ def reference(task: TaskReport, methods: Sequence[Method], question: Question, m
     return max(methods, key=place)
 
 
-def headline(row: Row, comparison: Comparison) -> Headline | None:
+def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
     """Return a row of a method as a headline, with all baselines that it was compared with."""
     question, method = comparison.question, row.method
     source = next((row.method for row in comparison.rows if row.kind == "baseline"), method)
@@ -252,13 +252,13 @@ def _row(
     measure: Measure,
     pairs: Mapping[str, Pair],
     picked: Sequence[Pair],
-) -> Row:
+) -> ComparisonRow:
     """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with the best."""
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
     run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
     gain = pairing.gain(measure, list(pairs.values()), picked if kind == "model" else ())
-    return Row(
+    return ComparisonRow(
         name,
         kind,
         method.family,
@@ -305,7 +305,7 @@ class PairedRuns:
     p: float  # p of the paired t test, NaN below two units and where all differ by as much
 
 
-def observations(runs: Sequence[Run], question: Question, predictor: str = MODEL) -> pd.DataFrame:
+def observations(runs: Sequence[ComparedRun], question: Question, predictor: str = MODEL) -> pd.DataFrame:
     """Return a row a run and recording: run (its place), seed, fold, tested, recording, and ``s0``, ``s1`` … of its sums.
 
     ``tested`` is the set of a run's recordings as text: what distinguishes folds that have no name.
@@ -322,7 +322,10 @@ def observations(runs: Sequence[Run], question: Question, predictor: str = MODEL
 
 
 def paired_runs(
-    first: Sequence[Run], second: Sequence[Run], question: Question, predictors: tuple[str, str] = (MODEL, MODEL)
+    first: Sequence[ComparedRun],
+    second: Sequence[ComparedRun],
+    question: Question,
+    predictors: tuple[str, str] = (MODEL, MODEL),
 ) -> PairedRuns:
     """Return the paired t test of two methods' scores by fold, or by seed where there is one fold.
 
@@ -341,7 +344,7 @@ def paired_runs(
     return PairedRuns("folds", 0, math.nan)
 
 
-def _scores(runs: Sequence[Run], question: Question, predictor: str, column: str) -> dict[Hashable, float]:
+def _scores(runs: Sequence[ComparedRun], question: Question, predictor: str, column: str) -> dict[Hashable, float]:
     """Return the mean score of the runs of each value of a column."""
     score = next(run for run in runs if question in run.questions).questions[question].measure.score_of
     table = observations(runs, question, predictor).dropna(subset=column)

@@ -97,7 +97,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Errors:
+class PredictorErrors:
     """Errors of the predictors of one run on one question."""
 
     measure: Measure
@@ -106,14 +106,14 @@ class Errors:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class ComparedRun:
     """One result: a model trained once and evaluated once."""
 
     dataset: Dataset
     task: str
     method: str  # name of all runs that differ in settings only
     settings: Settings  # all that makes its method; neither seed nor fold
-    questions: Mapping[Question, Errors]
+    questions: Mapping[Question, PredictorErrors]
     family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None
@@ -131,7 +131,7 @@ class Method:
     family: str
     settings: Settings
     differing: Settings  # those in which others of the same first name differ
-    runs: tuple[Run, ...]
+    runs: tuple[ComparedRun, ...]
 
     @property
     def control(self) -> bool:
@@ -161,7 +161,7 @@ class Method:
             default=str,
         )
 
-    def of(self, question: Question) -> list[Run]:
+    def of(self, question: Question) -> list[ComparedRun]:
         """Return its runs that were evaluated on a question."""
         return [run for run in self.runs if question in run.questions]
 
@@ -178,13 +178,13 @@ class Method:
         return list(dict.fromkeys(name for run in self.of(question) for name in run.questions[question].sums))
 
 
-def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) -> list[Method]:
+def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Any]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
     Runs of one task whose method, settings and units of errors are alike are one method. Names state the settings in which
     methods of the same first name differ, but for empty ones and those in ``usual``: names, or names with values.
     """
-    by_key: dict[str, list[Run]] = {}
+    by_key: dict[str, list[ComparedRun]] = {}
     for run in runs:
         by_key.setdefault(_key(run), []).append(run)
     firsts = [same[0] for same in by_key.values()]
@@ -196,7 +196,7 @@ def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) 
     return sorted(methods, key=lambda method: method.name)
 
 
-def separate(runs: Sequence[Run]) -> list[Method]:
+def separate(runs: Sequence[ComparedRun]) -> list[Method]:
     """Return a method a run, in the order given: nothing is pooled, and names state seed and fold too."""
     methods = []
     for method in grouped(runs):
@@ -209,6 +209,6 @@ def separate(runs: Sequence[Run]) -> list[Method]:
     return sorted(methods, key=lambda candidate: order[id(candidate.runs[0])])
 
 
-def _key(run: Run) -> str:
+def _key(run: ComparedRun) -> str:
     units = sorted({errors.measure.unit for errors in run.questions.values()})
     return json.dumps([run.task, run.method, run.control, run.settings, units], sort_keys=True, default=str)

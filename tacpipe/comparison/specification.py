@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.comparison.runs import MODEL, Run
+from tacpipe.comparison.runs import MODEL, ComparedRun
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.engine import Comparison, Row
+    from tacpipe.comparison.engine import Comparison, ComparisonRow
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.report.blocks import Cell, Fold
     from tacpipe.report.context import Context
@@ -34,7 +34,7 @@ class TaskReport:
         self.name = name
         self.title = self.title or name.replace("_", " ")
 
-    def read(self, results: Sequence[Dataset]) -> list[Run]:
+    def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that can be compared, in their order; others are left out."""
         return []
 
@@ -50,7 +50,9 @@ class TaskReport:
         """Return whether the page can use a dataset that is not a result."""
         return False
 
-    def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
+    def columns(
+        self, context: Context, comparison: Comparison
+    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return more columns of the table of all methods: pairs of a head and the function of a row to its cell."""
         return []
 
@@ -66,7 +68,7 @@ class TaskReport:
         """Return what must be known about the numbers."""
         return []
 
-    def run_columns(self, run: Run) -> dict[str, str | Cell]:
+    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs, by their heads."""
         return {}
 

@@ -29,7 +29,7 @@ _OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}
 
 
 @dataclass(frozen=True)
-class Change:
+class DirectoryChange:
     """Planned content of a directory.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
@@ -53,7 +53,7 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool 
         deliver(store, directory, manifest)
         store.roots.set(directory, manifest.content_digest)
         return
-    change(store, directory, lambda: Change(manifest, replace=replace))
+    change(store, directory, lambda: DirectoryChange(manifest, replace=replace))
 
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
@@ -78,7 +78,7 @@ def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "f
     return "links" if linked else "files"
 
 
-def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manifest:
+def change(store: Store, directory: Path, decide: Callable[[], DirectoryChange]) -> Manifest:
     """Make ``directory`` show what ``decide`` returns, and return its manifest: whatever is changed there goes this way.
 
     ``decide`` is called once nobody else changes the directory, so it may read what is there first. Then come a root in
@@ -103,7 +103,7 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
         yield
 
 
-def _show(store: Store, planned: Change, directory: Path) -> None:
+def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     manifest, relabelled = planned.manifest, planned.relabelled
     check_output(store, directory)
     current = _current(directory, manifest)

@@ -118,12 +118,12 @@ def _change(path: Path, new_labels: Callable[[Found], ByRecording]) -> Changed:
     _refuse_made(dataset.manifest, directory)
     names: list[str] = []
 
-    def labelled() -> directory_of.Change:
+    def labelled() -> directory_of.DirectoryChange:
         current = manifest_of.find(directory)  # Read again: another process may have changed it meanwhile
         labels = {name: dict(values) for name, values in new_labels(current).items()}
         names.extend(labels)
         current.manifest.keep(store)
-        return directory_of.Change(current.manifest.labelled(labels), relabelled=True)
+        return directory_of.DirectoryChange(current.manifest.labelled(labels), relabelled=True)
 
     with store.at_work([dataset.digest]):
         directory_of.change(store, directory, labelled)

@@ -12,7 +12,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
-from tacpipe.io.terminal import WIDTH, Group, Row, Table
+from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
@@ -241,8 +241,8 @@ def _nested_lines(name: str, tree: Mapping[str, Any]) -> list[str]:
             lines += _nested_lines(f"{name}.{key}", value)
         elif rows := _rows(value):
             heads = list(dict.fromkeys(head for row in rows for head in row))
-            cells = [Row([str(row.get(head, "")) for head in heads]) for row in rows]
-            table = Table(heads, [Group("", cells)], left=range(len(heads)))
+            cells = [TerminalRow([str(row.get(head, "")) for head in heads]) for row in rows]
+            table = TerminalTable(heads, [RowGroup("", cells)], left=range(len(heads)))
             lines += [f"{name}.{key}:", *(f"  {line}" for line, _ in table.lines(WIDTH))]
     return lines
 

@@ -142,7 +142,7 @@ class Manifest:
         if isinstance(self.recordings, pages_of.Recordings) and self.pages is not None:
             pages = self.pages.changed(items)
             recordings = pages_of.Recordings(pages)
-            sources, labels = pages_of.Sources(pages), pages_of.Labels(pages)
+            sources, labels = pages_of.SourceDigests(pages), pages_of.Labels(pages)
         else:
             fields: list[dict[str, Any]] = [{**self.recordings}, {**self.sources}, {**self.labels}]
             for name, item in items.items():
@@ -314,7 +314,7 @@ def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[
         raise ValueError(f"it lists pages of {pages.total('recordings')} recordings, which a manifest holds itself")
     if not value.keys().isdisjoint(_PER_RECORDING):
         raise ValueError("it holds recordings next to pages of them")
-    views: Any = pages_of.Recordings(pages), pages_of.Labels(pages), pages_of.Sources(pages)
+    views: Any = pages_of.Recordings(pages), pages_of.Labels(pages), pages_of.SourceDigests(pages)
     return Manifest(**value, **dict(zip(_PER_RECORDING, views, strict=True))), declared
 
 

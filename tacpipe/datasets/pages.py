@@ -415,7 +415,7 @@ class Labels(_View):
     part, count = "labels", "labelled"
 
 
-class Sources(_View):
+class SourceDigests(_View):
     """The digests of the raw files of recordings of a dataset in pages."""
 
     part, count = "sources", "sourced"
@@ -452,7 +452,7 @@ class KeyRecordings(Recordings, Written):
         yield b"}"
 
 
-class Group(NamedTuple):
+class RecordGroup(NamedTuple):
     """Recordings that follow each other in the order of names, whose results have one record together."""
 
     page: str  # digest of the page that holds exactly these; empty where recordings are not in pages
@@ -485,15 +485,15 @@ def group_names(names: Iterable[str]) -> Iterator[list[str]]:
         yield group
 
 
-def groups(recordings: Mapping[str, Entry]) -> Iterator[Group]:
+def groups(recordings: Mapping[str, Entry]) -> Iterator[RecordGroup]:
     """Yield the groups of recordings; of a dataset in pages none is read yet."""
     if isinstance(recordings, Recordings):
         pages = recordings.pages
         for number, page in enumerate(pages.pages):
-            yield Group(page.digest, lambda number=number: pages.load(number).recordings)  # type: ignore[misc]
+            yield RecordGroup(page.digest, lambda number=number: pages.load(number).recordings)  # type: ignore[misc]
         return
     for names in group_names(recordings):
-        yield Group("", lambda names=names: {name: recordings[name] for name in names})  # type: ignore[misc]
+        yield RecordGroup("", lambda names=names: {name: recordings[name] for name in names})  # type: ignore[misc]
 
 
 def parts(recordings: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:

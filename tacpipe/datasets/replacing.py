@@ -45,7 +45,7 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ResultPlan:
     """Properties of a result that are known before it is computed."""
 
     stage: str
@@ -173,7 +173,7 @@ def _raw(source: Mapping[str, Any]) -> dict[str, Any]:
     return {file: digest for file, digest in source.items() if file != VALUES}
 
 
-def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
+def refuse_plan(before: Manifest | None, output: Path, plan: ResultPlan) -> None:
     """Raise `UsageError` if ``plan`` would replace recordings or labels; this is checked before anything is computed."""
     if before is None:
         return
@@ -198,7 +198,7 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
         )
 
 
-def _refuse_alike(before: Manifest, output: Path, plan: Plan, hint: str) -> None:
+def _refuse_alike(before: Manifest, output: Path, plan: ResultPlan, hint: str) -> None:
     """Raise `UsageError` if a new recording has the raw files of an existing one, or its name except for case."""
     new = [name for name in plan.sources if name not in before.recordings]
     if not new:
@@ -221,7 +221,7 @@ def _refuse_alike(before: Manifest, output: Path, plan: Plan, hint: str) -> None
 
 def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> None:
     """Raise `UsageError` if ``after`` would replace another stage's dataset, or lose recordings or labels of ``before``."""
-    refuse_plan(before, output, Plan(after.stage, after.version, after.params))
+    refuse_plan(before, output, ResultPlan(after.stage, after.version, after.params))
     lost = Losses() if before is None else losses(before, after)
     if lost.recordings:
         count = len(lost.recordings)

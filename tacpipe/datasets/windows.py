@@ -59,7 +59,7 @@ class _Selection(NamedTuple):
         return ((selected.double() - mean) / std).to(values.dtype)
 
 
-class _Rows(NamedTuple):
+class _RecordingRows(NamedTuple):
     """The rows of one recording."""
 
     values: torch.Tensor  # (time, channel), above rest where that is subtracted, not scaled
@@ -118,7 +118,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         self._ends: Int64s | None = None  # (recording,), windows up to the end of each
         self._channels: tuple[tuple[str, ...], tuple[str, ...]] | None = None  # inputs and targets
         self._scaling: Scaling | None = None
-        self._cache: OrderedDict[str, _Rows] = OrderedDict()
+        self._cache: OrderedDict[str, _RecordingRows] = OrderedDict()
 
     def __len__(self) -> int:
         return int(self._index()[-1]) if self._names else 0
@@ -243,14 +243,14 @@ class Windows(torch.utils.data.Dataset[Window]):
             self._ends = np.cumsum([len(self._rows(name).starts) for name in self._names], dtype=np.int64)
         return self._ends
 
-    def _rows(self, name: str) -> _Rows:
+    def _rows(self, name: str) -> _RecordingRows:
         rows = self._cache.pop(name, None) or self._decoded(self.dataset[name])
         self._cache[name] = rows  # moves it to the end, as the last one used
         while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
             self._cache.popitem(last=False)
         return rows
 
-    def _decoded(self, recording: Recording) -> _Rows:
+    def _decoded(self, recording: Recording) -> _RecordingRows:
         table = recording.table(self.stream)
         t_ns = streams.times(table)
         read = arrays.of_table(table)
@@ -272,7 +272,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         usable: Bools = ~streams.gaps(table) & np.isfinite(values).all(axis=1)
         groups = np.cumsum(breaks(t_ns, streams.apart(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
-        return _Rows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
+        return _RecordingRows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 
 
 def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: str) -> tuple[str, ...]:
@@ -320,5 +320,5 @@ def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
     return values
 
 
-def _bytes(rows: _Rows) -> int:
+def _bytes(rows: _RecordingRows) -> int:
     return rows.values.nbytes + rows.t_ns.nbytes

@@ -12,8 +12,8 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import computing, execution, keys, provenance
-from tacpipe.engine.executors.executor import Chosen
-from tacpipe.engine.keys import Done, Task
+from tacpipe.engine.executors.executor import ChosenExecutor
+from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request
@@ -43,7 +43,7 @@ class ByRecording:
     store: Store
     request: Request
     outcome: Outcome
-    chosen: Chosen
+    chosen: ChosenExecutor
     previous: Previous | None = None  # Earlier run whose unchanged results are reused
 
     def run_step(self, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> Mapping[str, Entry]:
@@ -55,7 +55,7 @@ class ByRecording:
         """
         entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
         answered: list[Answer | _RecordingGroup] = []
-        missing: list[Task] = []
+        missing: list[WorkerTask] = []
         stored: dict[str, Mapping[str, Any]] = {}  # Records of groups that are incomplete
         reusable = None if self.previous is None else self.previous.reusable(entries, step)
         reusable_pages: Mapping[str, pages.Pages] = {}
@@ -118,7 +118,7 @@ class ByRecording:
         entries: Mapping[str, Entry] = record["result"]["recordings"]
         return entries
 
-    def run(self, name: str, tasks: Sequence[Task]) -> dict[str, Entry]:
+    def run(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Entry]:
         """Return the entry of each task of stage ``name``, by recording.
 
         Raises `TacpipeError` where recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
@@ -128,22 +128,22 @@ class ByRecording:
             {recording: result["recordings"][""] for recording, result in self.results(name, tasks).items()}, {}
         )
 
-    def results(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
+    def results(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Mapping[str, Any]]:
         """Return what the record of each task of stage ``name`` holds as its result, by recording; raises as `run`."""
         return {recording: record["result"] for recording, record in self._records(name, tasks).items()}
 
     def _reruns(self, name: str) -> bool:
         return self.request.rerun and registry.stage_name(name) == self.request.name
 
-    def _records(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
+    def _records(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Mapping[str, Any]]:
         """Return the record of each task, by recording."""
         stored, missing = self._stored(name, tasks)
         return self._computed(name, missing, stored, len(tasks))
 
-    def _stored(self, name: str, tasks: Sequence[Task]) -> tuple[dict[str, Mapping[str, Any]], list[Task]]:
+    def _stored(self, name: str, tasks: Sequence[WorkerTask]) -> tuple[dict[str, Mapping[str, Any]], list[WorkerTask]]:
         """Return the stored records by recording, and the tasks that must be computed."""
         stored: dict[str, Mapping[str, Any]] = {}
-        missing: list[Task] = []
+        missing: list[WorkerTask] = []
         rerun = self._reruns(name)
         self.store.expect(digest(task.identity) for task in tasks)
         for task in tasks:
@@ -159,7 +159,7 @@ class ByRecording:
         return stored, missing
 
     def _computed(
-        self, name: str, missing: Sequence[Task], stored: Mapping[str, Mapping[str, Any]], count: int
+        self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]], count: int
     ) -> dict[str, Mapping[str, Any]]:
         """Return the ``stored`` records and those of the ``missing`` tasks, which are computed; ``count`` is their total."""
         if missing and self.request.check:
@@ -211,7 +211,7 @@ class ByRecording:
         return source
 
     def _compute(
-        self, name: str, tasks: Sequence[Task], stored: Mapping[str, Mapping[str, Any]]
+        self, name: str, tasks: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Mapping[str, Any]]:
         """Compute tasks and return their records; with ``--recompute-and-compare`` compare them with the ``stored`` ones."""
         computed: dict[str, Mapping[str, Any]] = {}
@@ -300,7 +300,7 @@ def run_chain_of_model(recordings: Dataset, model: Dataset) -> Dataset:
     dataset_dirs = (str(recordings.path), str(model.path))
     store = locate(recordings.path, model.path)
     manifests = [source.content_digest, bytes_digest(model.source.content)]
-    with Chosen("", 0) as chosen, store.at_work(manifests):
+    with ChosenExecutor("", 0) as chosen, store.at_work(manifests):
         mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)
         replayed = mapping.replay(selected, model.source, dataset_dirs, str(recordings.path))
     return Dataset(replayed, execution.reader(store, dataset_dirs))

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets.manifest import VALUES, Manifest
 from tacpipe.engine import execution, provenance
-from tacpipe.engine.execution import Scratch
-from tacpipe.engine.keys import Done, Task
+from tacpipe.engine.execution import ScratchStore
+from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
@@ -37,7 +37,7 @@ _MANY = 4  # tasks for which threads are started
 class _Computing:
     """Compute one task, or several that overlap their requests to a remote store."""
 
-    def __call__(self, task: Task) -> Done:
+    def __call__(self, task: WorkerTask) -> Done:
         """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
         store = opened(task.store, task.run)
         try:
@@ -45,7 +45,7 @@ class _Computing:
         finally:
             store.close()
 
-    def compute_all(self, tasks: Sequence[Task]) -> Iterator[Done]:
+    def compute_all(self, tasks: Sequence[WorkerTask]) -> Iterator[Done]:
         """Yield the outcome of each task, in order.
 
         While a task is computed, the records of the next tasks are read from a remote store and results of earlier tasks
@@ -68,7 +68,7 @@ class _Computing:
 compute = _Computing()
 
 
-def _overlapped(tasks: Sequence[tuple[Task, Store]]) -> Iterator[Done]:
+def _overlapped(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
     """Yield what becomes of each task. Stages run in this thread alone."""
     from concurrent.futures import ThreadPoolExecutor  # Not loaded for a cache hit
 
@@ -100,7 +100,7 @@ def _overlapped(tasks: Sequence[tuple[Task, Store]]) -> Iterator[Done]:
                 finish.leases.close()
 
 
-def _begin(task: Task, store: Store) -> Callable[[], Done]:
+def _begin(task: WorkerTask, store: Store) -> Callable[[], Done]:
     """Compute the task unless its record is stored; return a function that stores the result and returns the outcome."""
     key = digest(task.identity)
     try:
@@ -115,7 +115,7 @@ def _begin(task: Task, store: Store) -> Callable[[], Done]:
     return lambda: failure
 
 
-def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
+def _failed(task: WorkerTask, store: Store, error: TacpipeError) -> Done:
     execution.remove_empty_workspace(store, digest(task.identity))
     return Done(task.recording, None, str(error), error.exit_code, at_fault=is_input_error(error))
 
@@ -134,7 +134,7 @@ class _Made:
 class _Sending:
     """Commit a result when called; the leases end with that."""
 
-    task: Task
+    task: WorkerTask
     store: Store
     computed: _Made
     leases: ExitStack
@@ -156,9 +156,9 @@ class _Sending:
         return Done(task.recording, record)
 
 
-def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _Made:
+def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Done | _Made:
     if task.dry:
-        result, _ = execution.execute(task, store, Scratch())
+        result, _ = execution.execute(task, store, ScratchStore())
         return Done(task.recording, {"result": result, "provenance": provenance.describe(0.0)})
     leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
     record = store.record(key)
@@ -177,7 +177,7 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
     return _Made(result, origin, replace, stage.source)
 
 
-def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
+def _manifest_of(task: WorkerTask, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
     """Return a manifest of one recording that was read from published files."""
     (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
     files, values = inputs[stage.argument("Files")], inputs.get(stage.argument("Values"))

@@ -18,7 +18,7 @@ from tacpipe.datasets.dataset import Dataset, Reader, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import provenance
-from tacpipe.engine.keys import Task
+from tacpipe.engine.keys import WorkerTask
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_input_error
 from tacpipe.io import files, memory, regular
 from tacpipe.io.files import Draft, Hashed, move, present, write_whole
@@ -67,7 +67,7 @@ _CODE = "code"  # the file of a workspace with the digest of the code that write
 log = logging.getLogger(__name__)
 
 
-class Scratch:
+class ScratchStore:
     """Takes content as a store does, and keeps only its name."""
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
@@ -82,7 +82,7 @@ class Scratch:
 
 
 def execute(
-    task: Task, store: Store, sink: Store | Scratch, *, followed: bool = True
+    task: WorkerTask, store: Store, sink: Store | ScratchStore, *, followed: bool = True
 ) -> tuple[dict[str, Any], list[str]]:
     """Call the stage for the task, put the content into ``sink``, and return the ``result`` of a record and notes.
 
@@ -111,7 +111,7 @@ def _result(name: str, stage: AnyStage, returned: Any) -> Result:
     return Result(recordings={"": _recording(name, returned)}) if stage.mapped else _files(name, returned)
 
 
-def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
+def _stored(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
@@ -220,7 +220,7 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
         try:
             with store.leases.hold(key, f"{identity['stage']}, for {path}"):
                 if not store.has(name, size):  # Otherwise another process has recomputed it
-                    execute(Task(store.place, identity["stage"], identity, run=store.run), store, store)
+                    execute(WorkerTask(store.place, identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
                 raise
@@ -259,7 +259,7 @@ def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
 
 
 @contextmanager
-def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
+def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict[str, Any]]:
     """Yield the arguments that the identity describes, by name."""
     read = reader(store, task.dataset_dirs)
     inputs = task.identity["inputs"]
@@ -349,7 +349,7 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
 
 
 @contextmanager
-def watching(task: Task) -> Iterator[Sequence[following.Follower]]:
+def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
     """Yield the followers in this process of a training in another process; none if the stage trains nothing."""
     if registry.load_step(task.name).argument("Workspace") is None:
         yield ()
@@ -395,12 +395,12 @@ def _files(name: str, returned: Any) -> Result:
     raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a Result or files by name.")
 
 
-def _entry(recording: RecordingOutput, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
+def _entry(recording: RecordingOutput, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
     shards = {stream: _shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
 
 
-def _shard(table: Any, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
+def _shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
     """Store a table, or batches as they come, as a shard."""
     from tacpipe.io import parquet
 

@@ -15,13 +15,13 @@ from typing import Any
 from tacpipe.engine import pipeline, processor
 from tacpipe.engine.executors.local import Local
 from tacpipe.engine.outcome import Outcome
-from tacpipe.engine.request import Inputs, Request
+from tacpipe.engine.request import Request, RequestInputs
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
 from tacpipe.store.location import locate
 from tacpipe.training import display, following
-from tacpipe.training.following import Line, Network
+from tacpipe.training.following import Line, TrainedNetwork
 
 PLACE = "{fold}"  # is replaced by the number of the fold in paths
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
@@ -93,7 +93,7 @@ _HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
-class Estimate:
+class DurationEstimate:
     """Upper estimate of a grid's duration: each model takes as long as the first, and none stops early."""
 
     models: int  # Missing models
@@ -111,7 +111,7 @@ class Estimate:
         )
 
 
-def estimate_duration(requests: Sequence[Request], jobs: int) -> Estimate | None:
+def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimate | None:
     """Return how long the missing trainings take, ``jobs`` at a time; None if it cannot be estimated.
 
     There is no estimate if nothing is missing, if no network is trained, and if the first training fails.
@@ -126,7 +126,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> Estimate | None
         return None
     at_once = min(jobs or processor.jobs(), len(missing))
     hours = total_s(each_s, len(missing), at_once, processor.threads(), processor.usable_cores()) / _HOUR_S
-    return Estimate(len(missing), at_once, each_s, hours)
+    return DurationEstimate(len(missing), at_once, each_s, hours)
 
 
 def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) -> float:
@@ -142,7 +142,7 @@ def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) 
 def _is_missing(request: Request) -> bool:
     """Return whether the store has no answer to a request."""
     store = locate(*request.locations)
-    return request.rerun or store.record(digest(Inputs(request, store).identity())) is None
+    return request.rerun or store.record(digest(RequestInputs(request, store).identity())) is None
 
 
 def _timed(request: Request) -> float | None:
@@ -166,9 +166,9 @@ class _Stopwatch:
         self.all_s = 0.0  # Reading and all epochs of the remaining networks
         self._started_s = self._begun_s = time.monotonic()
         self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
-        self._network, self._done = Network(1), 0
+        self._network, self._done = TrainedNetwork(1), 0
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         self._begun_s = time.monotonic()
         self._network, self._done = network, len(history)
 

@@ -20,7 +20,7 @@ _MOST_TRIALS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Task:
+class WorkerTask:
     """One key to make: all that a worker process needs."""
 
     store: str  # its path or address
@@ -93,21 +93,23 @@ def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Ent
     return {"group": step["stage"], "step": step, "recordings": recordings_digest}
 
 
-def shard_tasks(store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> list[Task]:
+def shard_tasks(
+    store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]
+) -> list[WorkerTask]:
     """Return one task per included recording of ``source`` for the map stage of a link of a chain."""
     stage = registry.load_step(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
     name_argument = stage.argument("RecordingName")
 
-    def task(name: str, entry: Entry) -> Task:
+    def task(name: str, entry: Entry) -> WorkerTask:
         inputs = {
             recording: of_recording(entry, stage.reads or ()),
             **fitted,
             **({name_argument: name} if name_argument else {}),
         }
         task_identity = identity(step["stage"], stage.version, step["params"], inputs)
-        return Task(store.place, step["stage"], task_identity, name, dataset_dirs=dataset_dirs)
+        return WorkerTask(store.place, step["stage"], task_identity, name, dataset_dirs=dataset_dirs)
 
     return [task(name, entry) for name, entry in sorted(source.included.items())]
 
@@ -119,26 +121,26 @@ def source_tasks(
     params: Any,
     sources: Mapping[str, Source],
     digests: Mapping[str, Mapping[str, str]],
-) -> list[Task]:
+) -> list[WorkerTask]:
     """Return one task per recording of a published source."""
     argument, values, called = (stage.argument(kind) for kind in ("Files", "Values", "RecordingName"))
     assert argument is not None
 
-    def task(recording: str, source: Source) -> Task:
+    def task(recording: str, source: Source) -> WorkerTask:
         inputs: dict[str, Any] = {argument: {file: digests[recording][file] for file in source.files}}
         if values is not None:
             inputs[values] = dict(source.values)
         if called is not None:
             inputs[called] = recording
         task_identity = identity(name, stage.version, params, inputs)
-        return Task(
+        return WorkerTask(
             store.place, name, task_identity, recording, files={file: str(path) for file, path in source.files.items()}
         )
 
     return [task(recording, source) for recording, source in sources.items()]
 
 
-def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[Task]:
+def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[WorkerTask]:
     """Return one task per recording to simulate, named ``trial-000`` and so on."""
     (argument,) = (name for name, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)
@@ -146,7 +148,7 @@ def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[T
         raise UsageError(f"--trials is {count}; a dataset holds at most {_MOST_TRIALS:,} recordings.")
     width = max(3, len(str(count - 1)))
     return [
-        Task(
+        WorkerTask(
             store.place,
             name,
             identity(name, stage.version, params, {argument: number}),

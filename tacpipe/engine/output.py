@@ -32,7 +32,7 @@ class Unread:
     rows: int
 
 
-class Work(Protocol):
+class CommandSource(Protocol):
     """Source of a command's result."""
 
     @property
@@ -62,7 +62,7 @@ class Work(Protocol):
         """
 
 
-def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> Manifest | Unread:
+def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: CommandSource) -> Manifest | Unread:
     """Return the manifest that the output shows once the request is met; the only way in which a command writes it.
 
     Where a note states that it shows the answer, and still holds, that is not read.
@@ -114,7 +114,7 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
                 pass
 
 
-def existing_answer(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
+def existing_answer(store: Store, request: Request, work: CommandSource) -> Manifest | Unread | None:
     """Return the result of `settle` if the output already shows the stored answer, else None; nothing is changed."""
     place = _place(store, request)
     if (unread := place.unread(work)) is not None:
@@ -149,7 +149,7 @@ class _Place(ABC):
         The files are part of the ``look``.
         """
 
-    def unread(self, work: Work) -> Unread | None:
+    def unread(self, work: CommandSource) -> Unread | None:
         """Return what is known of the answer where it is noted that all of it is shown, and the note still holds."""
         return None
 
@@ -157,7 +157,7 @@ class _Place(ABC):
         """Return a look at all files that begins now, where what it finds is worth a note."""
         return None
 
-    def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
+    def note(self, look: Look | None, work: CommandSource, hit: Manifest) -> bool:
         """Note that the look found all of the answer shown; return whether that is noted."""
         return False
 
@@ -170,12 +170,12 @@ class _Place(ABC):
         """Return the run that gave what is shown, where all of that is noted and still there."""
         return None
 
-    def published(self, work: Work, result: Manifest, previous: Previous | None = None) -> Manifest:
+    def published(self, work: CommandSource, result: Manifest, previous: Previous | None = None) -> Manifest:
         """Publish ``result``, which may reuse parts of a ``previous`` run, and return the published manifest."""
         return self.publish(result)
 
     @abstractmethod
-    def refuse(self, plan: replacing.Plan) -> None:
+    def refuse(self, plan: replacing.ResultPlan) -> None:
         """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
 
     @abstractmethod
@@ -224,7 +224,7 @@ class _Directory(_Place):
                 return note
         return None
 
-    def unread(self, work: Work) -> Unread | None:
+    def unread(self, work: CommandSource) -> Unread | None:
         request = self.request
         if request.compare or request.rerun or request.track or request.check:
             return None
@@ -242,7 +242,7 @@ class _Directory(_Place):
                 return Look(self.store, self.path)
         return None
 
-    def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
+    def note(self, look: Look | None, work: CommandSource, hit: Manifest) -> bool:
         if look is None or hit.copied or not self._linked:
             return False
         return look.note(_head(work, hit), hit.contents())
@@ -254,7 +254,7 @@ class _Directory(_Place):
     def previous(self) -> Previous | None:
         return None if self._noted is None else previous_of.find(self.store, self.path, self._noted)
 
-    def published(self, work: Work, result: Manifest, previous: Previous | None = None) -> Manifest:
+    def published(self, work: CommandSource, result: Manifest, previous: Previous | None = None) -> Manifest:
         published = self.publish(result, previous, work.key)
         if result.copied or published.pages is None:
             return published
@@ -270,7 +270,7 @@ class _Directory(_Place):
             directory.publish(self.store, published, self.path)
         return published
 
-    def refuse(self, plan: replacing.Plan) -> None:
+    def refuse(self, plan: replacing.ResultPlan) -> None:
         directory.check_output(self.store, self.request.output)
         if not self.request.replace:
             replacing.refuse_plan(self._occupant(), self.request.output, plan)
@@ -307,11 +307,11 @@ class _Directory(_Place):
             self.store.roots.set(self.path, result.content_digest, key=key)
             return result
 
-        def decided() -> directory.Change:  # Labels may have been set in the meantime
+        def decided() -> directory.DirectoryChange:  # Labels may have been set in the meantime
             settled = self.settled(result)
             self._refuse_losses(settled)
             complete = previous is not None and previous.is_current()
-            return directory.Change(settled, is_complete=complete, replace=self.request.replace, key=key)
+            return directory.DirectoryChange(settled, is_complete=complete, replace=self.request.replace, key=key)
 
         return directory.change(self.store, self.request.output, decided)
 
@@ -338,7 +338,7 @@ class _File(_Place):
         is_current = root is not None and root["manifest"] == hit.content_digest and self.path.exists()
         return is_current and file_digest(self.path) == self._digest(hit)
 
-    def refuse(self, plan: replacing.Plan) -> None:
+    def refuse(self, plan: replacing.ResultPlan) -> None:
         if self.request.replace or not self.path.is_file() or self.root is not None:
             return
         if not self.store.has(file_digest(self.path)):
@@ -369,5 +369,5 @@ def _labelled(result: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -
     return result.labelled(labels) if labels else result
 
 
-def _head(work: Work, result: Manifest) -> Head:
+def _head(work: CommandSource, result: Manifest) -> Head:
     return Head(work.key, result.content_digest, work.count(result), result.rows)

@@ -16,12 +16,12 @@ from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
-from tacpipe.engine.executors.executor import Chosen
-from tacpipe.engine.keys import Task
+from tacpipe.engine.executors.executor import ChosenExecutor
+from tacpipe.engine.keys import WorkerTask
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.output import Unread
 from tacpipe.engine.previous import Previous
-from tacpipe.engine.request import Inputs, Request
+from tacpipe.engine.request import Request, RequestInputs
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
@@ -56,9 +56,9 @@ def run(request: Request) -> Outcome:
     trackers = tracking.open_trackers(request.track) if request.track else {}
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
-    inputs = Inputs(request, store)
-    with Chosen(request.executor, request.jobs) as chosen:
-        work = _Run(request, store, inputs, inputs.identity(), chosen)
+    inputs = RequestInputs(request, store)
+    with ChosenExecutor(request.executor, request.jobs) as chosen:
+        work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
         outcome = work.outcome
         with _tracked(request, trackers, outcome, store) as end_tracking:
             result = output.settle(store, request, inputs.plan(), work)
@@ -77,14 +77,14 @@ def answered(request: Request) -> Outcome | None:
         return None
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
-    inputs = Inputs(request, store)
-    with Chosen(request.executor, request.jobs) as chosen:
-        work = _Run(request, store, inputs, inputs.identity(), chosen)
+    inputs = RequestInputs(request, store)
+    with ChosenExecutor(request.executor, request.jobs) as chosen:
+        work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
         result = output.existing_answer(store, request, work)
     return None if result is None else _concluded(work.outcome, inputs, result, started)
 
 
-def _concluded(outcome: Outcome, inputs: Inputs, result: Manifest | Unread, started: float) -> Outcome:
+def _concluded(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *inputs.describe_unread(), *outcome.describe_results(), *outcome.notes]
     outcome.rows = result.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
@@ -114,11 +114,11 @@ def _tracked(
         raise
 
 
-class _Run:
+class _RequestRun:
     """Result of a request, from the store or by computing what is missing there."""
 
     def __init__(
-        self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], chosen: Chosen
+        self, request: Request, store: Store, inputs: RequestInputs, identity: Mapping[str, Any], chosen: ChosenExecutor
     ) -> None:
         self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
@@ -225,7 +225,7 @@ class _Run:
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
 
-    def _own_tasks(self) -> list[Task]:
+    def _own_tasks(self) -> list[WorkerTask]:
         """Return one task per recording of a stage that reads no dataset: from a source, or to simulate."""
         request, stage = self.request, self.stage
         if stage.source:
@@ -359,7 +359,7 @@ class _Run:
             return result
         if self.request.check:
             raise WouldChangeError(f"{name} would run: there is no result for these inputs and params.")
-        task = Task(
+        task = WorkerTask(
             self.store.place,
             name,
             identity,

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from tacpipe.datasets import manifest, merging, recording_names, roles
 from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
-from tacpipe.datasets.replacing import Plan
+from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
 from tacpipe.formats import source_files
@@ -84,7 +84,7 @@ class Request:
         return self.output.suffix == ".html"
 
 
-class Inputs:
+class RequestInputs:
     """All that a request reads."""
 
     def __init__(self, request: Request, store: Store) -> None:
@@ -127,9 +127,9 @@ class Inputs:
             reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
         return source_files.describe(self.request.source, read, reason, self.request.output)
 
-    def plan(self) -> Plan:
+    def plan(self) -> ResultPlan:
         """Return what is known of the result before anything is computed."""
-        return Plan(
+        return ResultPlan(
             self.request.name, self.stage.version, params_of.to_json(self.request.params), dict(self.source_digests)
         )
 

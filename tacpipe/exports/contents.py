@@ -57,7 +57,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Stream:
+class ExportStream:
     """One stream over all recordings."""
 
     name: str
@@ -75,7 +75,7 @@ class Stream:
 class Contents:
     """The streams, duration and losses of all recordings together."""
 
-    streams: Mapping[str, Stream]
+    streams: Mapping[str, ExportStream]
     seconds: float  # time between first and last stamp, summed over recordings
     first_ns: int | None
     losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # sentence, names of the recordings that lose it
@@ -200,12 +200,14 @@ class _StreamTotals:
             self.shared = [column for column in self.shared if (column.name, column.type) in alike]
             self.all_columns |= dict.fromkeys(column.name for column in columns)
 
-    def stream(self, name: str) -> Stream:
+    def stream(self, name: str) -> ExportStream:
         """Return the stream over all recordings."""
         rates_hz = [min(self.rates_hz), max(self.rates_hz)] if self.rates_hz else []
         shared = [column.name for column in self.shared]
         names = list(self.all_columns)
-        return Stream(name, self.columns, self.recordings, self.rows, rates_hz, self.differing, shared, self.nan, names)
+        return ExportStream(
+            name, self.columns, self.recordings, self.rows, rates_hz, self.differing, shared, self.nan, names
+        )
 
 
 def contents_from_parts(parts: Dataset) -> Contents:

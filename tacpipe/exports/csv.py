@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, Contents, Loss, Stream, stream_label
+from tacpipe.exports.contents import TIME, Contents, ExportStream, Loss, stream_label
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
@@ -89,7 +89,7 @@ def layout_text(described: Contents) -> str:
     return "\n".join([*lines, "", "[[labels]]", f'file = "{{recording}}/{LABELS}"', ""])
 
 
-def _stream_lines(stream: Stream, *, optional: bool) -> Iterator[str]:
+def _stream_lines(stream: ExportStream, *, optional: bool) -> Iterator[str]:
     yield ""
     yield f"[streams.{stream_label(stream.name)}]"
     yield f"files = {json.dumps(f'{{recording}}/{stream_label(stream.name)}.csv')}"

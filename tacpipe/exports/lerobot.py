@@ -27,7 +27,7 @@ from tacpipe.exports.lerobot_features import (
     ORIGINALS,
     STATISTICS,
     STATISTICS_TABLE,
-    Feature,
+    FrameFeature,
     Params,
     column_statistics,
     dataset_statistics,
@@ -275,7 +275,7 @@ def _index_columns(rows: int, episode: int, start: int, task: int, fps: float) -
     }
 
 
-def _feature_array(feature: Feature) -> pa.Array:
+def _feature_array(feature: FrameFeature) -> pa.Array:
     import pyarrow as pa
 
     values = feature.values
@@ -299,7 +299,7 @@ def _task_table(tasks: Mapping[str, str]) -> bytes:
 
 
 def _episodes(
-    frame_features: Sequence[Feature],
+    frame_features: Sequence[FrameFeature],
     recordings: Sequence[Recording],
     parts: Dataset,
     originals: Dataset,
@@ -341,7 +341,11 @@ def _episodes(
 
 
 def _info(
-    params: Params, frame_features: Sequence[Feature], lengths: Mapping[str, int], tasks: Mapping[str, str], fps: float
+    params: Params,
+    frame_features: Sequence[FrameFeature],
+    lengths: Mapping[str, int],
+    tasks: Mapping[str, str],
+    fps: float,
 ) -> dict[str, Any]:
     described: dict[str, Any] = {
         feature.name: {
@@ -371,7 +375,7 @@ def _info(
     }
 
 
-def _feature_metadata(frame_features: Sequence[Feature], described: contents.Contents) -> dict[str, Any]:
+def _feature_metadata(frame_features: Sequence[FrameFeature], described: contents.Contents) -> dict[str, Any]:
     """Return units and quantities of each feature, and the columns of the synchronized table."""
     return {
         "features": {

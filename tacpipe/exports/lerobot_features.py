@@ -35,7 +35,7 @@ class Params:
 
 
 @dataclass(frozen=True)
-class Feature:
+class FrameFeature:
     """One feature of a frame: its values (time,) or (time, channel), and the channels' names, units and quantities."""
 
     name: str
@@ -56,7 +56,7 @@ class Feature:
         return list(self.values.shape[1:]) or [1]
 
 
-def features_from_table(params: Params, table: pa.Table) -> list[Feature]:
+def features_from_table(params: Params, table: pa.Table) -> list[FrameFeature]:
     """Return the features of a synchronized table, in a fixed order."""
     import numpy as np
 
@@ -67,10 +67,10 @@ def features_from_table(params: Params, table: pa.Table) -> list[Feature]:
     taxels = [channel for channel in channels if channel.signal and channel.quantity == frames.TACTILE]
     state = [channel for channel in state if channel not in taxels]
 
-    def vector(name: str, members: Sequence[frames.Channel], values: AnyArray | None = None) -> Feature:
+    def vector(name: str, members: Sequence[frames.Channel], values: AnyArray | None = None) -> FrameFeature:
         values = frames.matrix(table, members, np.dtype(np.float32)) if values is None else values
         one_stream = len({channel.stream for channel in members}) == 1
-        return Feature(
+        return FrameFeature(
             name,
             values[:, 0] if values.shape[1] == 1 else values,
             [channel.short if one_stream else channel.name for channel in members],
@@ -79,7 +79,7 @@ def features_from_table(params: Params, table: pa.Table) -> list[Feature]:
             [channel.quantity for channel in members],
         )
 
-    vectors: list[Feature] = []
+    vectors: list[FrameFeature] = []
     observed = [*state, *taxels] if params.tactile_in_state else state
     vectors += [vector("observation.state", observed)] if observed else []
     if params.actions:
@@ -94,14 +94,16 @@ def features_from_table(params: Params, table: pa.Table) -> list[Feature]:
     vectors += [vector("observation.latents", latents)] if latents else []
     truth = [channel for channel in channels if channel.truth and channel.type in ("float", "double")]
     vectors += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
-    vectors.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
+    vectors.append(FrameFeature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
     placed = {channel.name for channel in (*state, *signals, *latents, *truth)}
     for channel in channels:
         if channel.name not in placed and (channel.number or channel.type == "string"):
             name = f"{channel.short}.{channel.stream}" if channel.stream else channel.short
             name = f"{ORIGINALS}.{name.replace('/', '_')}"
             values = table.column(channel.name).to_numpy()
-            vectors.append(Feature(name, values, [channel.name], [channel.name], [channel.unit], [channel.quantity]))
+            vectors.append(
+                FrameFeature(name, values, [channel.name], [channel.name], [channel.unit], [channel.quantity])
+            )
     return vectors
 
 
@@ -111,7 +113,7 @@ STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
 Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
 
 
-def column_statistics(feature: Feature) -> Iterator[tuple[str, tuple[float, ...]]]:
+def column_statistics(feature: FrameFeature) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield each column of a feature with its statistics; none of text, and NaN where nothing was measured."""
     import numpy as np
 
@@ -132,7 +134,7 @@ def _statistics_of(values: Floats) -> tuple[float, ...]:
     return (*ends, *(float(quantile) for quantile in np.quantile(finite, list(QUANTILES.values()))))
 
 
-def episode_statistics(features: Sequence[Feature], part: Recording, rows: int) -> Stats:
+def episode_statistics(features: Sequence[FrameFeature], part: Recording, rows: int) -> Stats:
     """Return the statistics of an episode's features, as its part has them."""
     rows_by_column = {(row[ACTION], row["column"]): row for row in part.table(STATISTICS_TABLE).to_pylist()}
     statistics: Stats = {}
@@ -163,7 +165,7 @@ def index_statistics(rows: int, episode: int, start: int, task: int, fps: float)
 
 def dataset_statistics(
     parts: Dataset,
-    features: Sequence[Feature],
+    features: Sequence[FrameFeature],
     starts: Mapping[str, int],
     lengths: Mapping[str, int],
     tasks: Mapping[str, int],

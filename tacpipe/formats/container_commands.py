@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.formats.table import contained
-from tacpipe.formats.table.contained import Command, Params
+from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.plugins.stage import Files, RecordingOutput, Values, stage
 
-ROSBAG, MCAP, HDF5 = Command("rosbag"), Command("mcap"), Command("hdf5")
-XDF, LEROBOT, ZARR = Command("xdf"), Command("lerobot"), Command("zarr")
+ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), ContainerCommand("hdf5")
+XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
 
 
 @stage(version=2, discover=ROSBAG.discover, preview=ROSBAG.preview, guess=ROSBAG.guess, why_unread=ROSBAG.why_unread)

@@ -38,14 +38,14 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Damage:
+class DamagedChunk:
     """Bytes that are no chunk."""
 
     at: int
     bytes: int
 
 
-def read_chunks(data: Content) -> Iterator[Chunk | Damage]:
+def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
     """Yield the chunks of a file in their order, and what is none.
 
     Raises `TacpipeError` for what does not begin as an XDF file does.
@@ -65,7 +65,7 @@ def read_chunks(data: Content) -> Iterator[Chunk | Damage]:
             yield parsed[0]
             return
         stop = len(data) if next_mark < 0 else next_mark + len(MARK)
-        yield Damage(at, stop - at)
+        yield DamagedChunk(at, stop - at)
         at = stop
 
 
@@ -99,7 +99,7 @@ def read_length(data: Content, at: int) -> tuple[int, int] | None:
 
 
 @dataclass(frozen=True)
-class Samples:
+class ChunkSamples:
     """The samples of one chunk: stamps in seconds as they are written, NaN where none is; and how many are missing."""
 
     stamps: Floats  # (sample,)
@@ -107,7 +107,7 @@ class Samples:
     missing: int = 0
 
 
-def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> Samples | None:
+def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> ChunkSamples | None:
     """Return the samples of a chunk of numbers, as many as are whole; None where even their count is not there."""
     count = read_length(content, 0)
     if count is None:
@@ -122,7 +122,9 @@ def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> 
     return _parse_irregular(body, wide, channels, declared)
 
 
-def _parse_regular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int) -> Samples | None:
+def _parse_regular(
+    body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int
+) -> ChunkSamples | None:
     """Return samples of which the first ``stamped`` have a stamp and the others none; None where it is not so."""
     full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
     bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
@@ -133,10 +135,10 @@ def _parse_regular(body: bytes, kind: np.dtype[np.generic], channels: int, count
     if (first["width"] != 8).any() or unstamped["width"].any():
         return None
     stamps = np.concatenate([first["stamp"], np.full(len(unstamped), np.nan)])
-    return Samples(stamps, np.concatenate([first["values"], unstamped["values"]]).astype(kind.newbyteorder("=")))
+    return ChunkSamples(stamps, np.concatenate([first["values"], unstamped["values"]]).astype(kind.newbyteorder("=")))
 
 
-def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> Samples:
+def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> ChunkSamples:
     """Return samples one by one, up to the first that is not whole."""
     stamps, values, at, size = [], [], 0, channels * kind.itemsize
     for _ in range(count):
@@ -147,10 +149,10 @@ def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, cou
         values.append(body[stamp[1] : stamp[1] + size])
         at = stamp[1] + size
     read = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
-    return Samples(np.array(stamps, dtype=np.float64), read, count - len(stamps))
+    return ChunkSamples(np.array(stamps, dtype=np.float64), read, count - len(stamps))
 
 
-def parse_texts(content: bytes, channels: int) -> Samples | None:
+def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
     """Return the samples of a chunk of texts, as many as are whole; None where even their count is not there."""
     count = read_length(content, 0)
     if count is None:
@@ -167,7 +169,7 @@ def parse_texts(content: bytes, channels: int) -> Samples | None:
         rows.append(words[0])
         at = words[1]
     table = np.array(list(itertools.chain(*rows)), dtype=object).reshape(-1, channels)
-    return Samples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
+    return ChunkSamples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
 
 
 def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:

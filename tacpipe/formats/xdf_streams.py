@@ -25,8 +25,8 @@ from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import xdf_chunks
 from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
-from tacpipe.formats.xdf_chunks import Chunk, Damage
+from tacpipe.formats.containers.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.formats.xdf_chunks import Chunk, DamagedChunk
 from tacpipe.io import regular
 from tacpipe.io.spill import Piece, Spill, unpack
 from tacpipe.plugins.stage import Attribute
@@ -47,7 +47,7 @@ COMPRESSED_BYTES = 1 << 20  # bytes decompressed at once
 class _StreamReading:
     """The samples, stamps and offsets of a stream read so far."""
 
-    about: lsl.Description
+    about: lsl.LslDescription
     spill: Spill
     stamps: list[Floats] = field(default_factory=list)
     values: list[AnyArray] = field(default_factory=list)  # (sample, channel), of samples that are not put aside
@@ -117,7 +117,7 @@ class _FileReading:
     headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
-    damage: list[Damage] = field(default_factory=list)
+    damage: list[DamagedChunk] = field(default_factory=list)
     cut_at: int | None = None  # offset of the incomplete chunk at the end of a truncated file
 
     def notes(self, path: Path) -> list[str]:
@@ -151,11 +151,11 @@ class XdfFile:
         """Return nothing: a file is one recording."""
         return ()
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         """Return all that is in the file: it has no index, so a look reads it."""
         return self.read(None, episode)
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams, and for each whose clock was compared with the recorder's its offsets as another one.
 
         Raises `TacpipeError` for a file that is not XDF.
@@ -189,7 +189,7 @@ class XdfFile:
                 offsets = _offsets_table(stream)
                 streams.append(SourceStream(source, names[source], Time(STAMP, "ns"), offsets, offsets.num_rows))
         chosen = [name for name in streams if sources is None or name.source in sources]
-        return Contents(chosen, attributes, skipped, notes)
+        return EpisodeContents(chosen, attributes, skipped, notes)
 
     def _read(self) -> _FileReading:
         read = _FileReading()
@@ -239,9 +239,9 @@ def _gzip_blocks(file: BinaryIO) -> Iterator[bytes]:
         yield block
 
 
-def _add_chunk(read: _FileReading, chunk: Chunk | Damage, path: Path) -> None:
+def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> None:
     """Take a chunk into what was read."""
-    if isinstance(chunk, Damage):
+    if isinstance(chunk, DamagedChunk):
         read.damage.append(chunk)
         return
     if not chunk.is_complete:

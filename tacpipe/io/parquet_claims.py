@@ -51,7 +51,7 @@ class _Leaf(NamedTuple):
     length: int  # bytes of a value of fixed length
 
 
-class Page(NamedTuple):
+class PageHeader(NamedTuple):
     """Fields of a page's header."""
 
     kind: int
@@ -136,7 +136,7 @@ def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
     return start, stop
 
 
-def _texts(pages: Collection[Page], *, shared: bool) -> int:
+def _texts(pages: Collection[PageHeader], *, shared: bool) -> int:
     """Return how many bytes texts can be: those that share beginnings, or stand in a dictionary, as long as it each."""
     words = max((page.unpacked for page in pages if page.kind == DICTIONARY), default=0)
     total = words if shared else 0
@@ -149,11 +149,11 @@ def _texts(pages: Collection[Page], *, shared: bool) -> int:
     return total
 
 
-def _pages(content: Bytes, place: int, stop: int) -> Iterator[Page]:
+def _pages(content: Bytes, place: int, stop: int) -> Iterator[PageHeader]:
     while place < stop:
         usual = _USUAL.match(content, place, stop)
         if usual is not None:
-            page = Page(DATA, _varint(usual[1]), _varint(usual[2]), _varint(usual[4]), usual[5][0] >> 1)
+            page = PageHeader(DATA, _varint(usual[1]), _varint(usual[2]), _varint(usual[4]), usual[5][0] >> 1)
             place = usual.end()
         else:
             header, place = _struct(content, place, stop, 0)
@@ -161,7 +161,7 @@ def _pages(content: Bytes, place: int, stop: int) -> Iterator[Page]:
                 (header[field] for field in (5, 7, 8) if isinstance(header.get(field), dict)), {}
             )
             encoding = inner.get(4 if 8 in header else 2, -1)
-            page = Page(
+            page = PageHeader(
                 *(
                     _expect_number(value)
                     for value in (header.get(1), header.get(2), header.get(3), inner.get(1, 0), encoding)

@@ -101,7 +101,7 @@ GAP = "  "
 
 
 @dataclass(frozen=True)
-class Row:
+class TerminalRow:
     """The cells of a row and how they are shown on a terminal, as rich names styles."""
 
     cells: Sequence[str]
@@ -109,19 +109,19 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Group:
+class RowGroup:
     """Rows below a heading; an empty heading is not printed."""
 
     heading: str
-    rows: Sequence[Row]
+    rows: Sequence[TerminalRow]
 
 
 @dataclass(frozen=True)
-class Table:
+class TerminalTable:
     """Groups of rows with the same columns, and a caption."""
 
     heads: Sequence[str]
-    groups: Sequence[Group]
+    groups: Sequence[RowGroup]
     caption: str = ""
     spare: Sequence[int] = ()  # columns that may be left out, in this order
     left: Sequence[int] = field(default=(0,))  # columns of text, aligned to the left
@@ -176,7 +176,7 @@ def width_of(stream: TextIO) -> int:
     return WIDTH
 
 
-def show(table: Table, *, on_stdout: bool) -> None:
+def show(table: TerminalTable, *, on_stdout: bool) -> None:
     """Print a table on stdout or stderr, in colours on a terminal; a command's result goes to stdout."""
     stream = sys.stdout if on_stdout else sys.stderr
     lines = table.lines(width_of(stream))

@@ -18,7 +18,7 @@ from tacpipe.errors import DeviceError, MissingModuleError, UsageError
 from tacpipe.io import files
 from tacpipe.links.link import Arrived, Descriptor
 from tacpipe.plugins import extras
-from tacpipe.sensors.sensor import Line, Sensor
+from tacpipe.sensors.sensor import Sensor, SerialLine
 
 if TYPE_CHECKING:
     import serial
@@ -207,7 +207,7 @@ def refused(error: OSError, place: str, name: str) -> DeviceError:
     return DeviceError(f"{name}: {place} cannot be opened: {error.strerror or error}. Unplug it and plug it in again.")
 
 
-def _open_port(place: str, baud: int, line: Line, name: str) -> serial.Serial:
+def _open_port(place: str, baud: int, line: SerialLine, name: str) -> serial.Serial:
     with extras.explain_missing(name):
         import serial
 

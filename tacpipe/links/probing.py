@@ -18,7 +18,7 @@ from tacpipe.links.opening import open_link, run_dialogue
 from tacpipe.plugins import params, registry
 from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.sensor import Dialogue, Line, Sensor
+from tacpipe.sensors.sensor import Dialogue, Sensor, SerialLine
 
 # Kinds of links whose entries are packets, whose size is evidence too
 PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl")
@@ -29,7 +29,7 @@ FEWEST = 3  # smallest number of frames
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SensorCandidate:
     """A sensor that may have sent the bytes, with its options."""
 
     kind: str  # registered name
@@ -49,7 +49,7 @@ class Candidate:
 class Finding:
     """The evidence for a candidate."""
 
-    candidate: Candidate
+    candidate: SensorCandidate
     frames: int
     rate_hz: float  # rate of frames, 0 with fewer than two arrivals
     bytes: int  # number of bytes that were examined
@@ -74,7 +74,7 @@ class Finding:
         return f"{self.candidate}: {self.frames:,} frames{rate}, {part} ({chance})"
 
 
-def candidates(data: Chunks, scheme: str) -> list[Candidate]:
+def candidates(data: Chunks, scheme: str) -> list[SensorCandidate]:
     """Return the sensors that use links of this kind, with the options that the bytes suggest."""
     sensors = []
     for kind in registry.sensors():
@@ -86,13 +86,13 @@ def candidates(data: Chunks, scheme: str) -> list[Candidate]:
             continue
         for options in variants.of(kind, data):
             try:
-                sensors.append(Candidate(kind, params.filled(loaded, options, kind, "option"), options))
+                sensors.append(SensorCandidate(kind, params.filled(loaded, options, kind, "option"), options))
             except TacpipeError:  # its options cannot be guessed, such as the columns of a generic driver
                 continue
     return sensors
 
 
-def recognise(data: Chunks, scheme: str, sensors: Iterable[Candidate] | None = None) -> list[Finding]:
+def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | None = None) -> list[Finding]:
     """Return the findings for ``sensors``, the likeliest first. Sensors without evidence are left out.
 
     ``data`` came over a link of the kind ``scheme``. By default all sensors of such links are tried.
@@ -183,9 +183,9 @@ class Report:
         return bool(self.findings) and (self.findings[0].evidence >= CERTAIN)
 
 
-def placeholder(baud: int, line: Line | None = None) -> Sensor:
+def placeholder(baud: int, line: SerialLine | None = None) -> Sensor:
     """Return a sensor that only states how its port is set."""
-    kind = type("StandIn", (Sensor,), {"baud": baud, "rate_hz": 0.0, "line": line or Line()})
+    kind = type("StandIn", (Sensor,), {"baud": baud, "rate_hz": 0.0, "line": line or SerialLine()})
     sensor: Sensor = kind()
     return sensor
 
@@ -284,7 +284,7 @@ def _bauds(usb_id: str) -> list[int]:
     return list(dict.fromkeys([*first, *(baud for baud, _ in counted.most_common()), *TEXT_BAUDS]))
 
 
-def _by_usb(sensors: list[Candidate], usb_id: str) -> list[Candidate]:
+def _by_usb(sensors: list[SensorCandidate], usb_id: str) -> list[SensorCandidate]:
     """Return one candidate per driver, drivers that know the USB device first."""
     by_kind = {candidate.kind: candidate for candidate in reversed(sensors)}
     return sorted(by_kind.values(), key=lambda candidate: (usb_id not in candidate.sensor.usb_ids, candidate.kind))

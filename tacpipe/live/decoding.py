@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Indices
-from tacpipe.recording.reading import Batch, Reading
-from tacpipe.recording.spool import Note
+from tacpipe.recording.reading import Batch, LinkReader
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -24,18 +24,18 @@ class Decoder:
         self.sensor = sensor
         self.heard_ns: int | None = None  # arrival of the newest chunk
         self.failures = 0
-        self._reading = Reading(sensor)
-        self._waiting: list[Chunks | Note] = []
+        self._reading = LinkReader(sensor)
+        self._waiting: list[Chunks | StreamNote] = []
         self._schema: pa.Schema | None = None  # schema of its batches
         self._places: Places = {}
 
-    def columns(self, batch: Batch, offset_ns: int) -> Columns:
+    def columns(self, batch: Batch, offset_ns: int) -> BatchColumns:
         """Return a batch of this stream as it is recorded; ``offset_ns`` is added to the monotonic clock to have UTC."""
         if self._schema is None:
             self._schema = batch_schema(batch, self.sensor)
-        return Columns(batch, self._schema, offset_ns, self._places)
+        return BatchColumns(batch, self._schema, offset_ns, self._places)
 
-    def take(self, block: Chunks | Note) -> None:
+    def take(self, block: Chunks | StreamNote) -> None:
         """Keep a block."""
         if isinstance(block, Chunks):
             self.heard_ns = int(block.t_ns[-1])
@@ -75,7 +75,7 @@ class Decoder:
             return [self._reading.feed(chunks)]
         except Exception:  # a driver failed: later bytes are tried again, as when the recording is sealed
             self.failures += 1
-            self._reading = Reading(self.sensor)
+            self._reading = LinkReader(self.sensor)
             return []
 
 
@@ -83,7 +83,7 @@ Place = tuple[int, Indices, Indices]  # number of a block, which columns are in 
 Places = dict[tuple[int, ...], list[Place]]
 
 
-class Columns:
+class BatchColumns:
     """A batch as the recording will hold it, without a copy. It has what a causal chain reads of a table.
 
     A table of pyarrow costs 10 us a column, and an arm has fifty of which a model reads ten.

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from tacpipe.live import wire
 from tacpipe.live.messages import Description, Message
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -58,7 +58,7 @@ class Engine(ABC):
         """The state that another process needs to continue the recording; None while there is none."""
         return None
 
-    def take(self, stream: str, block: Chunks | Note) -> None:
+    def take(self, stream: str, block: Chunks | StreamNote) -> None:
         """Take a block of a stream, or a note on all streams (``stream`` is empty)."""
         if isinstance(block, Chunks):
             self.take_chunks(stream, block)
@@ -74,7 +74,7 @@ class Engine(ABC):
         elif block.what == wire.OVERFLOW:
             self.overflow()
 
-    def take_note(self, stream: str, note: Note) -> None:
+    def take_note(self, stream: str, note: StreamNote) -> None:
         """Take a note on a stream: that its part of the recording begins or is over, or that bytes of it were lost."""
         if note.what == BEGAN:
             self.begin_stream(stream)

@@ -19,7 +19,7 @@ from tacpipe.plugins import fields
 from tacpipe.printable import plain
 from tacpipe.recording import recorder
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.rig import Rig, Stream
+from tacpipe.recording.rig import Rig, RigStream
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -112,7 +112,7 @@ def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
             f"The rig file has a stream {conflicting[0]}, as a live session adds itself; give it another name."
         )
     added = {
-        name: Stream(
+        name: RigStream(
             name, "live", rigs.build_sensor("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)
         )
         for (name, options), port in zip(streams.items(), free_ports(len(streams)), strict=True)

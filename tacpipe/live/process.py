@@ -26,7 +26,7 @@ from tacpipe.live.messages import Message
 from tacpipe.live.publishing import Publishers
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 
 REPORT_NS = 250_000_000  # period of reports to the recording process
 FETCH_BYTES = 1 << 18  # read at once
@@ -157,7 +157,7 @@ class Loop:
                 self._ended = True
                 return
             for stream, block in self.blocks.feed(data):
-                if not stream and isinstance(block, Note) and block.what == wire.STOP:
+                if not stream and isinstance(block, StreamNote) and block.what == wire.STOP:
                     self._ended = True
                 self.engine.take(stream, block)
 

@@ -18,10 +18,10 @@ from typing import Any
 from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
 from tacpipe.live import scheduling, wire
 from tacpipe.live.settings import SessionOptions
-from tacpipe.live.wire import Tap
+from tacpipe.live.wire import RecorderTap
 from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.sensors.framing import Chunks
 
 MODULE = "tacpipe.live.process"  # runs as the model's process
@@ -35,7 +35,7 @@ SWITCH_S = 0.0005  # time that one thread may hold up another: the threads that 
 @contextlib.contextmanager
 def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[], bool]) -> Iterator[Supervisor]:
     """Have the model's process follow a rig while in the block. Raises what it refuses the session with."""
-    supervisor = Supervisor(options, Tap(options.streams))
+    supervisor = Supervisor(options, RecorderTap(options.streams))
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -82,7 +82,7 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
 class Supervisor:
     """Keeps the model's process of a session running: a `tacpipe.recording.recorder.Companion`."""
 
-    def __init__(self, options: SessionOptions, tap: Tap) -> None:
+    def __init__(self, options: SessionOptions, tap: RecorderTap) -> None:
         self.options, self.tap = options, tap
         self._noted_stream = options.own_streams[0]  # stream that gets the notes on the process
         self.report: dict[str, Any] = {}  # the last report of the running process
@@ -92,7 +92,7 @@ class Supervisor:
         self._totals = {"forecasts": 0, "skipped": 0, "late": 0, "dropped": 0}  # counts of processes that ended
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
-        self._lines = wire.Lines()
+        self._lines = wire.LineCutter()
         self._offset_ns: int | None = None  # offset of the running recording
         self._beginning: dict[str, Any] | None = None  # state that a new process continues from
         self._restart_s = RESTART_S[0]
@@ -119,7 +119,7 @@ class Supervisor:
             raise TacpipeError(f"The model's process ended with {code} before it was ready; see above.")
         return self.ready
 
-    def put(self, stream: str, content: Chunks | Note) -> None:
+    def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Pass a block of a stream to the model's process."""
         self.tap.put(stream, content)
 
@@ -127,7 +127,7 @@ class Supervisor:
         """Begin a recording, whose UTC is the monotonic clock and a constant."""
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self._beginning = None
-        self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
+        self.tap.note(StreamNote(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
         if self.options.settings.realtime:
             scheduling.realtime(scheduling.RECORDER)
 
@@ -136,9 +136,9 @@ class Supervisor:
         self._offset_ns = None
         if self.options.settings.realtime:
             scheduling.ordinary()  # decoding and writing have no deadline
-        self.tap.note(Note(clock.now_ns(), "", wire.END))
+        self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
-    def look(self) -> list[Note]:
+    def look(self) -> list[StreamNote]:
         """Take what the process reports, start it anew where it ended; return notes on that. Never raises, never waits."""
         self.tap.flush()
         self._read()
@@ -149,12 +149,12 @@ class Supervisor:
             self._forget()
             self._due_s = clock.now_s() + self._restart_s
             self._restart_s = min(2 * self._restart_s, RESTART_S[1])
-            notes.append(Note(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
+            notes.append(StreamNote(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
         if self._process is None and clock.now_s() >= self._due_s:
             with contextlib.suppress(OSError):  # too little memory: it is tried again
                 self._spawn()
                 notes.append(
-                    Note(clock.now_ns(), self._noted_stream, RESTARTED, f"restart {self.deaths} of this session")
+                    StreamNote(clock.now_ns(), self._noted_stream, RESTARTED, f"restart {self.deaths} of this session")
                 )
         return notes
 
@@ -163,7 +163,7 @@ class Supervisor:
         process = self._process
         if process is None:
             return
-        self.tap.note(Note(clock.now_ns(), "", wire.STOP))
+        self.tap.note(StreamNote(clock.now_ns(), "", wire.STOP))
         until_s = clock.now_s() + STOP_S
         while process.poll() is None and clock.now_s() < until_s:
             self.tap.flush()
@@ -194,12 +194,12 @@ class Supervisor:
             )
         finally:
             theirs.close()
-        self._socket, self._lines, self.ready = ours, wire.Lines(), False
+        self._socket, self._lines, self.ready = ours, wire.LineCutter(), False
         ours.sendall(self.options.to_json().encode())
         ours.setblocking(False)
-        first = [] if self._offset_ns is None else [Note(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        first = [] if self._offset_ns is None else [StreamNote(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
         if first and self._beginning is not None:
-            first.insert(0, Note(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
+            first.insert(0, StreamNote(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
         self.tap.connect(ours, *first)
         if first:
             self.tap.put_begins()

@@ -16,7 +16,7 @@ from typing import Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.recording import clock, spool
-from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, Note
+from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, StreamNote
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 
@@ -29,7 +29,7 @@ STOP = "stop"  # the session is over
 QUEUED_BYTES = 8 << 20  # limit of the bytes that wait for the model's process: many seconds of a rig
 
 
-def block(stream: int | None, content: Chunks | Note) -> bytes:
+def block(stream: int | None, content: Chunks | StreamNote) -> bytes:
     """Return one block as bytes; ``stream`` is the number of its stream, None for a note on all of them."""
     if isinstance(content, Chunks):
         body = content.t_ns.astype("<i8").tobytes() + content.size.astype("<u4").tobytes() + content.data
@@ -45,7 +45,7 @@ class Blocks:
         self._streams = list(streams)
         self._text = bytearray()
 
-    def feed(self, data: bytes) -> Iterator[tuple[str, Chunks | Note]]:
+    def feed(self, data: bytes) -> Iterator[tuple[str, Chunks | StreamNote]]:
         """Yield each block that is complete now with the name of its stream, empty for a note on all.
 
         Raises `TacpipeError` for bytes that are not blocks: the other process is not of this version.
@@ -67,7 +67,7 @@ class Blocks:
         del self._text[:place]
 
 
-class Lines:
+class LineCutter:
     """Cuts received bytes into objects, one a line."""
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ def line(content: dict[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":")).encode() + b"\n"
 
 
-class Tap:
+class RecorderTap:
     """The recorder's side of the connection to the model's process, which may be replaced while it is in use."""
 
     def __init__(self, streams: Sequence[str], most_bytes: int = QUEUED_BYTES) -> None:
@@ -97,7 +97,7 @@ class Tap:
         self._waiting: deque[memoryview] = deque()
         self._waiting_bytes = 0
 
-    def connect(self, connection: socket.socket | None, *first: Note) -> None:
+    def connect(self, connection: socket.socket | None, *first: StreamNote) -> None:
         """Send later blocks over a socket, ``first`` before it; None: send nothing until the next call."""
         with self._keeping:
             self._waiting.clear()
@@ -108,13 +108,13 @@ class Tap:
             for note in first:
                 self._append(block(None, note))
 
-    def put(self, stream: str, content: Chunks | Note) -> None:
+    def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Send a block of a stream, or a note on it; thread-safe."""
         with self._keeping:
             if self._connection is not None:
                 self._append(block(self._numbers[stream], content))
 
-    def note(self, note: Note) -> None:
+    def note(self, note: StreamNote) -> None:
         """Send a note on all streams."""
         with self._keeping:
             if self._connection is not None:
@@ -123,7 +123,7 @@ class Tap:
     def put_begins(self) -> None:
         """Send the note that each stream begins to a process that is started during a recording."""
         for stream in self._numbers:
-            self.put(stream, Note(clock.now_ns(), stream, BEGAN))
+            self.put(stream, StreamNote(clock.now_ns(), stream, BEGAN))
 
     def flush(self) -> None:
         """Send the blocks that wait, as far as the socket accepts them."""
@@ -143,7 +143,7 @@ class Tap:
         retained = [self._waiting[0]] if is_partly_sent else []
         self.overflows += 1
         self.bytes_lost += self._waiting_bytes - sum(part.nbytes for part in retained)
-        note = memoryview(block(None, Note(clock.now_ns(), "", OVERFLOW)))
+        note = memoryview(block(None, StreamNote(clock.now_ns(), "", OVERFLOW)))
         self._waiting = deque([*retained, note])
         self._waiting_bytes = sum(part.nbytes for part in self._waiting)
 

@@ -46,7 +46,7 @@ class Collected:
 
 
 @dataclass
-class Live:
+class LiveObjects:
     """Everything that is needed by roots, by what lies at their paths, by running processes, or as an ancestor of these."""
 
     objects: set[str] = field(default_factory=set)  # digests, of manifests too
@@ -58,12 +58,12 @@ class Live:
     runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
 
 
-def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> Live:
+def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
     """Return what is needed, with ``lasting`` also what was replaced and cannot be computed again.
 
     Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
     """
-    needed, pending, replaced = Live(), [], []
+    needed, pending, replaced = LiveObjects(), [], []
     for run in store.leases.runs():  # runs are read before roots: one that ends meanwhile has written its root
         needed.runs.add(run.path.stem)
         needed.objects |= run.objects
@@ -316,7 +316,7 @@ def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reache
 
 
 def _sweep(
-    store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
+    store: Store, needed: LiveObjects, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
 ) -> None:
     """Remove drafts, leases and checkpoints of runs that are over, and what was long in quarantine.
 

@@ -21,7 +21,7 @@ NONE = "–"
 
 
 @dataclass(frozen=True)
-class Row:
+class HeadlineRow:
     """The errors of one predictor, one value a column of the headline; NaN where one is not defined."""
 
     name: str
@@ -39,8 +39,8 @@ class Headline:
     columns: tuple[str, ...]  # names of the errors
     unit: str  # names of the errors
     ranked_by: str  # the error that orders the baselines and that the gain is computed from
-    model: Row
-    baselines: tuple[Row, ...]  # the best first
+    model: HeadlineRow
+    baselines: tuple[HeadlineRow, ...]  # the best first
     measure: str  # kind of gain: "skill" (1 − error / error of the best baseline) or "points" (of percent)
     gain: float  # gain of the model over the best baseline; NaN where it is not defined
     low: float  # 95 % interval of the gain; NaN with fewer than three clusters
@@ -55,12 +55,12 @@ class Headline:
     left_out: int = 0  # recordings on which the reference makes no error, which have no ratio to it
 
     @property
-    def best(self) -> Row | None:
+    def best(self) -> HeadlineRow | None:
         """The best baseline, None where none was evaluated."""
         return self.baselines[0] if self.baselines else None
 
     @property
-    def table_baselines(self) -> tuple[Row, ...]:
+    def table_baselines(self) -> tuple[HeadlineRow, ...]:
         """Return the baselines that tables show: the best one and the reference."""
         return tuple(row for row in self.baselines if row is self.best or row.name == self.reference)
 
@@ -262,8 +262,8 @@ def _json(value: Any) -> Any:
     return value
 
 
-def _row(value: Mapping[str, Any]) -> Row:
-    return Row(value["name"], tuple(_number(number) for number in value["values"]))
+def _row(value: Mapping[str, Any]) -> HeadlineRow:
+    return HeadlineRow(value["name"], tuple(_number(number) for number in value["values"]))
 
 
 def _number(value: float | None) -> float:

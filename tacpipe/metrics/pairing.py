@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.metrics import intervals
-from tacpipe.metrics.headline import Headline, Row, verdict_of
+from tacpipe.metrics.headline import Headline, HeadlineRow, verdict_of
 from tacpipe.metrics.intervals import Estimate, Interval, Jackknife
 
 Sums = Mapping[
@@ -179,8 +179,8 @@ def headline(
         measure.columns,
         measure.unit,
         measure.ranked_by,
-        Row(method, measure.values(own_pair.totals[0])),
-        tuple(Row(name, measure.values(pair.totals[1])) for name, pair in ranked.items()),
+        HeadlineRow(method, measure.values(own_pair.totals[0])),
+        tuple(HeadlineRow(name, measure.values(pair.totals[1])) for name, pair in ranked.items()),
         measure.name,
         over.mean,
         over.low,

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models import lstm
-from tacpipe.models.windows import MOTION, UP, Shape, Windows, motion, repeats
+from tacpipe.models.windows import MOTION, UP, ForecastShape, ForecastWindows, motion, repeats
 
 CELLS = ("gru", "lstm", "tcn")
 CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a sensor must not dominate a window
@@ -49,7 +49,7 @@ class ChangeForecast(nn.Module):
         self.register_buffer("motion_mean", torch.zeros(MOTION))
         self.register_buffer("motion_scale", torch.ones(MOTION))
 
-    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+    def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scales on training windows; ``ahead`` is (horizon, window, feature)."""
         moved = ahead if self.increments else ahead - windows.touch[-1]
         self.change_scale.copy_(_scale(moved.square().mean().sqrt()))
@@ -59,7 +59,7 @@ class ChangeForecast(nn.Module):
         self.motion_mean.copy_(steps.mean(0))
         self.motion_scale.copy_(_scale(spread(steps)))
 
-    def loss(self, windows: Windows, ahead: Tensor) -> Tensor:
+    def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
         """Return the mean error in units of the usual change: absolute, squared, or Huber's."""
         predicted, truth = self(windows) / self.change_scale, ahead / self.change_scale
         if self.kind == "squared":
@@ -68,13 +68,13 @@ class ChangeForecast(nn.Module):
             return nn.functional.huber_loss(predicted, truth)
         return nn.functional.l1_loss(predicted, truth)
 
-    def arm(self, windows: Windows) -> tuple[Tensor, Tensor]:
+    def arm(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
         """Return the scaled motion (row, window, 15) and up (window, 3), both as the hand sees them."""
         steps, up = driven(windows)
         return ((steps - self.motion_mean) / self.motion_scale).clamp(-CLIPPED, CLIPPED), up
 
-    def inputs(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Return past (context, window, `Shape.past`) and plan (horizon, window, `Shape.plan`), scaled."""
+    def inputs(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
+        """Return past (context, window, `ForecastShape.past`) and plan (horizon, window, `Shape.plan`), scaled."""
         steps, up = self.arm(windows)
         arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
         past, plan = arm[: windows.context], arm[windows.context :]
@@ -84,7 +84,7 @@ class ChangeForecast(nn.Module):
             [change, level, repeats(windows.touch)[..., None], closing(windows)[..., None], past], -1
         ), plan
 
-    def touched(self, change: Tensor, windows: Windows) -> Tensor:
+    def touched(self, change: Tensor, windows: ForecastWindows) -> Tensor:
         """Return touch (horizon, window, feature) from scaled change."""
         return change * self.change_scale + (0.0 if self.increments else windows.touch[-1])
 
@@ -92,14 +92,14 @@ class ChangeForecast(nn.Module):
 class PlainForecast(ChangeForecast):
     """A network of past and plan between scales: it returns scaled change or, with ``change_only = False``, levels."""
 
-    def __init__(self, network: nn.Module, shape: Shape, *, loss: str) -> None:
+    def __init__(self, network: nn.Module, shape: ForecastShape, *, loss: str) -> None:
         """Take the network, and what it reads and predicts."""
         sizes = {"context": shape.context, "horizon": shape.horizon}
         super().__init__(shape.features, dropout=0.0, loss=loss, increments=shape.increments, **sizes)
         self.network = network
         self.change_only = bool(getattr(network, "change_only", True))
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the features to come (horizon, window, feature), in their own unit."""
         past, plan = self.inputs(windows)
         scaled: Tensor = self.network(past, plan)
@@ -119,7 +119,7 @@ class SequenceForecast(ChangeForecast):
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
         """Make a model of random weights that begins at persistence."""
         super().__init__(features, **shared)  # type: ignore[arg-type]
-        shape = Shape(features, self.context, self.horizon)
+        shape = ForecastShape(features, self.context, self.horizon)
         past, arm = shape.past, shape.plan
         self.cell = cell
         if cell == "tcn":
@@ -132,7 +132,7 @@ class SequenceForecast(ChangeForecast):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the features to come (horizon, window, feature), in their own unit."""
         read, plan = self.inputs(windows)
         if self.cell == "tcn":
@@ -177,12 +177,12 @@ def _scale(spread: Tensor) -> Tensor:
     return torch.where(spread > 0, spread, 1.0)
 
 
-def closing(windows: Windows) -> Tensor:
+def closing(windows: ForecastWindows) -> Tensor:
     """Return the width between the fingers against now, (context, window), in thirds of a centimetre."""
     return 300.0 * (windows.finger - windows.finger[-1])  # 3 mm between rows is a fast gripper
 
 
-def driven(windows: Windows) -> tuple[Tensor, Tensor]:
+def driven(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
     """Return `motion` with what accelerates the hand added (context + horizon, window, 15), and up (window, 3).
 
     The last three columns are by how much the velocity differs from that of the row before, m/s; 0 in the first row,
@@ -245,7 +245,7 @@ class TaxelwiseForecast(ChangeForecast):
         nn.init.zeros_(self.factors.weight)
         nn.init.zeros_(self.factors.bias)
 
-    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+    def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scales on training windows; ``ahead`` is (horizon, window, feature)."""
         super().calibrate(windows, ahead)
         by_axis = self._by_taxel(windows.touch).std(dim=(0, 1, 2))
@@ -255,7 +255,7 @@ class TaxelwiseForecast(ChangeForecast):
             getattr(self, f"{name}_mean").copy_(flat.mean(0))
             getattr(self, f"{name}_scale").copy_(spread(flat) + 1e-3)
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the future touch (horizon, window, channel), in counts above rest."""
         own, whole_inputs = (
             ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(-CLIPPED, CLIPPED)
@@ -274,7 +274,7 @@ class TaxelwiseForecast(ChangeForecast):
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
         return self.touched(change.flatten(2), windows)
 
-    def _new(self, windows: Windows) -> Tensor:
+    def _new(self, windows: ForecastWindows) -> Tensor:
         """Return which rows are new (window, context): new frames are rare, so they weigh more."""
         return 3 - 4 * repeats(windows.touch).T
 
@@ -287,7 +287,7 @@ class TaxelwiseForecast(ChangeForecast):
         mask: Tensor = self.drop(hidden.new_ones(len(hidden), 1, hidden.shape[-1]))
         return mask
 
-    def _read(self, windows: Windows) -> tuple[Tensor, Tensor]:
+    def _read(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
         """Return the inputs of each taxel (window, taxel, …) and of the whole (window, …)."""
         touch = windows.touch
         lags = torch.tensor([windows.context - 1 - lag for lag in self.lags], dtype=torch.long)

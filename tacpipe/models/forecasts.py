@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast, TaxelwiseForecast, grid
 from tacpipe.models.lstm import lstm
-from tacpipe.models.windows import POSE, Windows
+from tacpipe.models.windows import POSE, ForecastWindows
 
 TRIED = torch.linspace(0, 1, 21)  # weights of which the best is taken at each step
 DOUBT = 0.05  # fraction of persistence's error that one more recording is imagined to lose by the full forecast
@@ -30,17 +30,17 @@ class Ensemble(nn.Module):
         self.members = nn.ModuleList(members)
         self.change_only = members[0].change_only
 
-    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+    def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scales of all members on training windows; ``ahead`` is (horizon, window, feature)."""
         for member in self.members:
             member.calibrate(windows, ahead)  # type: ignore[operator]
 
-    def loss(self, windows: Windows, ahead: Tensor) -> Tensor:
+    def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
         """Return the mean of the members' losses; the gradient of a member depends on its own loss only."""
         losses = [member.loss(windows, ahead) for member in self.members]  # type: ignore[operator]
         return torch.stack(losses).mean()
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the features to come (horizon, window, feature)."""
         return torch.stack([member(windows) for member in self.members]).mean(0)
 
@@ -58,7 +58,7 @@ class Shrunk(nn.Module):
         self.network, self.change_only = network, True
         self.register_buffer("weight", weight)
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the features to come (horizon, window, feature)."""
         now = windows.touch[-1]
         ahead: Tensor = now + self.weight[:, None, None] * (self.network(windows) - now)
@@ -148,7 +148,7 @@ class RecurrentForecast(nn.Module):
             self.register_buffer(f"{name}_centre", torch.zeros(width))
             self.register_buffer(f"{name}_half", torch.ones(width))
 
-    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+    def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scalings on training windows: the lowest and highest value of each feature and coordinate."""
         for name, values in (("touch", torch.cat([windows.touch, ahead])), ("pose", windows.arm[..., :POSE])):
             low, high = values.flatten(0, 1).amin(0), values.flatten(0, 1).amax(0)
@@ -156,16 +156,16 @@ class RecurrentForecast(nn.Module):
             getattr(self, f"{name}_centre").copy_((high + low) / 2)
             getattr(self, f"{name}_half").copy_(torch.where(half > 0, half, 1.0))
 
-    def forward(self, windows: Windows) -> Tensor:
+    def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the features to come (horizon, window, feature), in their own unit."""
         restored: Tensor = self._scaled(windows) * self.touch_half + self.touch_centre
         return restored
 
-    def loss(self, windows: Windows, ahead: Tensor) -> Tensor:
+    def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
         """Return the mean squared error in scaled features, the paper's measure; ``ahead`` (horizon, window, feature)."""
         return nn.functional.mse_loss(self._scaled(windows), (ahead - self.touch_centre) / self.touch_half)
 
-    def _scaled(self, windows: Windows) -> Tensor:
+    def _scaled(self, windows: ForecastWindows) -> Tensor:
         touch = (windows.touch - self.touch_centre) / self.touch_half
         pose = (windows.arm[..., :POSE] - self.pose_centre) / self.pose_half
         past = torch.cat([touch, pose[: windows.context]], -1)

@@ -67,7 +67,7 @@ class Map:
 
 
 @dataclass(frozen=True)
-class Baselines:
+class FittedBaselines:
     """Hold the fitted baselines, float32 as the forecasts."""
 
     mean_count: AnyFloats  # (channel,)
@@ -79,7 +79,7 @@ class Baselines:
     ridge_actions: Map
 
     @classmethod
-    def fit(cls, training: Windows, validation: Windows) -> Baselines:
+    def fit(cls, training: Windows, validation: Windows) -> FittedBaselines:
         """Return the baselines fitted on ``training``, each (past, motion, ahead); ``validation`` picks the alphas.
 
         Raises `TacpipeError` where a part has no windows, arrays do not fit one another or a value is not finite.
@@ -96,7 +96,7 @@ class Baselines:
         means = [arrays.mean(axis=0, dtype=np.float64) for arrays in training]
         centre = _features(means[0][None], means[1][None])[0]
         bias = (means[2] - means[0][-1]).ravel()
-        sums, evaluated = (_Sums.over(part, centre, bias) for part in (training, validation))
+        sums, evaluated = (_FeatureSums.over(part, centre, bias) for part in (training, validation))
         blind = centre.size - horizon * motion.shape[2]  # features that do not know the plan
         shared = _Shared.from_sums(sums, centre, bias, (context - 1, channels, horizon))
         phi, lag = shared.damped_trend()
@@ -166,7 +166,7 @@ class Baselines:
         return tensors | self.ridge.to_tensors("ridge") | self.ridge_actions.to_tensors("ridge_actions")
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, AnyFloats]) -> Baselines:
+    def from_tensors(cls, tensors: Mapping[str, AnyFloats]) -> FittedBaselines:
         """Return the baselines that `to_tensors` described."""
         return cls(
             tensors["train_mean"],
@@ -180,7 +180,7 @@ class Baselines:
 
 
 @dataclass(frozen=True)
-class _Sums:
+class _FeatureSums:
     """Sums over windows of products of features and of features with targets, both less their training means."""
 
     windows: int
@@ -188,7 +188,7 @@ class _Sums:
     xy: AnyFloats  # (feature, step x channel)
 
     @classmethod
-    def over(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _Sums:
+    def over(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
         past, motion, ahead = part
         xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
         for first in range(0, len(past), CHUNK):
@@ -202,9 +202,9 @@ class _Sums:
             raise TacpipeError("Some windows hold values that are not finite. Take windows over usable rows only.")
         return cls(len(past), xx, xy)
 
-    def first(self, features: int) -> _Sums:
+    def first(self, features: int) -> _FeatureSums:
         """Return the sums of the first ``features`` alone."""
-        return _Sums(self.windows, self.xx[:features, :features], self.xy[:features])
+        return _FeatureSums(self.windows, self.xx[:features, :features], self.xy[:features])
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class _Shared:
     xy: AnyFloats  # (context - 1, horizon)
 
     @classmethod
-    def from_sums(cls, sums: _Sums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
+    def from_sums(cls, sums: _FeatureSums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
         """Return the sums of the blocks of each channel with itself; ``shape`` is context - 1, channel and horizon."""
         before, channels, horizon = shape
         changes = before * channels  # the first features
@@ -254,7 +254,7 @@ class _Shared:
         return weight, y - x @ weight
 
 
-def _ridge(sums: _Sums, evaluated: _Sums, centre: AnyFloats, bias: AnyFloats) -> Map:
+def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias: AnyFloats) -> Map:
     """Return the ridge regression whose alpha has the least squared error on the windows of ``evaluated``.
 
     With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy: what is costly does not

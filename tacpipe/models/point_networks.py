@@ -133,7 +133,7 @@ WIDTHS = (64, 128, 256)
 
 
 @dataclass(frozen=True)
-class Shape:
+class PointNetworkShape:
     """Sizes of what a network of touch reads and predicts."""
 
     channels: int  # numbers per point

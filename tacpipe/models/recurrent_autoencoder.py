@@ -156,7 +156,7 @@ DECODERS = ("D1", "D2")
 
 
 @dataclass(frozen=True)
-class Shape:
+class AutoencoderShape:
     """Sizes and layers of a sensor's network."""
 
     channels: int
@@ -184,7 +184,7 @@ class RecurrentAutoencoder(nn.Module):
 
     ANY_LENGTH = True  # reads slides of any number of frames
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: AutoencoderShape) -> None:
         super().__init__()
         if shape.decoder not in DECODERS:
             raise TacpipeError(f"There is no decoder {shape.decoder!r}; there are {' and '.join(DECODERS)}.")
@@ -224,7 +224,7 @@ class RecurrentClassifier(nn.Module):
 
     ANY_LENGTH = True
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: AutoencoderShape) -> None:
         super().__init__()
         self.shape = shape
         self.header = build(shape.header, shape.channels, shape.unpool)

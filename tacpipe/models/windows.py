@@ -14,7 +14,7 @@ POSE = 7  # columns of ``arm`` that hold position and quaternion; velocity follo
 ARM = 13
 
 
-class Windows(NamedTuple):
+class ForecastWindows(NamedTuple):
     """Windows of one length; rows of the past, the last of them now, then those of the plan."""
 
     touch: Tensor  # (context, window, feature): latents in their codec's unit, or counts above rest
@@ -33,7 +33,7 @@ class Windows(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Shape:
+class ForecastShape:
     """Sizes of what a forecaster reads and predicts, and where each channel lies."""
 
     features: int  # channels of touch, or latents
@@ -73,7 +73,7 @@ def rotations(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-def motion(windows: Windows) -> tuple[Tensor, Tensor]:
+def motion(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
     """Return motion in the frame that the hand has now (context + horizon, window, 12), and up in it (window, 3).
 
     Columns: where the hand is from now, m; how it is turned from now, as the vector part of the rotation's skew
@@ -98,13 +98,13 @@ def motion(windows: Windows) -> tuple[Tensor, Tensor]:
     return torch.cat([displacement, vector, linear, angular], -1), inward[..., 2]
 
 
-def without_plan(windows: Windows) -> Windows:
+def without_plan(windows: ForecastWindows) -> ForecastWindows:
     """Return the windows with every row of the plan replaced by the last row of the past: the model reads nothing of it."""
     now = windows.arm[windows.context - 1 : windows.context]
     return windows._replace(arm=torch.cat([windows.arm[: windows.context], now.expand(windows.horizon, -1, -1)]))
 
 
-def with_plans_of(windows: Windows, sources: Tensor) -> Windows:
+def with_plans_of(windows: ForecastWindows, sources: Tensor) -> ForecastWindows:
     """Return the windows with the plans of ``sources`` (window,), begun where the hand is now: plausible, and wrong.
 
     Positions, orientations and velocities of the other plan are turned as one rigid motion from its own start to here.

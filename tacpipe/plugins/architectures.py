@@ -12,8 +12,9 @@ classes are the kinds of params of the task's stage (`tacpipe.plugins.params`).
 - One that cannot be loaded is left out of the choices; who asks for it gets the reason.
 - The shared loop of the task trains what ``build`` returns. An architecture that is trained otherwise has a method ``fit``
   of its own, so no task asks which architecture it trains.
-- What ``build`` gets and what its result must do is described by the task: `tacpipe.tasks.forward.params.Forward`,
-  `tacpipe.tasks.material.params.Estimator` and `Network`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
+- What ``build`` gets and what its result must do is described by the task:
+  `tacpipe.tasks.forward.params.ForwardModelParams`, `tacpipe.tasks.material.params.Estimator` and `NetworkParams`,
+  `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
 """
 
 from __future__ import annotations

@@ -66,13 +66,13 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
     names: list[str] = []  # the name of the recording, last
 
-    def appended() -> directory.Change:
+    def appended() -> directory.DirectoryChange:
         before = existing(output)
         recordings = {} if before is None else before.recordings
         existing_name = next((name for name, entry in recordings.items() if entry["shards"] == shards), None)
         if before is not None and existing_name is not None:  # a crash came after an earlier append
             names.append(existing_name)
-            return directory.Change(before, may_lack=_other_paths(before, existing_name, rig_name))
+            return directory.DirectoryChange(before, may_lack=_other_paths(before, existing_name, rig_name))
         name = _free_name(spooled.header["recording"], recordings)
         now = before or Manifest(ACQUIRE, VERSION)
         now = now.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
@@ -85,7 +85,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
                 f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
             ) from error
         names.append(name)
-        return directory.Change(now, may_lack=_other_paths(now, name, rig_name))
+        return directory.DirectoryChange(now, may_lack=_other_paths(now, name, rig_name))
 
     directory.change(store, output, appended)
     return names[-1]

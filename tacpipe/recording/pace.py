@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import Int64s, Times
-from tacpipe.recording.reading import Event
-from tacpipe.recording.spool import Note
+from tacpipe.recording.reading import StreamFault
+from tacpipe.recording.spool import StreamNote
 
 STALLED, CAUGHT_UP = "recorder_stalled", "caught_up"  # notes: this program was delayed; arrivals are certain again
 STALL_NS = 100_000_000  # delays below this are ordinary on a busy computer
@@ -91,7 +91,7 @@ class Stalls:
         self._windows: list[tuple[int, int, int]] = []  # first and last stamp, last time the link was empty
         self._suspended: list[tuple[int, int]] = []  # first stamp, time for which the clock had stood still
 
-    def take(self, note: Note) -> Event | None:
+    def take(self, note: StreamNote) -> StreamFault | None:
         """Add a note, and return the event of a note with a stall."""
         stall = parse_stall(note.detail) if note.what == STALLED else None
         if note.what == CAUGHT_UP and self._windows:
@@ -107,7 +107,7 @@ class Stalls:
             [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
         )
         facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
-        return Event(note.t_ns, STALLED, detail="; ".join(facts))
+        return StreamFault(note.t_ns, STALLED, detail="; ".join(facts))
 
     def __bool__(self) -> bool:
         """Return whether any stamp may be late."""

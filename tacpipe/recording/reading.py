@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
 from tacpipe.sensors.counting import Counted, Counting
-from tacpipe.sensors.framing import Account, Chunks, Loss, Run
+from tacpipe.sensors.framing import Account, Chunks, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Samples, Sensor
 
 LINK = "link"  # frames that the counter misses and of which no byte arrived
@@ -20,7 +20,7 @@ SILENT = "silent"  # a device without counter sent nothing for too long, and no 
 SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000  # the longer of both is the limit
 
 
-class Event(NamedTuple):
+class StreamFault(NamedTuple):
     """A fault of a stream: when, why, and how many frames and bytes it cost."""
 
     t_ns: int
@@ -39,7 +39,7 @@ class Batch:
     seq: Times | None = None  # (sample,), unrolled
     device_seq: Times | None = None  # (sample,), unrolled
     t_device_ns: Times | None = None  # (sample,)
-    events: tuple[Event, ...] = ()
+    events: tuple[StreamFault, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -50,7 +50,7 @@ class Batch:
         return [name for name in ("seq", "device_seq") if getattr(self, name) is not None]
 
 
-class Reading:
+class LinkReader:
     """Decodes the bytes of a link to samples. The same bytes give the same samples, however they are cut."""
 
     def __init__(self, sensor: Sensor) -> None:
@@ -61,10 +61,10 @@ class Reading:
         self._before = Account()  # account of the links before the present one
         self._counting = _counting(sensor, sensor.counter)
         self._device_counting = _counting(sensor, sensor.device_counter)
-        self._unexplained: list[Loss] = []  # losses whose cost the counter of a later sample states
+        self._unexplained: list[FramingLoss] = []  # losses whose cost the counter of a later sample states
         self._last_ns: int | None = None
         self._device_ns: tuple[int, int] | None = None  # the device's last clock reading, as sent and unrolled
-        self._silence: Event | None = None  # the last silence, which a burst may still make up for
+        self._silence: StreamFault | None = None  # the last silence, which a burst may still make up for
 
     @property
     def account(self) -> Account:
@@ -98,7 +98,7 @@ class Reading:
         self._unexplained, self._silence = [], None
         return replace(batch, events=batch.events + final_events)
 
-    def _batch(self, runs: Sequence[Run], losses: Sequence[Loss]) -> Batch:
+    def _batch(self, runs: Sequence[FrameRun], losses: Sequence[FramingLoss]) -> Batch:
         decoded = [(run, self.sensor.decode(run.frames)) for run in runs]
         decoded = [(run, samples) for run, samples in decoded if len(samples)]
         stamps = [run.t_ns if samples.rows is None else run.t_ns[samples.rows] for run, samples in decoded]
@@ -108,7 +108,7 @@ class Reading:
         seq, device_seq, t_device_ns = (_joined(decoded_samples, name) for name in ("seq", "device_seq", "t_device_ns"))
         if t_device_ns is not None and self.sensor.device_wrap_ns is not None:
             t_device_ns = self._unrolled(t_device_ns, self.sensor.device_wrap_ns)
-        events: list[Event] = []
+        events: list[StreamFault] = []
         retained = np.ones(len(t_ns), dtype=bool)
         self._unexplained += losses
         if self._counting is not None:
@@ -141,34 +141,34 @@ class Reading:
         self._device_ns = int(sent_ns[-1]), int(unrolled[-1])
         return unrolled
 
-    def _explained(self, counted: Counted, t_ns: Times) -> list[Event]:
+    def _explained(self, counted: Counted, t_ns: Times) -> list[StreamFault]:
         """Return the events of a batch with a counter. Each loss costs as many frames as the counter states."""
-        events: list[Event] = []
+        events: list[StreamFault] = []
         odd = np.flatnonzero((counted.missing > 0) | counted.duplicate | counted.late | counted.reset)
         for row in odd.tolist():
             at_ns, missing = int(t_ns[row]), int(counted.missing[row])
             if counted.duplicate[row]:
-                events.append(Event(at_ns, DUPLICATE))
+                events.append(StreamFault(at_ns, DUPLICATE))
                 continue
             if counted.late[row]:
-                events.append(Event(at_ns, LATE, frames=-1))
+                events.append(StreamFault(at_ns, LATE, frames=-1))
                 continue
             if counted.reset[row]:
-                events.append(Event(at_ns, RESET, detail=f"began anew at {counted.seq[row]}"))
+                events.append(StreamFault(at_ns, RESET, detail=f"began anew at {counted.seq[row]}"))
             for loss in [loss for loss in self._unexplained if loss.t_ns <= at_ns]:
                 count = min(loss.frames, missing)
                 missing -= count
                 events.append(_event(loss, count))
                 self._unexplained.remove(loss)
             if missing:
-                events.append(Event(at_ns, LINK, frames=missing))
+                events.append(StreamFault(at_ns, LINK, frames=missing))
         if len(t_ns):  # a loss after which the counter continued cost no frame
             last_ns = int(t_ns[-1])
             events += [_event(loss, 0) for loss in self._unexplained if loss.t_ns <= last_ns]
             self._unexplained = [loss for loss in self._unexplained if loss.t_ns > last_ns]
         return events
 
-    def _silences(self, t_ns: Times) -> list[Event]:
+    def _silences(self, t_ns: Times) -> list[StreamFault]:
         """Return the silences that ended. Samples of a burst after a silence were late, not lost."""
         if not self.sensor.awaited or not len(t_ns):
             return []
@@ -186,7 +186,7 @@ class Reading:
                 self._silence = self._silence._replace(frames=max(0, self._silence.frames - 1))
             if begins:
                 lost = max(0, round(step_ns / period_ns) - 1)
-                self._silence = Event(at_ns, SILENT, lost, detail=f"{step_ns / 1e6:.0f} ms, by the clock")
+                self._silence = StreamFault(at_ns, SILENT, lost, detail=f"{step_ns / 1e6:.0f} ms, by the clock")
         return events
 
 
@@ -199,19 +199,19 @@ def _joined(samples: Sequence[Samples], name: str) -> Times | None:
     return np.concatenate(arrays) if arrays and arrays[0] is not None else None
 
 
-def _event(loss: Loss, frames: int) -> Event:
-    return Event(loss.t_ns, loss.cause, frames, loss.bytes)
+def _event(loss: FramingLoss, frames: int) -> StreamFault:
+    return StreamFault(loss.t_ns, loss.cause, frames, loss.bytes)
 
 
-def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Event]:
+def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[StreamFault]:
     """Return the events of samples that the device skipped: those that its own counter misses beyond lost packets.
 
     A counter that restarted, or jumped further than the time allows, states no such samples.
     """
     beyond = np.where(skipped.reset, 0, skipped.missing - counted.missing)
-    events = [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
+    events = [StreamFault(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
     restarts = np.flatnonzero(skipped.reset & ~counted.reset)
-    return events + [Event(int(t_ns[row]), RESET, detail="the device's second counter") for row in restarts]
+    return events + [StreamFault(int(t_ns[row]), RESET, detail="the device's second counter") for row in restarts]
 
 
 def _select_rows(batch: Batch, rows: Bools) -> Batch:

@@ -17,8 +17,8 @@ from tacpipe.recording import clock
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import spool as spool_of
 from tacpipe.recording.pace import STALL_NS
-from tacpipe.recording.rig import Rig, Stream
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.rig import Rig, RigStream
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.station import LOST, Station, explain_silence
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors import variants
@@ -35,7 +35,7 @@ PREROLL_S = 0.5  # time before a trigger that is recorded too
 class Companion(Protocol):
     """A follower of a rig while it is recorded, such as a model in its own process. No method may wait or raise."""
 
-    def put(self, stream: str, content: Chunks | Note) -> None:
+    def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Receive bytes or a note of a stream. The reading threads call this."""
 
     def begin(self, clock: Mapping[str, int]) -> None:
@@ -44,7 +44,7 @@ class Companion(Protocol):
     def end(self) -> None:
         """End the recording."""
 
-    def look(self) -> Iterable[Note]:
+    def look(self) -> Iterable[StreamNote]:
         """Do the work that is due after each tick, and return notes for the recording."""
 
 
@@ -60,7 +60,7 @@ class Recorder:
         self._looked_ns: int | None = None  # time of the last tick
         self._awake_ns = 0  # start of uninterrupted ticks: an earlier silence may be a delay of this program
         self._held_ns = 0  # total time that this program was delayed
-        self._before: dict[str, deque[tuple[int, list[Chunks | Note]]]] = {name: deque() for name in rig.streams}
+        self._before: dict[str, deque[tuple[int, list[Chunks | StreamNote]]]] = {name: deque() for name in rig.streams}
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -146,7 +146,7 @@ class Recorder:
             early = _since(self._before[name], since_ns) if preroll else None
             pending = station.begin(functools.partial(spool.tally, spool.streams[name]), early)
             if station.error is not None:  # the loss came before the recording, so no note states it
-                spool.note(Note(clock.now_ns(), name, LOST, str(station.error)))
+                spool.note(StreamNote(clock.now_ns(), name, LOST, str(station.error)))
             if early is not None:
                 _spool_blocks(spool, name, [*early, *pending])
             self._watch(name, pending)
@@ -211,7 +211,7 @@ class Recorder:
         if overdue_ns > STALL_NS:
             self._awake_ns, self._held_ns = now_ns, self._held_ns + overdue_ns
 
-    def _watch(self, name: str, blocks: list[Chunks | Note]) -> None:
+    def _watch(self, name: str, blocks: list[Chunks | StreamNote]) -> None:
         """Pass blocks to the watch, and keep them as long as a trigger may need them."""
         before = self._before[name]
         if blocks:
@@ -236,10 +236,10 @@ def _sync(spool: Spool, stopped: threading.Event) -> None:
         spool.sync()
 
 
-def _since(before: deque[tuple[int, list[Chunks | Note]]], since_ns: int) -> list[Chunks | Note]:
+def _since(before: deque[tuple[int, list[Chunks | StreamNote]]], since_ns: int) -> list[Chunks | StreamNote]:
     """Return the parts of blocks that arrived since ``since_ns``."""
     blocks = [block for _, part in before for block in part]
-    recent: list[Chunks | Note] = []
+    recent: list[Chunks | StreamNote] = []
     for block in blocks:
         if isinstance(block, Chunks):
             block = block.since(since_ns)
@@ -249,9 +249,9 @@ def _since(before: deque[tuple[int, list[Chunks | Note]]], since_ns: int) -> lis
     return recent
 
 
-def _spool_blocks(spool: Spool, name: str, blocks: list[Chunks | Note]) -> None:
+def _spool_blocks(spool: Spool, name: str, blocks: list[Chunks | StreamNote]) -> None:
     for block in blocks:
-        if isinstance(block, Note):
+        if isinstance(block, StreamNote):
             spool.note(block)
         else:
             spool.append(name, block)
@@ -275,13 +275,13 @@ def complete_rig(rig: Rig) -> Rig:
     return replace(complete, text=rigs.to_toml(complete))
 
 
-def _complete_stream(stream: Stream) -> Stream:
+def _complete_stream(stream: RigStream) -> RigStream:
     options = {**_read_options(stream), **stream.options}
     sensor = rigs.build_sensor(stream.kind, options, f"stream {stream.name}")
     return replace(stream, options=options, sensor=sensor)
 
 
-def _read_options(stream: Stream) -> variants.Options:
+def _read_options(stream: RigStream) -> variants.Options:
     chunks: list[tuple[int, bytes]] = []
     until_s = clock.now_s() + STATED_S
     with closing(opening.open_link(stream.address, stream.sensor, stream.name)) as link:

@@ -37,7 +37,7 @@ KEYS = ("name", "sensor", "transport", "options", "emulate")
 
 
 @dataclass(frozen=True)
-class Stream:
+class RigStream:
     """One stream of a rig: the sensor and its address."""
 
     name: str
@@ -52,7 +52,7 @@ class Stream:
 class Rig:
     """A rig: its streams by name, the master stream, and the labels of every recording."""
 
-    streams: Mapping[str, Stream]
+    streams: Mapping[str, RigStream]
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
     emulate: Mapping[str, Any] = field(default_factory=dict)
@@ -86,7 +86,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
     tables = contents.get("stream")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise UsageError(f"{source} lists no stream; each is a table [[stream]] with name, sensor and transport.")
-    streams: dict[str, Stream] = {}
+    streams: dict[str, RigStream] = {}
     for number, table in enumerate(tables, start=1):
         stream = _stream(table, f"{source}, stream {_stream_label(table, number)}")
         if stream.name in streams:
@@ -105,7 +105,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
     return Rig(streams, master, labels, _table(contents, "emulate", source), _table(contents, "live", source), text)
 
 
-def _stream(table: Mapping[str, Any], source: str) -> Stream:
+def _stream(table: Mapping[str, Any], source: str) -> RigStream:
     _refuse_unknown(table, KEYS, source)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
@@ -124,7 +124,7 @@ def _stream(table: Mapping[str, Any], source: str) -> Stream:
             f"{source}: {kind} cannot be reached by {plain(str(address))}; it must be {' or '.join(sensor.links)}, as in "
             f"{' or '.join(link.SCHEMES[scheme] for scheme in sensor.links)}."
         )
-    return Stream(name, kind, sensor, address, options, emulate)
+    return RigStream(name, kind, sensor, address, options, emulate)
 
 
 def _table(table: Mapping[str, Any], key: str, source: str) -> Mapping[str, Any]:

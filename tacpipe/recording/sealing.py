@@ -10,9 +10,9 @@ from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
-from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
+from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, LinkReader, StreamFault
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import LOST, OPENED, OVERRUN
 from tacpipe.sensors.framing import Chunks
@@ -129,7 +129,7 @@ class Sealed:
     rows: int
     batches: Callable[[], pa.RecordBatchReader]  # returns the samples in batches
     span_ns: tuple[int, int] | None  # stamps of the first and the last sample, None without samples
-    events: list[Event]
+    events: list[StreamFault]
     lost: int  # number of lost frames, by counter where there is one
     received: int = 0  # number of bytes
     undecoded: int = 0  # number of bytes that the driver could not decode
@@ -167,7 +167,7 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
     crashed = _crashed(spooled, name, read.chunks, read.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
-        events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
+        events.append(StreamFault(last_ns, CRASH, bytes=crashed[1], detail=detail))
     stamping = Stamping(lambda t_ns: spooled.utc_ns(stalls.awake_ns(t_ns)), stalls.uncertain_ns)
     events = [event._replace(t_ns=stamping.utc_ns(event.t_ns)) for event in events]
     late = decoded.uncertain(stamping) if stalls else 0
@@ -188,15 +188,15 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
 class _Read:
     """The account of a stream's blocks."""
 
-    events: list[Event] = field(default_factory=list)
+    events: list[StreamFault] = field(default_factory=list)
     chunks: int = 0
     bytes: int = 0
     undecoded: int = 0  # bytes
 
 
-def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
+def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
     """Decode the blocks of a stream: add samples to ``decoded``, delays of the program to ``stalls``."""
-    account, reading = _Read(), Reading(sensor)
+    account, reading = _Read(), LinkReader(sensor)
 
     def add(batch: Batch) -> None:
         account.events.extend(batch.events)
@@ -204,7 +204,7 @@ def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, sta
 
     away = False
     for block in blocks:
-        if isinstance(block, Note):
+        if isinstance(block, StreamNote):
             away |= block.what == LOST
             if block.what == LOST:
                 add(reading.broken())
@@ -221,8 +221,8 @@ def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, sta
         except Exception as error:  # a driver's error does not stop the other streams and blocks
             account.undecoded += len(block.data)
             reason = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            account.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
-            reading = Reading(sensor)
+            account.events.append(StreamFault(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
+            reading = LinkReader(sensor)
         decoded.spill_if_large()
     add(reading.finish())
     return account
@@ -234,23 +234,25 @@ def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, 
     return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
 
 
-def _event_of(note: Note, sensor: Sensor) -> Event:
+def _event_of(note: StreamNote, sensor: Sensor) -> StreamFault:
     """Return the event of a note. Packets that this computer dropped count as lost where no counter states them."""
     dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
-    return Event(note.t_ns, note.what, dropped, detail=note.detail)
+    return StreamFault(note.t_ns, note.what, dropped, detail=note.detail)
 
 
-def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[Event]:
+def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[StreamFault]:
     """Return the event of a stream that fell silent well before the end, which no counter reports."""
     apart_s = (end_ns - last_ns) / 1e9
     if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
         return []
     return [
-        Event(end_ns, SILENT, round(apart_s * sensor.rate_hz), detail=f"{apart_s:.1f} s, up to the end, by the clock")
+        StreamFault(
+            end_ns, SILENT, round(apart_s * sensor.rate_hz), detail=f"{apart_s:.1f} s, up to the end, by the clock"
+        )
     ]
 
 
-def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
+def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | StreamNote]:
     """Yield the blocks of a stream, with chunks joined to blocks that are large enough to decode."""
     waiting: list[Chunks] = []
     for _, block in spooled.blocks(name):
@@ -261,13 +263,13 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
         if waiting:
             yield Chunks.joined(waiting)
             waiting = []
-        if isinstance(block, Note):
+        if isinstance(block, StreamNote):
             yield block
     if waiting:
         yield Chunks.joined(waiting)
 
 
-def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event, str]]:
+def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[StreamFault, str]]:
     """Return the event of a recording that was not completed, with its duration, or nothing."""
     spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     if spooled.ended == COMPLETED or not spans_ns:
@@ -275,7 +277,9 @@ def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event
     first_ns, last_ns = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
     requested_s = spooled.header.get("duration_s")
     request = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
-    return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {request}"), "")]
+    return [
+        (StreamFault(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {request}"), "")
+    ]
 
 
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
@@ -287,7 +291,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     rows = sorted((event, name) for name, stream in sealed.items() for event in stream.events)
     rows += _cut_off(sealed, spooled)
     rows = [
-        (Event(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=damage.bytes), "")
+        (StreamFault(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=damage.bytes), "")
         for damage in spooled.damage
     ] + rows
     count = {"unit": "1", "quantity": "count"}

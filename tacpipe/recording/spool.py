@@ -42,7 +42,7 @@ WHOLE = 255  # stream number of a note on the recording, whose stream is ""
 
 
 @dataclass(frozen=True)
-class Note:
+class StreamNote:
     """An event of a stream, such as a link that opened or was lost. ``what`` names it."""
 
     t_ns: int
@@ -84,12 +84,12 @@ def find_next(handle: int, content: mmap.mmap, place: int) -> int:
     return stop if mark < 0 else mark
 
 
-def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
+def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | StreamNote | None:
     """Return the content of a block, or None where its check sum is right but another program wrote it."""
     try:
         if kind == NOTE:
             entry = json.loads(body)
-            return Note(int(entry["t_ns"]), stream, str(entry["what"]), str(entry["detail"]))
+            return StreamNote(int(entry["t_ns"]), stream, str(entry["what"]), str(entry["detail"]))
         stamps = np.frombuffer(body, "<i8", count)
         sizes = np.frombuffer(body, "<u4", count, 8 * count).astype(np.int64)
     except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
@@ -146,7 +146,7 @@ class Spool:
             body = chunks.t_ns.astype("<i8").tobytes() + chunks.size.astype("<u4").tobytes() + chunks.data
             self._waiting.append(pack_block(CHUNKS, self.streams[stream], len(chunks.size), body))
 
-    def note(self, note: Note) -> None:
+    def note(self, note: StreamNote) -> None:
         """Add a note."""
         body = json.dumps({"t_ns": note.t_ns, "what": note.what, "detail": note.detail}).encode()
         self._waiting.append(pack_block(NOTE, self.streams[note.stream] if note.stream else WHOLE, 0, body))

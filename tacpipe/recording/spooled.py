@@ -19,7 +19,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sync_folder
 from tacpipe.recording import spool, spool_folders
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED, RECOVERED
-from tacpipe.recording.spool import ENDED, TALLY, Note
+from tacpipe.recording.spool import ENDED, TALLY, StreamNote
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
@@ -68,7 +68,7 @@ class Spooled:
                 f"Remove the folder."
             ) from error
         self.damage: list[Damage] = []
-        self._notes: list[Note] = []  # notes on the whole recording
+        self._notes: list[StreamNote] = []  # notes on the whole recording
 
     @property
     def ended(self) -> str:
@@ -76,7 +76,7 @@ class Spooled:
         entry = next((note.detail for note in self._notes if note.what == ENDED), "")
         return entry if entry in (COMPLETED, INTERRUPTED) else RECOVERED
 
-    def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
+    def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | StreamNote]]:
         """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
 
         Bytes that are no block are skipped and noted in ``damage``. Notes on the recording are collected for `ended`.
@@ -111,7 +111,7 @@ class Spooled:
                     entry = spool.unpack_block(
                         kind, "", count, content[place + spool.HEAD.size : place + spool.HEAD.size + size]
                     )
-                    self._notes += [entry] if isinstance(entry, Note) else []
+                    self._notes += [entry] if isinstance(entry, StreamNote) else []
                 place = stop
 
     def _add_damage(self, offset: int, size: int) -> None:

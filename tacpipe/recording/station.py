@@ -16,13 +16,13 @@ from tacpipe.links.link import Link, LinkLostError, Opened
 from tacpipe.links.opening import NoReplyError
 from tacpipe.recording import clock
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, WAITED_NS, Pace
-from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool import Note
+from tacpipe.recording.rig import RigStream
+from tacpipe.recording.spool import StreamNote
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
-    from tacpipe.links.probing import Candidate
+    from tacpipe.links.probing import SensorCandidate
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
@@ -38,7 +38,7 @@ STOP_S = 2.0  # limit for ending the thread
 REPLY_S = 0.5  # a device that sends on request is asked again after so long
 
 Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
-Listener = Callable[["Chunks | Note"], None]  # receives blocks as they arrive; it must neither wait nor raise
+Listener = Callable[["Chunks | StreamNote"], None]  # receives blocks as they arrive; it must neither wait nor raise
 
 
 class Station:
@@ -47,14 +47,14 @@ class Station:
     `take` returns the blocks since the last call, which are not decoded here.
     """
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: RigStream) -> None:
         self.stream = stream
         self.error: TacpipeError | None = None  # the reason while the link is lost
         self.listener: Listener | None = None  # called by the thread that reads
         self._tally: Tally | None = None
         self._link: Link | None = None
         self._entries: deque[tuple[int, bytes]] = deque()
-        self._notes: deque[Note] = deque()
+        self._notes: deque[StreamNote] = deque()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
         self._keeping = threading.Lock()
@@ -73,12 +73,12 @@ class Station:
             raise DeviceError(explain_silence(self.stream, error.awaited, heard, reply=True)) from error
         self._thread.start()
 
-    def take(self) -> list[Chunks | Note]:
+    def take(self) -> list[Chunks | StreamNote]:
         """Return the bytes and notes since the last call, in their order."""
         with self._keeping:
             return self._take_blocks()
 
-    def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
+    def begin(self, tally: Tally, early: list[Chunks | StreamNote] | None) -> list[Chunks | StreamNote]:
         """Return the blocks since the last call, and report the totals of later blocks to ``tally``.
 
         ``early`` has earlier blocks that are recorded too; they and the returned blocks then count. With None
@@ -94,17 +94,17 @@ class Station:
             self._foreign = 0 if self._link is None else self._link.foreign  # earlier packets are not recorded
             self._refused = 0
             for block in (
-                Note(clock.now_ns(), self.stream.name, BEGAN),
+                StreamNote(clock.now_ns(), self.stream.name, BEGAN),
                 *(() if early is None else (*early, *pending)),
             ):
                 self._inform(block)
             return pending
 
-    def end(self) -> list[Chunks | Note]:
+    def end(self) -> list[Chunks | StreamNote]:
         """Return the blocks since the last call, and stop the tally. The listener gets the note `OVER`."""
         with self._keeping:
             self._tally = None
-            self._inform(Note(clock.now_ns(), self.stream.name, OVER))
+            self._inform(StreamNote(clock.now_ns(), self.stream.name, OVER))
             self._note_left_out(self._link)
             return self._take_blocks()
 
@@ -161,7 +161,7 @@ class Station:
         if self.listener is not None and isinstance(link, Opened):
             link.hasten()
         self._overruns, self._foreign = link.overruns, link.foreign
-        self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
+        self._notes.append(StreamNote(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
         self._link, self.error = link, None
         self._keep(early)
 
@@ -180,7 +180,7 @@ class Station:
         link, self._link = self._link, None
         self.error = error
         if link is not None:
-            note = Note(time.monotonic_ns(), self.stream.name, LOST, str(error))
+            note = StreamNote(time.monotonic_ns(), self.stream.name, LOST, str(error))
             self._notes.append(note)
             with self._keeping:
                 self._inform(note)
@@ -228,9 +228,9 @@ class Station:
         at_ns = packets[0][0] if packets else ended_ns
         if stall is not None:
             late_ns = 0 if link.kernel_stamped else stall.late_ns
-            self._notes.append(Note(at_ns, self.stream.name, STALLED, replace(stall, late_ns=late_ns).detail))
+            self._notes.append(StreamNote(at_ns, self.stream.name, STALLED, replace(stall, late_ns=late_ns).detail))
         elif pace.caught_up(began_ns, ended_ns):
-            self._notes.append(Note(at_ns, self.stream.name, CAUGHT_UP))
+            self._notes.append(StreamNote(at_ns, self.stream.name, CAUGHT_UP))
         self._keep(packets)
         if not packets or ended_ns - began_ns > WAITED_NS:
             self._empty_ns = began_ns
@@ -271,15 +271,15 @@ class Station:
         self._left_out_s = time.monotonic()
         if link is not None and link.foreign > self._foreign:
             described = f"{link.foreign - self._foreign} packets of other senders were left out"
-            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, described))
+            self._notes.append(StreamNote(clock.now_ns(), self.stream.name, FOREIGN, described))
             self._foreign = link.foreign
         if self._refused:
             described = f"{self._refused} packets that {self.stream.kind} does not accept were left out"
-            self._notes.append(Note(clock.now_ns(), self.stream.name, REFUSED, described))
+            self._notes.append(StreamNote(clock.now_ns(), self.stream.name, REFUSED, described))
             self._refused = 0
 
     def _overran(self, overruns: int) -> None:
-        self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))
+        self._notes.append(StreamNote(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))
         self._overruns = overruns
 
     def _keep(self, packets: list[tuple[int, bytes]]) -> None:
@@ -298,12 +298,12 @@ class Station:
             if self.listener is not None:
                 self._inform(Chunks.of(packets))
 
-    def _inform(self, block: Chunks | Note) -> None:
+    def _inform(self, block: Chunks | StreamNote) -> None:
         if self.listener is not None:
             self.listener(block)
 
-    def _take_blocks(self) -> list[Chunks | Note]:
-        blocks: list[Chunks | Note] = []
+    def _take_blocks(self) -> list[Chunks | StreamNote]:
+        blocks: list[Chunks | StreamNote] = []
         while self._notes:
             note = self._notes.popleft()
             blocks += [*_chunks(self._entries, note.t_ns), note]
@@ -321,7 +321,7 @@ def _chunks(entries: deque[tuple[int, bytes]], before_ns: int | None) -> list[Ch
 INVISIBLE_OPTIONS = ("rate_hz", "baud")  # options that do not change the frames
 
 
-def explain_silence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
+def explain_silence(stream: RigStream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
     """Return a sentence with the device, the problem and what to do, for a stream on which ``awaited`` did not come.
 
     ``heard`` has the bytes that came instead. With ``reply`` a reply was awaited, and frames of the sensor itself are
@@ -344,11 +344,11 @@ def explain_silence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, re
     return f"{about} Either the device {at}speaks another protocol; {probe} tries what is known."
 
 
-def _explain_bytes(stream: Stream, heard: Chunks, *, reply: bool) -> str:
+def _explain_bytes(stream: RigStream, heard: Chunks, *, reply: bool) -> str:
     """Return a sentence on the sensor that the bytes are of, empty if none is recognised."""
-    from tacpipe.links.probing import Candidate, recognise
+    from tacpipe.links.probing import SensorCandidate, recognise
 
-    scheme, expected = stream.address.scheme, Candidate(stream.kind, stream.sensor)
+    scheme, expected = stream.address.scheme, SensorCandidate(stream.kind, stream.sensor)
     if reply and recognise(heard, scheme, [expected]):
         return (
             f"They are frames of {expected}, so the device does not hear us or is another model: check the wire that we "
@@ -365,9 +365,9 @@ def _explain_bytes(stream: Stream, heard: Chunks, *, reply: bool) -> str:
     return f"They are frames of {best}: name that in the rig file, or plug in the other device."
 
 
-def _nearer(expected: Candidate, recognised: Candidate) -> list[Candidate]:
+def _nearer(expected: SensorCandidate, recognised: SensorCandidate) -> list[SensorCandidate]:
     """Return variants of the rig file's sensor, each with one option of another sensor of the same kind."""
-    from tacpipe.links.probing import Candidate
+    from tacpipe.links.probing import SensorCandidate
 
     sensor: Any = expected.sensor
     variants = []
@@ -377,7 +377,7 @@ def _nearer(expected: Candidate, recognised: Candidate) -> list[Candidate]:
             continue
         try:
             variant = replace(sensor, **{option.name: value})
-            variants.append(Candidate(expected.kind, variant, {option.name: value}))
+            variants.append(SensorCandidate(expected.kind, variant, {option.name: value}))
         except TacpipeError:  # no product has these options together
             continue
     return variants

@@ -19,10 +19,10 @@ from tacpipe.recording.appending import NothingError
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import ENDED, Note, Spool
+from tacpipe.recording.spool import ENDED, Spool, StreamNote
 from tacpipe.recording.spool_folders import users
 from tacpipe.recording.spooled import Spooled
-from tacpipe.recording.watch import View
+from tacpipe.recording.watch import RigView
 from tacpipe.store.store import Store
 
 
@@ -74,14 +74,14 @@ class Recorded:
 
 
 def run(
-    recorder: Recorder, store: Store, plan: RecordingPlan, view: View, stopping: EndRequest
+    recorder: Recorder, store: Store, plan: RecordingPlan, view: RigView, stopping: EndRequest
 ) -> tuple[list[Recorded], list[str]]:
     """Record the trials of ``plan`` until ``stopping`` is true or a stream is lost.
 
     Return the recordings, and a sentence for each lost stream.
     """
     recorded: list[Recorded] = []
-    tap = triggers.Tap(recorder.watches) if "tap" in (plan.start, plan.stop) else None
+    tap = triggers.MessageTrigger(recorder.watches) if "tap" in (plan.start, plan.stop) else None
     with _keys(plan) as pressed:
         for trial in range(plan.trials):
             if plan.tare:
@@ -108,7 +108,7 @@ def _keys(plan: RecordingPlan) -> contextlib.AbstractContextManager[triggers.Key
     return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
 
 
-def _await(recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: View, waiting: str) -> None:
+def _await(recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: RigView, waiting: str) -> None:
     recorder.run(lambda: stopping() or starts(), lambda: view.show(waiting))
 
 
@@ -135,7 +135,7 @@ def _record(
     plan: RecordingPlan,
     trial: int,
     stops: triggers.Trigger,
-    view: View,
+    view: RigView,
     stopping: EndRequest,
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
@@ -159,7 +159,7 @@ def _record(
     with termination.reporting(f"tacpipe: interrupted. {advice}."), contextlib.closing(spool):
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
-            spool.note(Note(clock.now_ns(), "", ENDED, ending))
+            spool.note(StreamNote(clock.now_ns(), "", ENDED, ending))
         lost = recorder.lost()  # before sealing, during which nothing is read
         view.show(f"sealing {name}")
         try:
@@ -185,12 +185,12 @@ def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
 
 
 def _triggers(
-    recorder: Recorder, plan: RecordingPlan, pressed: triggers.Keys, tap: triggers.Tap | None
+    recorder: Recorder, plan: RecordingPlan, pressed: triggers.Keys, tap: triggers.MessageTrigger | None
 ) -> tuple[triggers.Trigger, triggers.Trigger]:
     """Return the trigger that starts the next trial, and the one that stops it besides its duration."""
     contact = None
     if "contact" in (plan.start, plan.stop):
-        contact = triggers.Contact(recorder.watches, plan.contact_count)
+        contact = triggers.ContactTrigger(recorder.watches, plan.contact_count)
     starts: dict[str, triggers.Trigger] = {"now": lambda: True, "key": lambda: pressed(must=True)}
     stops: dict[str, triggers.Trigger] = {"duration": lambda: False, "key": pressed}
     if contact is not None:

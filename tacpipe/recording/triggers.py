@@ -85,7 +85,7 @@ def _find_key(typed: bytes, *, lines: bool) -> tuple[int, bool]:
     return (0 if lines else len(typed)), False
 
 
-class Contact:
+class ContactTrigger:
     """Detects a contact by the tactile channels of all streams."""
 
     def __init__(self, watches: Mapping[str, Watch], threshold: float) -> None:
@@ -115,7 +115,7 @@ class Contact:
         return not touched and self._touched_s is not None and clock.now_s() - self._touched_s > RELEASE_S
 
 
-class Tap:
+class MessageTrigger:
     """Detects by messages of the lab's own programs whether a trial begins or ends."""
 
     def __init__(self, watches: Mapping[str, Watch]) -> None:

@@ -16,9 +16,9 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress, terminal
 from tacpipe.recording import clock
-from tacpipe.recording.reading import Batch, Reading
-from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool import Note
+from tacpipe.recording.reading import Batch, LinkReader
+from tacpipe.recording.rig import RigStream
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 
@@ -41,19 +41,19 @@ class Figures:
 class Watch:
     """Follows one stream and keeps only its newest samples."""
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: RigStream) -> None:
         self.stream = stream
         self.samples = 0
         self.error = ""  # the last error of its driver
         self.newest: Floats | None = None  # (channel,)
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to recognise the device where no frame is found
         self.last_ns: int | None = None  # arrival of the newest sample
-        self._reading = Reading(stream.sensor)
+        self._reading = LinkReader(stream.sensor)
         self._recent: deque[tuple[Int64s, Int64s | None]] = deque()
         self._rest_samples: list[Floats] = []
         self.rest_level: Floats | None = None  # (channel,), once it is measured
 
-    def feed(self, blocks: list[Chunks | Note]) -> None:
+    def feed(self, blocks: list[Chunks | StreamNote]) -> None:
         """Decode blocks. A driver's error is kept in ``error``, because a watch must not end a recording."""
         for block in blocks:
             if isinstance(block, Chunks):
@@ -65,7 +65,7 @@ class Watch:
                     self._look(self._reading.broken())
             except Exception as error:
                 self.error = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-                self._reading = Reading(self.stream.sensor)
+                self._reading = LinkReader(self.stream.sensor)
 
     def figures(self, now_ns: int) -> Figures:
         """Return the figures at ``now_ns`` of the monotonic clock."""
@@ -106,7 +106,7 @@ class Watch:
             self._recent.popleft()
 
 
-def tactile_channels(stream: Stream) -> list[tuple[int, Any]]:
+def tactile_channels(stream: RigStream) -> list[tuple[int, Any]]:
     """Return the position among the numeric channels and the field of each tactile channel of a stream."""
     import pyarrow as pa
 
@@ -124,7 +124,7 @@ SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange
 COLUMNS = 16  # largest number of columns of the heat map
 
 
-class View:
+class RigView:
     """Shows the watches of a rig. `show` may be called at any rate."""
 
     def __init__(
@@ -140,7 +140,7 @@ class View:
         self._largest = dict.fromkeys(watches, 1.0)
 
     @contextlib.contextmanager
-    def open(self) -> Iterator[View]:
+    def open(self) -> Iterator[RigView]:
         """Show the view on the terminal in the block, where there is a terminal."""
         if self._quiet or not progress.is_visible():
             yield self

@@ -65,7 +65,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Note:
+class SmallPrint:
     """A paragraph in small print."""
 
     text: str
@@ -87,7 +87,7 @@ class Fold:
     about: str = ""  # a few words next to the heading
 
 
-Block = Table | Chart | Note | Charts | Fold
+Block = Table | Chart | SmallPrint | Charts | Fold
 
 
 @dataclass(frozen=True)
@@ -119,15 +119,17 @@ def table(
 
 def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
     """Return a fold of those blocks that are there; none where none is."""
-    shown_blocks = [block for block in blocks if block is not None and not (isinstance(block, Note) and not block.text)]
-    if all(isinstance(block, Note) for block in shown_blocks):
+    shown_blocks = [
+        block for block in blocks if block is not None and not (isinstance(block, SmallPrint) and not block.text)
+    ]
+    if all(isinstance(block, SmallPrint) for block in shown_blocks):
         return []
     return [Fold(title, shown_blocks, about)]
 
 
-def notes(*texts: str) -> Note:
+def notes(*texts: str) -> SmallPrint:
     """Return texts as one paragraph, empty ones left out."""
-    return Note(" ".join(filter(None, texts)))
+    return SmallPrint(" ".join(filter(None, texts)))
 
 
 def number(value: float, digits: int = 4) -> Cell:

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import MODEL, Method, Run
+from tacpipe.comparison.engine import Comparison, ComparisonRow
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.comparison.specification import TaskReport
 from tacpipe.datasets.origin import PUBLISHED
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts
 from tacpipe.report.blocks import Block, table
-from tacpipe.report.charts import Line
+from tacpipe.report.charts import Curve
 
 if TYPE_CHECKING:
     from tacpipe.comparison.runs import Method
@@ -33,7 +33,7 @@ SHORTENED = "shortened"  # setting of a method on the recordings of a paper: `Re
 GROWS = "trained_on"  # a part that names the recordings of the calibration too
 
 
-class Result:
+class ReportResult:
     """One result: a model trained once and evaluated once."""
 
     STAGE: ClassVar[str] = ""  # stage that trained the model
@@ -171,10 +171,10 @@ def loss_chart(
     lines = []
     for name, curves in runs.items():
         if len(curves) > 1:
-            lines += [Line(name, range(1, len(curve) + 1), curve, thin=True) for curve in curves]
+            lines += [Curve(name, range(1, len(curve) + 1), curve, thin=True) for curve in curves]
         length = min(map(len, curves))
         mean = np.mean([curve[:length] for curve in curves], axis=0)
-        lines.append(Line(name, range(1, length + 1), mean))
+        lines.append(Curve(name, range(1, length + 1), mean))
     single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value makes no line
     return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
 
@@ -208,7 +208,7 @@ class Context:
     others: Sequence[Dataset] = ()  # datasets that are not results
     bare: Sequence[Dataset] = ()  # results that hold nothing to compare
     traces: int = 0  # recordings that are drawn in full
-    runs: Sequence[Run] = field(default=())
+    runs: Sequence[ComparedRun] = field(default=())
 
     @cached_property
     def parts(self) -> dict[str, list[Comparison]]:
@@ -239,19 +239,19 @@ class Context:
         best = min(mean_ranks, key=lambda name: (mean_ranks[name], name), default=None)
         return next((method for method in self.methods if method.name == best), None)
 
-    def row(self, comparison: Comparison, method: Method | None) -> Row | None:
+    def row(self, comparison: Comparison, method: Method | None) -> ComparisonRow | None:
         """Return the row of a method itself in a comparison."""
         return next(
             (row for row in comparison.rows if method and row.method is method and row.name == method.name), None
         )
 
 
-def median_run(method: Method, comparison: Comparison) -> Run:
+def median_run(method: Method, comparison: Comparison) -> ComparedRun:
     """Return the run of a method whose score is in the middle, of an even number the one below."""
     measure, question = comparison.measure, comparison.question
     runs = method.of(question)
 
-    def place(run: Run) -> tuple[float, str]:
+    def place(run: ComparedRun) -> tuple[float, str]:
         return measure.score_of(run.questions[question].sums[MODEL].values()), str(run.seed)
 
     return sorted(runs, key=place)[(len(runs) - 1) // 2]

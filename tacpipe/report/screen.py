@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tacpipe.comparison.engine import Comparison, Row
+from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.metrics import headline
 from tacpipe.report import charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, interval, listed, number
@@ -142,7 +142,7 @@ def _by_target(context: Context, parts: dict[str, list[Comparison]], targets: Se
     return table_of(f"{measure.columns[0]} by target, and {measure.name} over the best baseline", heads, rows)
 
 
-def gain(comparison: Comparison, row: Row) -> Cell:
+def gain(comparison: Comparison, row: ComparisonRow) -> Cell:
     """Return the gain of a row with its interval."""
     digits = 1 if comparison.measure.name == "points" else 3
     return interval(row.gain.mean, row.gain.low, row.gain.high, digits)
@@ -155,9 +155,9 @@ def _questions(context: Context) -> list[Comparison]:
     return parts[0] if parts and has_several_targets else [compared[0] for compared in parts[:2]]
 
 
-def _leaders(comparison: Comparison) -> list[Row]:
+def _leaders(comparison: Comparison) -> list[ComparisonRow]:
     """Return the best method of each family, then others, the best first."""
-    firsts: dict[str, Row] = {}
+    firsts: dict[str, ComparisonRow] = {}
     for row in comparison.models:
         firsts.setdefault(row.family, row)
     heads = list(firsts.values())[: MOST - 2]
@@ -179,7 +179,7 @@ def _heads(comparison: Comparison, single: bool) -> list[str]:
     ]
 
 
-def _cells(comparison: Comparison, row: Row | None, single: bool) -> list[str | Cell]:
+def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> list[str | Cell]:
     if row is None:
         return [NONE] * len(_heads(comparison, single))
     values = row.values[-2:] if single else row.values[-1:]
@@ -188,7 +188,7 @@ def _cells(comparison: Comparison, row: Row | None, single: bool) -> list[str | 
     return [*(number(value) for value in values), compared, *count]
 
 
-def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, Row]]) -> str:
+def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, ComparisonRow]]) -> str:
     place = f"on {part}, " if part else ""
     if len(rows) == 1:
         comparison, row = rows[0]
@@ -209,7 +209,7 @@ def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, Row]]) -> str
     return f"{place}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
 
 
-def _verb(comparison: Comparison, row: Row) -> str:
+def _verb(comparison: Comparison, row: ComparisonRow) -> str:
     size = counted(row.n, comparison.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"
@@ -220,14 +220,14 @@ def _verb(comparison: Comparison, row: Row) -> str:
     return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(comparison, row, '95 % interval ')}"
 
 
-def _amount(comparison: Comparison, row: Row, called: str = "") -> str:
+def _amount(comparison: Comparison, row: ComparisonRow, called: str = "") -> str:
     """Return a gain with its interval and what it rests on."""
     ends = [headline.signed(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
     interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
     return f"{_gained(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
 
 
-def _gained(comparison: Comparison, row: Row) -> str:
+def _gained(comparison: Comparison, row: ComparisonRow) -> str:
     gained = headline.signed(row.gain.mean, comparison.measure.name)
     return f"{gained} points" if comparison.measure.name == "points" else f"{comparison.measure.name} {gained}"
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.comparison import engine
-from tacpipe.comparison.engine import Comparison, Row
+from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, grouped
 from tacpipe.comparison.specification import TaskReport
 from tacpipe.metrics import headline, pairing
@@ -21,8 +21,8 @@ from tacpipe.report.blocks import (
     Chart,
     Fold,
     Group,
-    Note,
     Section,
+    SmallPrint,
     Table,
     counted,
     fold,
@@ -158,7 +158,7 @@ def headline_caption(measure: Measure) -> str:
 
 def _table(context: Context, comparison: Comparison) -> Table:
     extra = context.task.columns(context, comparison)
-    families: dict[str, list[Row]] = {}
+    families: dict[str, list[ComparisonRow]] = {}
     for row in comparison.models:
         families.setdefault(row.family, []).append(row)
     groups = [
@@ -193,7 +193,9 @@ def _same(comparison: Comparison) -> bool:
     )
 
 
-def _line(comparison: Comparison, row: Row, extra: Sequence[tuple[str, Callable[[Row], Cell]]], kind: str) -> Line:
+def _line(
+    comparison: Comparison, row: ComparisonRow, extra: Sequence[tuple[str, Callable[[ComparisonRow], Cell]]], kind: str
+) -> Line:
     score = row.score
     ends = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
     cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
@@ -213,14 +215,14 @@ def recordings(context: Context) -> list[Fold]:
         parts += _by_recording(comparison, row) if row else []
     if not parts:
         return []
-    command = Note(
+    command = SmallPrint(
         "To see a recording with what was predicted: `tacpipe view DATASET RECORDING --predictions RESULT`, where DATASET "
         "was given to `tacpipe evaluate` and RESULT is its output. A click on a name copies its command."
     )
     return [Fold("Recordings", [command, *parts], "where the best method fails, and the command to look at it")]
 
 
-def _by_recording(comparison: Comparison, row: Row) -> list[blocks.Block]:
+def _by_recording(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
     measure, question = comparison.measure, comparison.question
     best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
     mine = pairing.add_by_key((name, comparison) for (_, name), comparison in row.method.sums(question).items())
@@ -262,7 +264,7 @@ def _by_recording(comparison: Comparison, row: Row) -> list[blocks.Block]:
     baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
     heads = ["recording", *measure.columns, baseline_head, measure.name]
     if not rows:
-        return [*parts, Note(f"{title}: all {len(names):,} are without error.")]
+        return [*parts, SmallPrint(f"{title}: all {len(names):,} are without error.")]
     return [*parts, blocks.table(f"{title}, {about}{right}", heads, rows)]
 
 
@@ -301,7 +303,11 @@ def basis(context: Context) -> list[Fold]:
     texts += [PICKED] if len(context.methods) > 1 else []
     texts += [SIMULATED] if context.simulated else []
     texts += ["No recording above is one that its model was trained on."] if context.runs else []
-    return [Fold("What these numbers rest on", [Note(text) for text in dict.fromkeys(texts) if text])] if texts else []
+    return (
+        [Fold("What these numbers rest on", [SmallPrint(text) for text in dict.fromkeys(texts) if text])]
+        if texts
+        else []
+    )
 
 
 def source(context: Context) -> list[Fold]:
@@ -312,7 +318,7 @@ def source(context: Context) -> list[Fold]:
     method = context.winner(first.question.part) or context.methods[0]
     run = median_run(method, first)
     params = ", ".join(f"{name} = {json.dumps(value, default=str)}" for name, value in sorted(run.settings.items()))
-    note = Note(f"A run of {method.name}{f', seed {run.seed}' if run.seed is not None else ''}, with {params}.")
+    note = SmallPrint(f"A run of {method.name}{f', seed {run.seed}' if run.seed is not None else ''}, with {params}.")
     return [Fold("Where it comes from", [note, *provenance_blocks(run.dataset.manifest)])]
 
 

@@ -22,10 +22,10 @@ from tacpipe.sensors.framing import (
     UNCONFIRMED,
     Account,
     Chunks,
+    FrameRun,
     Framing,
-    Loss,
+    FramingLoss,
     Pending,
-    Run,
 )
 
 AMBIGUOUS = 64  # frames that are kept while marks repeat in more than one place
@@ -50,13 +50,13 @@ class ByteFramer:
         self._follows_tail = False  # True where the buffered bytes begin right after a tail that was cut off
         self._ruined: set[int] = set()  # places, from the first byte, where no chain begins
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Take what a link gave; return the frames that are complete now, and what was lost."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
         return self._scan(ended=False)
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left when nothing more comes: frames with a sum are good, others lack what confirms them."""
         runs, losses = self._scan(ended=True)
         remaining = len(self._text.data)
@@ -66,9 +66,9 @@ class ByteFramer:
             self._text.cut(remaining)
         return runs, losses
 
-    def _scan(self, *, ended: bool) -> tuple[list[Run], list[Loss]]:
-        runs: list[Run] = []
-        losses: list[Loss] = []
+    def _scan(self, *, ended: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
+        runs: list[FrameRun] = []
+        losses: list[FramingLoss] = []
         place, size = 0, len(self._text.data)
         while place < size:
             if not self._locked:
@@ -92,7 +92,7 @@ class ByteFramer:
         self._text.cut(place)
         return runs, losses
 
-    def _give(self, spans: Sequence[Span], unconfirmed: int, runs: list[Run], place: int) -> int:
+    def _give(self, spans: Sequence[Span], unconfirmed: int, runs: list[FrameRun], place: int) -> int:
         """Append the runs of a chain but for its last ``unconfirmed`` frames; return where those begin."""
         give = -unconfirmed
         for _, _, count in spans:
@@ -104,7 +104,7 @@ class ByteFramer:
             give -= count
             place = start + count * size
             runs.append(
-                Run(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, place, size)))
+                FrameRun(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, place, size)))
             )
             self.account.framed += count * size
             self._usual = size
@@ -258,7 +258,7 @@ class ByteFramer:
             if start >= place and start != barred and text.endswith(mark[:length]):
                 yield start
 
-    def _skip(self, place: int, start: int, losses: list[Loss]) -> int:
+    def _skip(self, place: int, start: int, losses: list[FramingLoss]) -> int:
         if start > place:
             losses.append(self._lose(place, start, self._cause(place, start)))
         return start
@@ -279,11 +279,11 @@ class ByteFramer:
             return CUT if begins or not marker or place < broken else NOISE
         return GARBLED
 
-    def _lose(self, start: int, stop: int, cause: str) -> Loss:
+    def _lose(self, start: int, stop: int, cause: str) -> FramingLoss:
         self.account.lost += stop - start
         usual = self._usual or stop - start
         frames = 0 if cause in (START, NOISE) else max(1, round((stop - start) / usual))
-        return Loss(self._text.arrival(stop - 1), cause, frames, stop - start)
+        return FramingLoss(self._text.arrival(stop - 1), cause, frames, stop - start)
 
 
 def _leading(good: Bools) -> int:

@@ -141,7 +141,7 @@ class Contactile(Sensor):
             self._values(np.zeros((0, LARGEST), dtype=np.uint8), layout), seq=none, t_device_ns=none, rows=none
         )
 
-    def _values(self, frames: Bytes, layout: pts.Layout) -> tuple[AnyArray, ...]:
+    def _values(self, frames: Bytes, layout: pts.PtsLayout) -> tuple[AnyArray, ...]:
         forces = np.hstack(
             [_floats(_gathered(frames, layout.places(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
         )
@@ -187,10 +187,10 @@ class Contactile(Sensor):
 
     def device(self) -> Device:
         """Return a controller that streams from power-on at the rate that it was last stated."""
-        return _Controller()
+        return _ContactileController()
 
 
-class _Controller(Device):
+class _ContactileController(Device):
     """The controller's side: lines of text, none answered."""
 
     def hear(self, data: bytes) -> list[bytes]:

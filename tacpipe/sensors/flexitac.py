@@ -17,7 +17,7 @@ from tacpipe.arrays import Bytes
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Line, Samples, Sensor
+from tacpipe.sensors.sensor import Samples, Sensor, SerialLine
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,7 +33,9 @@ class FlexiTac(Sensor):
     summary: ClassVar[str] = (
         "FlexiTac: a grid of piezoresistive taxels behind an Arduino, of any number of rows and columns."
     )
-    line: ClassVar[Line] = Line(settle_s=2.0)  # opening the port resets an Arduino, which takes so long to boot
+    line: ClassVar[SerialLine] = SerialLine(
+        settle_s=2.0
+    )  # opening the port resets an Arduino, which takes so long to boot
 
     rows: int = 12  # rows of the grid, as in the firmware
     columns: int = 32  # columns of the grid, as in the firmware

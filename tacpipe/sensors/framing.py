@@ -59,7 +59,7 @@ class Chunks:
 
 
 @dataclass(frozen=True)
-class Run:
+class FrameRun:
     """Frames of one size in the order of their arrival: bytes (frame, byte), or a list of text frames."""
 
     frames: Any
@@ -67,7 +67,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Loss:
+class FramingLoss:
     """Bytes that are not a frame, what became of them, and how many frames are lost for it as far as the bytes state."""
 
     t_ns: int
@@ -95,10 +95,10 @@ class Framer(Protocol):
 
     account: Account
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Take what a link gave; return the frames that are complete now, and what was lost."""
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left when nothing more comes, which ends the framer's work."""
 
 
@@ -180,7 +180,7 @@ class PacketFramer:
         self.sizes, self.check = frozenset(sizes), check
         self.account = Account()
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the packets that are frames, those of one size together, and the others as losses."""
         self.account.received += len(chunks.data)
         runs, losses = [], []
@@ -195,12 +195,12 @@ class PacketFramer:
             if good[0] and self.check is not None:
                 good &= self.check(frames)
             if good.any():
-                runs.append(Run(frames if good.all() else frames[good], chunks.t_ns[rows[good]]))
-            losses += [Loss(int(t_ns), MALFORMED, 1, size) for t_ns in chunks.t_ns[rows[~good]]]
+                runs.append(FrameRun(frames if good.all() else frames[good], chunks.t_ns[rows[good]]))
+            losses += [FramingLoss(int(t_ns), MALFORMED, 1, size) for t_ns in chunks.t_ns[rows[~good]]]
             self.account.framed += int(good.sum()) * size
             self.account.lost += int((~good).sum()) * size
         return runs, losses
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return nothing: a packet is whole or it is none."""
         return [], []

@@ -38,7 +38,7 @@ AT_HAND = 4  # requests that are kept between the framer's look at them and thei
 
 
 @dataclass(frozen=True)
-class Grasps(Sensor):
+class GraspRequests(Sensor):
     """Requests of a planner of grasps; a sample is one candidate, those of one request have the same arrival."""
 
     summary: ClassVar[str] = "Candidate grasps on a cloud, to be ranked by `tacpipe live`."

@@ -22,7 +22,7 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Int64s, Times
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Framer, Loss, Run
+from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -55,14 +55,14 @@ class ScanFramer:
         self._has_scans = False
         self._place = self.size  # place of the last CAN frame that is assigned
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the scans that are whole now, and what is left of torn ones as losses."""
         self.account.received += len(chunks.data)
         frames, t_ns, losses = self._can_frames(chunks)
         data, stamps = np.vstack([self._data, frames]), np.concatenate([self._t_ns, t_ns])
         places = self._places(data)
         bad = places < 0
-        losses += [Loss(int(at_ns), MALFORMED, 0, CAN) for at_ns in stamps[bad]]
+        losses += [FramingLoss(int(at_ns), MALFORMED, 0, CAN) for at_ns in stamps[bad]]
         starts, torn_at = self._scans(places, stamps)
         rows_of_scans = (starts[:, None] + np.arange(self.size)).ravel()
         keep = len(data) if torn_at is None else torn_at
@@ -76,14 +76,14 @@ class ScanFramer:
         if not len(starts):
             return [], losses
         self._has_scans = True
-        return [Run(data[rows_of_scans].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
+        return [FrameRun(data[rows_of_scans].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
 
-    def _can_frames(self, chunks: Chunks) -> tuple[Bytes, Times, list[Loss]]:
+    def _can_frames(self, chunks: Chunks) -> tuple[Bytes, Times, list[FramingLoss]]:
         """Return the CAN frames of this board (frame, 13), their arrival, and packets that are not a CAN frames as
         losses."""
         right = (chunks.size > 0) & (chunks.size % CAN == 0)  # some adapters give several at once
         losses = [
-            Loss(int(at_ns), MALFORMED, 0, int(size))
+            FramingLoss(int(at_ns), MALFORMED, 0, int(size))
             for at_ns, size in zip(chunks.t_ns[~right], chunks.size[~right], strict=True)
         ]
         data = np.frombuffer(chunks.data, np.uint8)
@@ -113,7 +113,7 @@ class ScanFramer:
         open_at = int(starts[-1]) if starts[-1] + length[-1] == len(places) and length[-1] < self.size else None
         return starts[length >= self.size], open_at
 
-    def _torn(self, unassigned: Bools, places: Int64s, t_ns: Times, first: int) -> list[Loss]:
+    def _torn(self, unassigned: Bools, places: Int64s, t_ns: Times, first: int) -> list[FramingLoss]:
         """Return a loss for each stretch of CAN frames that belong to no whole scan, and count the scans they are of.
 
         Those before ``first`` are what was left of a scan when recording began.
@@ -125,14 +125,14 @@ class ScanFramer:
             self._place = int(places[is_placed][-1])
         rows = np.flatnonzero(unassigned)
         return [
-            Loss(int(t_ns[group[-1]]), START, 0, len(group) * CAN)
+            FramingLoss(int(t_ns[group[-1]]), START, 0, len(group) * CAN)
             if group[0] < first
-            else Loss(int(t_ns[group[-1]]), TORN, int(new[group].sum()), len(group) * CAN)
+            else FramingLoss(int(t_ns[group[-1]]), TORN, int(new[group].sum()), len(group) * CAN)
             for group in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
             if len(group)
         ]
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left of a scan that is not whole."""
         unassigned, first = np.ones(len(self._data), dtype=bool), 0 if self._has_scans else len(self._data)
         losses = self._torn(unassigned, self._places(self._data), self._t_ns, first)

@@ -20,7 +20,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Line, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor, SerialLine
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,7 +38,7 @@ class JustFloat(Sensor):
     """A board that sends JustFloat."""
 
     summary: ClassVar[str] = "Boards that send JustFloat, the format of VOFA+, among them fulai tactile skins."
-    line: ClassVar[Line] = Line(dtr=True, rts=False)
+    line: ClassVar[SerialLine] = SerialLine(dtr=True, rts=False)
 
     model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = "any"  # a fulai's hardware version, or any board
     channels: int = 0  # floats in a frame, of any board; 0: as many as names

@@ -20,7 +20,7 @@ MOST_CELLS = 4096
 
 
 @dataclass(frozen=True)
-class Column:
+class LineColumn:
     """One column of the lines, or several of a kind."""
 
     name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are several, the last braces count fastest
@@ -32,7 +32,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class LineSequence:
     """The column that counts the lines."""
 
     column: str  # the name of the column that holds it
@@ -41,7 +41,7 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class Clock:
+class LineClock:
     """The device's time of a line."""
 
     column: str  # the name of the column that holds it
@@ -50,7 +50,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Sum:
+class LineSum:
     """The check sum that ends a line."""
 
     kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # how it is computed
@@ -66,7 +66,7 @@ class Sum:
 
 
 @dataclass(frozen=True)
-class Cell:
+class LineCell:
     """One cell of a line."""
 
     name: str
@@ -90,7 +90,7 @@ def dtype(kind: str) -> np.dtype[Any]:
     return np.dtype(f"{kind[0]}{int(kind[1:]) // 8}")
 
 
-def cells(columns: tuple[Column, ...]) -> tuple[Cell, ...]:
+def cells(columns: tuple[LineColumn, ...]) -> tuple[LineCell, ...]:
     """Return the cells of a line in their order.
 
     Raises `UsageError` for a name that cannot be a channel's or is there twice, and for braces that name nothing.
@@ -98,7 +98,7 @@ def cells(columns: tuple[Column, ...]) -> tuple[Cell, ...]:
     >>> [cell.name for cell in cells((Column("t", "u32"), Column("taxel{1..2}_{x,y}", "u16")))]
     ['t', 'taxel01_x', 'taxel01_y', 'taxel02_x', 'taxel02_y']
     """
-    by_name: dict[str, Cell] = {}
+    by_name: dict[str, LineCell] = {}
     for column in columns:
         for cell in _expanded(column):
             if not NAME.fullmatch(cell.name):
@@ -112,7 +112,7 @@ def cells(columns: tuple[Column, ...]) -> tuple[Cell, ...]:
     return tuple(by_name.values())
 
 
-def _expanded(column: Column) -> Iterator[Cell]:
+def _expanded(column: LineColumn) -> Iterator[LineCell]:
     """Yield the cells of a column, the last braces counting fastest."""
     braces = _braces(column.name)
     if _braces(column.label) not in ([], braces):
@@ -122,7 +122,7 @@ def _expanded(column: Column) -> Iterator[Cell]:
         name = _filled(column.name, [value.zfill(brace.width) for brace, value in pairs])
         label = _filled(column.label, list(values))
         metadata = {"unit": column.unit, "quantity": column.quantity, **_places(column.quantity, pairs)}
-        yield Cell(name, column.type, label, column.skip, metadata)
+        yield LineCell(name, column.type, label, column.skip, metadata)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Int64s
 from tacpipe.sensors import layout, number_texts
-from tacpipe.sensors.line_layout import Cell, Sum, dtype
+from tacpipe.sensors.line_layout import LineCell, LineSum, dtype
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -29,11 +29,11 @@ LETTER = re.compile(rb"[A-Za-z]")
 
 
 @dataclass(frozen=True)
-class Table:
+class LineNumbers:
     """The numbers of lines: those of each type side by side (line, cell), in the order of the cells."""
 
     numbers: Mapping[str, AnyArray]
-    cells: tuple[Cell, ...]
+    cells: tuple[LineCell, ...]
 
     def block(self, places: Sequence[int]) -> AnyArray:
         """Return the numbers (line, cell) of some cells of one type."""
@@ -49,14 +49,14 @@ class Table:
 class Parser:
     """How lines read; the texts are those of the rig file in bytes."""
 
-    cells: tuple[Cell, ...]
+    cells: tuple[LineCell, ...]
     separator: bytes = b""  # one byte; empty: spaces
     decimal: bytes = b"."
     missing: tuple[bytes, ...] = ()
     prefix: bytes = b""
     suffix: bytes = b""
     comments: tuple[bytes, ...] = ()
-    sum: Sum | None = None
+    sum: LineSum | None = None
 
     def is_chatter(self, line: bytes) -> bool:
         """Return whether a line is empty or a comment: it holds no sample, and none is lost with it.
@@ -65,7 +65,7 @@ class Parser:
         """
         return not line or bool(self.comments and line.startswith(self.comments) and LETTER.search(line))
 
-    def table(self, lines: Sequence[bytes]) -> Table | None:
+    def table(self, lines: Sequence[bytes]) -> LineNumbers | None:
         """Return the numbers of lines; None where a line is not well-formed."""
         bodies = self._bodies(lines)
         if bodies is None:
@@ -77,7 +77,7 @@ class Parser:
             return None
         numbers = {kind: _fitted(values, kind) for kind, values in numbers_at_once.items()}
         complete = {kind: values for kind, values in numbers.items() if values is not None}
-        return Table(complete, self.cells) if len(complete) == len(numbers) else None
+        return LineNumbers(complete, self.cells) if len(complete) == len(numbers) else None
 
     @cached_property
     def _requested(self) -> list[int]:
@@ -233,7 +233,7 @@ def _fitted(numbers: AnyArray, kind: str) -> AnyArray | None:
     return None if beyond else numbers.astype(target)
 
 
-def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
+def _without_sum(lines: Sequence[bytes], total: LineSum) -> list[bytes] | None:
     """Return the lines up to the mark of their sum; None where one has none or a wrong one."""
     mark, begin = total.mark.encode(), total.begin.encode()
     digits = re.compile(
@@ -251,7 +251,7 @@ def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
     return bodies if (sums(summed, total) == np.array(declared)).all() else None
 
 
-def sums(texts: Sequence[bytes], total: Sum) -> AnyArray:
+def sums(texts: Sequence[bytes], total: LineSum) -> AnyArray:
     """Return the sum of each text (text,), those of one length at once."""
     totals = np.zeros(len(texts), dtype=np.int64)
     rows = sorted(range(len(texts)), key=lambda row: len(texts[row]))

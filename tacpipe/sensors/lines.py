@@ -30,9 +30,9 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, line_layout, sensor
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
-from tacpipe.sensors.line_layout import Cell, Clock, Column, Sum
-from tacpipe.sensors.line_layout import Sequence as Counter
-from tacpipe.sensors.line_parser import Parser, Table, sums
+from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineSum
+from tacpipe.sensors.line_layout import LineSequence as Counter
+from tacpipe.sensors.line_parser import LineNumbers, Parser, sums
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, Samples
 from tacpipe.sensors.text_framer import LineFramer, TextFramer
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST = 1 << 16  # bytes of a line
-Read = tuple[Int64s | None, Table]  # lines with a sample (None: all), and their numbers
+Read = tuple[Int64s | None, LineNumbers]  # lines with a sample (None: all), and their numbers
 KEPT = 4  # batches of lines that are read once for the framer and the decoder
 
 
@@ -60,16 +60,16 @@ class Lines(DescribedSensor):
     }
 
     rate_hz: float  # lines a second
-    columns: tuple[Column, ...]  # columns of a line, in their order
+    columns: tuple[LineColumn, ...]  # columns of a line, in their order
     separator: str = ","  # character between columns, which may have spaces around it; a space: spaces or tabs
     decimal: Literal[".", ","] = "."  # mark of a float's decimals
     missing: tuple[str, ...] = ()  # text of a value that is missing: "nan", "" for nothing; it becomes NaN
     prefix: str = ""  # text that each line begins with: "$SKIN,"
     suffix: str = ""  # text that each line ends with, before the sum: "," where one follows the last number too
     comments: tuple[str, ...] = ()  # start of lines without a sample: "#"
-    sum: Sum | None = None  # the check sum at the end
+    sum: LineSum | None = None  # the check sum at the end
     sequence: Counter | None = None  # the column that counts the lines
-    clock: Clock | None = None  # the column that is the device's time
+    clock: LineClock | None = None  # the column that is the device's time
     packets: bool = False  # each packet of the link is a line (udp), and needs no end
     start: str = ""  # text that has the board send: "s\n"; none: it sends by itself
     stop: str = ""  # text that ends that
@@ -129,11 +129,11 @@ class Lines(DescribedSensor):
             object.__setattr__(self, "device_wrap_ns", wrap_ns or None)
 
     @functools.cached_property
-    def _cells(self) -> tuple[Cell, ...]:
+    def _cells(self) -> tuple[LineCell, ...]:
         return line_layout.cells(self.columns)
 
     @functools.cached_property
-    def _places(self) -> dict[str, tuple[int, Cell]]:
+    def _places(self) -> dict[str, tuple[int, LineCell]]:
         return {cell.name: (place, cell) for place, cell in enumerate(self._cells)}
 
     @functools.cached_property
@@ -221,7 +221,7 @@ class Lines(DescribedSensor):
         lines = [f"{self.prefix}{between.join(row)}{self.suffix}".encode() for row in zip(*texts, strict=True)]
         return lines if self.sum is None else _summed(lines, self.sum)
 
-    def _ticks(self, cell: Cell, t_device_ns: AnyArray) -> AnyArray:
+    def _ticks(self, cell: LineCell, t_device_ns: AnyArray) -> AnyArray:
         assert self.clock is not None
         unit_ns = layout.UNITS_NS[self.clock.unit]
         if cell.kind.kind == "f":
@@ -229,7 +229,7 @@ class Lines(DescribedSensor):
         ticks = (t_device_ns + unit_ns // 2) // unit_ns
         return np.asarray(ticks % (self.device_wrap_ns // unit_ns) if self.device_wrap_ns else ticks)
 
-    def _format_column(self, cell: Cell, column: AnyArray) -> list[str]:
+    def _format_column(self, cell: LineCell, column: AnyArray) -> list[str]:
         words = [str(value) for value in (column.astype(cell.kind) if cell.kind.kind == "f" else column)]
         if cell.kind.kind == "f":
             words = [word.replace(".", self.decimal) for word in words]
@@ -263,7 +263,7 @@ def _read(parser: Parser, lines: tuple[bytes, ...]) -> Read | None:
     return None if table is None else (np.array(rows, dtype=np.int64), table)
 
 
-def _summed(lines: Sequence[bytes], total: Sum) -> list[bytes]:
+def _summed(lines: Sequence[bytes], total: LineSum) -> list[bytes]:
     mark, begin = total.mark.encode(), total.begin.encode()
     end = mark if total.mark_summed else b""
     totals = sums([line[len(begin) :] + end for line in lines], total).tolist()
@@ -271,7 +271,7 @@ def _summed(lines: Sequence[bytes], total: Sum) -> list[bytes]:
     return [line + mark + (digits % value).encode() for line, value in zip(lines, totals, strict=True)]
 
 
-def _range(cell: Cell) -> int:
+def _range(cell: LineCell) -> int:
     """Return how many values a column of whole numbers can have."""
     return 1 << 8 * cell.kind.itemsize if cell.kind.kind in "ui" else 1 << 62
 

@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats, Int64s, Times
 from tacpipe.sensors import layout
 from tacpipe.sensors.framing import Chunks, Pending
-from tacpipe.sensors.line_layout import Sum
+from tacpipe.sensors.line_layout import LineSum
 from tacpipe.sensors.line_parser import sums
 
 FEWEST = 5  # lines that a guess takes
@@ -132,7 +132,7 @@ def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Opt
             continue
         for begin in begins:
             for through in (False, True):
-                total = Sum(kind=kind, mark=mark, begin=begin, mark_summed=through)  # type: ignore[arg-type]
+                total = LineSum(kind=kind, mark=mark, begin=begin, mark_summed=through)  # type: ignore[arg-type]
                 end = mark if through else ""
                 texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in parted]
                 if (sums(texts, total) == declared).mean() >= STEADY:

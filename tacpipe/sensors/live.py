@@ -60,7 +60,7 @@ class MessageSizes(Protocol):
         """Names of the alarms."""
 
 
-class Column(NamedTuple):
+class LiveColumn(NamedTuple):
     """One number of a recorded stream."""
 
     name: str
@@ -81,13 +81,13 @@ class Value:
     type: str = "<f4"  # type of each column, as numpy names it
     unit: str = ""
     quantity: str = ""  # metadata of the recorded columns
-    columns: Callable[[MessageSizes], list[Column]] | None = None  # None: one column with the value's name
+    columns: Callable[[MessageSizes], list[LiveColumn]] | None = None  # None: one column with the value's name
     schema: Callable[[MessageSizes], dict[str, Any]] | None = None  # its JSON schema; None: that of its type
     attribute: str = ""  # attribute of the message that holds it; empty: its name
 
-    def columns_for(self, sizes: MessageSizes) -> list[Column]:
+    def columns_for(self, sizes: MessageSizes) -> list[LiveColumn]:
         """Return its columns in a message of these sizes."""
-        return [Column(self.name, self.unit or "1")] if self.columns is None else self.columns(sizes)
+        return [LiveColumn(self.name, self.unit or "1")] if self.columns is None else self.columns(sizes)
 
     def read(self, message: object) -> Any:
         """Return the value that a message holds."""
@@ -142,7 +142,7 @@ class Declaration:
         """Return the values of a stream, in the order of its columns."""
         return [value for value in self.values if stream in value.streams]
 
-    def columns(self, stream: str, sizes: MessageSizes) -> list[tuple[Value, Column]]:
+    def columns(self, stream: str, sizes: MessageSizes) -> list[tuple[Value, LiveColumn]]:
         """Return the columns of a stream in messages of these sizes, each with its value."""
         return [(value, column) for value in self.recorded(stream) for column in value.columns_for(sizes)]
 
@@ -198,7 +198,7 @@ class Live(Sensor):
         return declaration
 
     @functools.cached_property
-    def _columns(self) -> list[tuple[Value, Column]]:
+    def _columns(self) -> list[tuple[Value, LiveColumn]]:
         return self._declaration.columns(self.output, self)
 
     @functools.cached_property

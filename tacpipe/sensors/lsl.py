@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
-from tacpipe.channels.lsl import Channel
+from tacpipe.channels.lsl import LslChannel
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -44,7 +44,7 @@ class Lsl(Sensor):
         "channels": "as the outlet states; leave out to take what it states when a recording begins",
     }
 
-    channels: tuple[Channel, ...] = ()  # channels of the stream, in their order; none: as the outlet states
+    channels: tuple[LslChannel, ...] = ()  # channels of the stream, in their order; none: as the outlet states
     format: Format = "float32"  # type of values, as LSL names it; comes from the outlet with the channels
     rate_hz: float = 0.0  # samples a second; 0: they come when they come
 
@@ -159,13 +159,13 @@ def options(data: Chunks) -> list[dict[str, Any]]:
     return []
 
 
-def _entry(channel: Channel, *, text: bool) -> dict[str, str]:
+def _entry(channel: LslChannel, *, text: bool) -> dict[str, str]:
     """Return a channel as a rig file has it; what is the same for every text is left out."""
     name = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
     return {"name": name, **({} if text else channel.metadata)}
 
 
-def _described(data: bytes) -> lsl.Description | None:
+def _described(data: bytes) -> lsl.LslDescription | None:
     try:
         return lsl.parse(data[1:])
     except TacpipeError:

@@ -80,7 +80,7 @@ def sums(frame: bytes) -> bool:
 
 
 @dataclass
-class Board(Device):
+class RegisterBoard(Device):
     """The board's side: registers that can be read and written, and the stream that one of them switches."""
 
     memory: dict[int, bytes] = field(default_factory=dict)
@@ -266,7 +266,7 @@ class Paxini(Sensor):
         counts = b"".join(two(self.points.get(slot, 0)) for slot in SLOTS)
         bits = sum(1 << SLOTS.index(module) for module in self.modules)
         memory = {VERSION: b"PX-HS V1.0.0".ljust(15, b"\x00"), ACTIVE: bits.to_bytes(4, "little"), POINTS: counts}
-        return Board(streaming=False, memory={**memory, DATA_TYPE: b"\x03"})
+        return RegisterBoard(streaming=False, memory={**memory, DATA_TYPE: b"\x03"})
 
     @functools.cached_property
     def _payload(self) -> int:

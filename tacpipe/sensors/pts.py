@@ -27,7 +27,7 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Int64s
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import Account, Chunks, Framer, Loss, Run
+from tacpipe.sensors.framing import Account, Chunks, Framer, FrameRun, FramingLoss
 
 MARKER, TAIL = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
 HUB, PILLARS, SENSORS, PILLAR_SLIP, SENSOR_SLIP = 1, 3, 4, 5, 6
@@ -43,7 +43,7 @@ class _NoLayoutError(ValueError):
 
 
 @dataclass(frozen=True)
-class Layout:
+class PtsLayout:
     """The places of the values in a frame, counted from its first byte, and the bytes that state them."""
 
     entries: dict[int, tuple[tuple[int, ...], ...]]  # block to the places of values: by sensor, and by pillar in it
@@ -70,7 +70,7 @@ class Layout:
         return same
 
 
-def layouts(frames: Bytes) -> Iterator[tuple[Int64s, Layout | None]]:
+def layouts(frames: Bytes) -> Iterator[tuple[Int64s, PtsLayout | None]]:
     """Yield for each layout among ``frames`` (frame, byte) the rows that have it; None for rows whose tables are wrong.
 
     Tables are read once for each layout: frames are compared with those that are known of their size.
@@ -102,7 +102,7 @@ def layouts(frames: Bytes) -> Iterator[tuple[Int64s, Layout | None]]:
 
 
 @functools.cache
-def _known(size: int) -> list[Layout]:
+def _known(size: int) -> list[PtsLayout]:
     """Return the layouts that were seen in frames of a size, the newest first."""
     return []
 
@@ -122,7 +122,7 @@ def are_whole(frames: Bytes) -> Bools:
     return is_valid
 
 
-def parse(frame: bytes) -> Layout:
+def parse(frame: bytes) -> PtsLayout:
     """Return the layout of a frame, markers included.
 
     Raises `ValueError` for tables that do not hold: an offset out of its block, an entry of another kind or size, blocks
@@ -155,7 +155,7 @@ def parse(frame: bytes) -> Layout:
                 fixed[place : place + SIZES[block]] = False
     fixed[-len(TAIL) - 2 : -len(TAIL)] = False  # the sum
     places = np.flatnonzero(fixed)
-    return Layout(moved, places, np.frombuffer(frame, np.uint8)[places])
+    return PtsLayout(moved, places, np.frombuffer(frame, np.uint8)[places])
 
 
 @dataclass(frozen=True)
@@ -251,22 +251,24 @@ class FreshFramer:
 
     def __init__(self, framer: Framer, counters: Counters, modulus: int, most: int) -> None:
         self._framer, self._counters, self._modulus, self._most = framer, counters, modulus, most
-        self._held: list[Run] | None = []
+        self._held: list[FrameRun] | None = []
         self.account: Account = framer.account  # delayed frames are pending
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the frames that are known to be of this session, and what was lost."""
         runs, losses = self._framer.feed(chunks)
         if self._held is None or not (runs or self._held):
             return runs, losses
         return self._decide(runs, losses, ended=False)
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left, and what is held back."""
         runs, losses = self._framer.flush()
         return (runs, losses) if self._held is None else self._decide(runs, losses, ended=True)
 
-    def _decide(self, runs: list[Run], losses: list[Loss], *, ended: bool) -> tuple[list[Run], list[Loss]]:
+    def _decide(
+        self, runs: list[FrameRun], losses: list[FramingLoss], *, ended: bool
+    ) -> tuple[list[FrameRun], list[FramingLoss]]:
         assert self._held is not None
         self.account.framed -= sum(run.frames.size for run in runs)
         self._held += runs
@@ -278,10 +280,10 @@ class FreshFramer:
             self.account.framed += run.frames.size
         for run in stale:
             self.account.lost += run.frames.size
-            losses.append(Loss(int(run.t_ns[-1]), STALE, 0, run.frames.size))
+            losses.append(FramingLoss(int(run.t_ns[-1]), STALE, 0, run.frames.size))
         return fresh, losses
 
-    def _parted(self, runs: list[Run]) -> tuple[list[Run], list[Run]]:
+    def _parted(self, runs: list[FrameRun]) -> tuple[list[FrameRun], list[FrameRun]]:
         """Return the runs before the last jump and those from it on."""
         if not runs:
             return [], []
@@ -296,7 +298,7 @@ class FreshFramer:
             count = min(dropped, len(run.t_ns))
             dropped -= count
             if count:
-                stale.append(Run(run.frames[:count], run.t_ns[:count]))
+                stale.append(FrameRun(run.frames[:count], run.t_ns[:count]))
             if count < len(run.t_ns):
-                fresh.append(Run(run.frames[count:], run.t_ns[count:]))
+                fresh.append(FrameRun(run.frames[count:], run.t_ns[count:]))
         return stale, fresh

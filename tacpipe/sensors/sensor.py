@@ -60,7 +60,7 @@ Dialogue = Generator[Ask, bytes, None]  # yields what is asked, is sent the repl
 
 
 @dataclass(frozen=True)
-class Line:
+class SerialLine:
     """How a serial port is set for a sensor; None leaves a control line as it is."""
 
     dtr: bool | None = None
@@ -91,7 +91,7 @@ class Sensor:
     summary: ClassVar[str] = ""  # one sentence: what it is
     product: ClassVar[str] = ""  # name in the attribute ``sensor`` of recordings; empty: the registered name
     links: ClassVar[tuple[str, ...]] = ("serial",)  # schemes of addresses it can be reached by
-    line: ClassVar[Line] = Line()
+    line: ClassVar[SerialLine] = SerialLine()
     counter: ClassVar[int | None] = None  # modulus of ``seq``; None: the device does not count
     device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
     step: ClassVar[int] = 1  # increment of ``seq`` between two samples

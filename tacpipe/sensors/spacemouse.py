@@ -20,7 +20,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.channels.schema import AXES
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import MALFORMED, Account, Chunks, Framer, Loss, Run
+from tacpipe.sensors.framing import MALFORMED, Account, Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -106,22 +106,22 @@ class StateFramer:
         self.account = Account()
         self._state = np.zeros(FRAME, dtype=np.uint8)
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return a frame a report, and packets that are none as losses."""
         self.account.received += len(chunks.data)
         packets = chunks.packets()
         good = np.array([len(packet) in SIZES.get(packet[0] if packet else 0, ()) for packet in packets], dtype=bool)
         reports = [packet for packet, fine in zip(packets, good, strict=True) if fine]
-        losses = [Loss(int(chunks.t_ns[row]), MALFORMED, 1, len(packets[row])) for row in np.flatnonzero(~good)]
+        losses = [FramingLoss(int(chunks.t_ns[row]), MALFORMED, 1, len(packets[row])) for row in np.flatnonzero(~good)]
         self.account.framed += sum(len(report) for report in reports)
         self.account.lost += sum(loss.bytes for loss in losses)
         if not reports:
             return [], losses
         frames = merged(reports, self._state)
         self._state = frames[-1].copy()
-        return [Run(frames, chunks.t_ns[good])], losses
+        return [FrameRun(frames, chunks.t_ns[good])], losses
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return nothing: a report is whole or it is none."""
         return [], []
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tacpipe.arrays import Bools
-from tacpipe.sensors.framing import CUT, GARBLED, MALFORMED, START, Account, Chunks, Loss, Pending, Run
+from tacpipe.sensors.framing import CUT, GARBLED, MALFORMED, START, Account, Chunks, FrameRun, FramingLoss, Pending
 
 FEW = 8  # texts that are looked at one by one
 Check = Callable[[bytes], bool]
@@ -25,7 +25,7 @@ class TextFramer:
         self.check, self.every = check, every
         self.account = Account()
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the packets that are frames, as a list of bytes, and the others as losses."""
         packets = chunks.packets()
         good = _good(packets, self.check, self.every)
@@ -34,13 +34,13 @@ class TextFramer:
         self.account.framed += len(chunks.data) - lost
         self.account.lost += lost
         losses = [
-            Loss(t_ns, MALFORMED, 1, size)
+            FramingLoss(t_ns, MALFORMED, 1, size)
             for t_ns, size in zip(chunks.t_ns[~good].tolist(), chunks.size[~good].tolist(), strict=True)
         ]
         accepted = _select(packets, good)
-        return ([Run(accepted, chunks.t_ns[good])] if accepted else []), losses
+        return ([FrameRun(accepted, chunks.t_ns[good])] if accepted else []), losses
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return nothing: a packet is whole or it is none."""
         return [], []
 
@@ -54,7 +54,7 @@ class LineFramer:
         self._text = Pending()
         self._has_lines = False
 
-    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+    def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the lines that are complete now, and those that are not frames as losses."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
@@ -67,31 +67,31 @@ class LineFramer:
         arrival = self._text.arrivals(sizes.cumsum() - 1)
         losses = []
         if not self._has_lines:  # the first line of all began before the recording did
-            losses = [Loss(int(arrival[0]), START, 0, int(sizes[0]))]
+            losses = [FramingLoss(int(arrival[0]), START, 0, int(sizes[0]))]
             lines, sizes, arrival = lines[1:], sizes[1:], arrival[1:]
         lines = [line.strip() for line in lines]
         good = _good(lines, self.check, self.every)
         bad = np.flatnonzero(~good).tolist()
-        losses += [Loss(int(arrival[row]), GARBLED, 1, int(sizes[row])) for row in bad]
+        losses += [FramingLoss(int(arrival[row]), GARBLED, 1, int(sizes[row])) for row in bad]
         self._has_lines = True
         accepted = _select(lines, good)
         lost = sum(loss.bytes for loss in losses)
         self.account.framed += stop - lost
         self.account.lost += lost
         self._text.cut(stop)
-        return ([Run(accepted, arrival[good])] if accepted else []), losses
+        return ([FrameRun(accepted, arrival[good])] if accepted else []), losses
 
-    def flush(self) -> tuple[list[Run], list[Loss]]:
+    def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left of a line that has no end."""
         return [], self._drop(len(self._text.data))
 
-    def _drop(self, count: int) -> list[Loss]:
+    def _drop(self, count: int) -> list[FramingLoss]:
         if not count:
             return []
         last_ns = self._text.arrival(count - 1)
         self.account.lost += count
         self._text.cut(count)
-        return [Loss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
+        return [FramingLoss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
 
 
 def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> Bools:

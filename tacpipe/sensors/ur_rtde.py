@@ -241,10 +241,10 @@ class UrRtde(Sensor):
 
     def device(self) -> Device:
         """Return a controller that waits for a recipe, and serves this sensor's alone."""
-        return _Controller(self)
+        return _RtdeController(self)
 
 
-class _Controller(Device):
+class _RtdeController(Device):
     """The controller's side. It finds no outputs but those that its frames hold, in their order."""
 
     def __init__(self, sensor: UrRtde) -> None:

@@ -223,7 +223,7 @@ NOISES = 3.0  # standard deviations of a finger's pressure at rest, beyond which
 
 
 @dataclass(frozen=True)
-class Limits:
+class ContactLimits:
     """Limits of pressing and of rest."""
 
     rest_s: float  # seconds at the start, whose median is each finger's level without load
@@ -232,7 +232,7 @@ class Limits:
     settled_count: float  # device counts by which the pressure may vary in so many seconds, and still rests
 
 
-def contact_row(pressure: Floats, t_ns: Times, limits: Limits) -> int:
+def contact_row(pressure: Floats, t_ns: Times, limits: ContactLimits) -> int:
     """Return the first row in which all fingers touch; ``pressure`` is (time, finger).
 
     They do where all then press for ``settle_s`` or longer. Each has touched since its pressure left rest for the last
@@ -258,7 +258,7 @@ def contact_row(pressure: Floats, t_ns: Times, limits: Limits) -> int:
     return max(since)
 
 
-def settled_rows(pressure: Floats, t_ns: Times, contact: int, limits: Limits) -> slice:
+def settled_rows(pressure: Floats, t_ns: Times, contact: int, limits: ContactLimits) -> slice:
     """Return the first ``settle_s`` of rows, from the row ``contact`` on, in which the pressure of each finger rests.
 
     ``pressure`` is (time, finger). Raises `TacpipeError` where it never does.

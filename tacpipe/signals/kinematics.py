@@ -21,7 +21,7 @@ TURN_SPREAD = 0.01  # the same of the entries of its rotation matrix
 
 
 @dataclass(frozen=True)
-class Chain:
+class KinematicChain:
     """Modified Denavit-Hartenberg parameters of revolute joints, each (joint,): lengths in metres, twists in radians."""
 
     length_m: tuple[float, ...]
@@ -30,19 +30,21 @@ class Chain:
 
 
 _QUARTER = np.pi / 2
-PANDA = Chain(  # Franka Emika, Panda documentation, "Denavit-Hartenberg parameters"
+PANDA = KinematicChain(  # Franka Emika, Panda documentation, "Denavit-Hartenberg parameters"
     (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088),
     (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0),
     (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, _QUARTER, _QUARTER),
 )
-IIWA14 = Chain(  # KUKA LBR iiwa 14 R820, data sheet: 0.36, 0.42, 0.40 m between base, shoulder, elbow and wrist
-    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126),  # the last one to the flange, without the plate for tools
-    (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, -_QUARTER, _QUARTER),
+IIWA14 = (
+    KinematicChain(  # KUKA LBR iiwa 14 R820, data sheet: 0.36, 0.42, 0.40 m between base, shoulder, elbow and wrist
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126),  # the last one to the flange, without the plate for tools
+        (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, -_QUARTER, _QUARTER),
+    )
 )
 
 
-def joint_frames(chain: Chain, joint_rad: AnyFloats) -> AnyFloats:
+def joint_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
     """Return the pose of each joint's frame in the base's, (time, joint, 4, 4), at angles ``joint_rad`` (time, joint)."""
     frames = np.empty((*joint_rad.shape, 4, 4))
     reached = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
@@ -69,7 +71,7 @@ def joint_frames(chain: Chain, joint_rad: AnyFloats) -> AnyFloats:
     return frames
 
 
-def carries(chain: Chain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
+def carries(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
     """Return whether a hand at ``hand_m`` (time, 3) hangs rigidly on the chain's last link: whether it is this arm.
 
     Rows that are not finite do not state.
@@ -81,7 +83,7 @@ def carries(chain: Chain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 
-def turns(chain: Chain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
+def turns(chain: KinematicChain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
     """Return whether a hand with ``quaternions`` x, y, z, w (time, 4) turns with the chain's last link as one rigid body.
 
     Rows that are not finite are left out.
@@ -92,13 +94,13 @@ def turns(chain: Chain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
     return bool(len(tool)) and bool((tool.std(axis=0) < TURN_SPREAD).all())
 
 
-def _last_frames(chain: Chain, joint_rad: AnyFloats) -> AnyFloats:
+def _last_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
     """Return the pose of the last joint's frame in the base's (time, 4, 4)."""
     lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
     return np.concatenate([np.zeros((0, 4, 4)), *lasts])
 
 
-def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
+def hand_velocity(chain: KinematicChain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
     """Return linear (m/s) and angular (rad/s) velocity of the hand in the base's frame, (time, 6).
 
     ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).

@@ -35,7 +35,7 @@ LEVEL_SIGMA = 3.0  # times the readings' own noise is at the level still
 
 
 @dataclass(frozen=True)
-class Limits:
+class SlipLimits:
     """Limits of slip: rates in multiples of their noise, and least numbers of rows."""
 
     on_sigma: float = 5.0
@@ -87,7 +87,7 @@ def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     return np.diff(smooth, prepend=smooth[:1]) * rate_hz
 
 
-def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: Limits) -> Bools:
+def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: SlipLimits) -> Bools:
     """Return where the object slips (time,), stated with the whole of ``readings`` (time,) since the grasp at hand.
 
     In the first ``rest_rows`` rows it is taken to rest; their rate sets the threshold.
@@ -103,7 +103,7 @@ def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: 
     return _trimmed(latched(on, off) & ~_resting(smooth, limits.off_rows, level), smooth, level)
 
 
-def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: Limits) -> Bools:
+def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: SlipLimits) -> Bools:
     """Return where slip is known of (time,) from each row and those before it; never in the first ``rest_rows``."""
     speed = np.abs(rate_so_far(readings, rate_hz, cutoff_hz))
     noise = _noise(speed[:rest_rows], limits)
@@ -134,7 +134,7 @@ def _lost(smooth: Floats, rest_readings: Floats, patch_count: float, saturated_c
     return np.logical_or.accumulate(lost)
 
 
-def _noise(speed: Floats, limits: Limits) -> float:
+def _noise(speed: Floats, limits: SlipLimits) -> float:
     return max(float(np.sqrt(np.mean(speed**2))) if len(speed) else 0.0, limits.noise_floor)
 
 

@@ -135,7 +135,7 @@ EDGE_PX = 10  # margin of the other body to the edge of the image
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """All points that the camera gives, and what each lies on: the table, the object or clutter (point,)."""
 
     cloud: Cloud
@@ -144,7 +144,7 @@ class View:
 
 def view(
     placed: Placed, neighbour: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
-) -> View:
+) -> CameraView:
     """Return the camera's view of a body on the table, with a body ``neighbour`` set down next to it."""
     through = rays(range(HEIGHT), range(WIDTH))
     depth = _table(through, up, camera_m)
@@ -163,10 +163,10 @@ def view(
     for kind, body in bodies:
         visible = surface == kind
         colours[visible] = painted(body.inward(through[visible] * depth[visible, None]), rng)
-    return View(Cloud(measured(through, depth, noise_scale, rng), colours), surface)
+    return CameraView(Cloud(measured(through, depth, noise_scale, rng), colours), surface)
 
 
-def tables(view: View) -> dict[str, pa.Table]:
+def tables(view: CameraView) -> dict[str, pa.Table]:
     """Return the stream ``scene``, and ``scene_truth`` with a row a point: 0 the table, 1 the object, 2 another one."""
     truth = pa.Table.from_arrays([pa.array(view.surface)], schema=pa.schema([schema.label_field("gt_surface")]))
     return {"scene": view.cloud.table(), "scene_truth": truth}

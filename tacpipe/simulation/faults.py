@@ -10,7 +10,7 @@ from tacpipe.arrays import AnyArray, Bools, Times
 
 
 @dataclass(frozen=True)
-class Clock:
+class DeviceClock:
     """A device's own clock: at ``time`` since the trial's start it reads ``offset_ns + (1 + skew) * time``."""
 
     offset_ns: int = 0
@@ -18,7 +18,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Samples:
+class LoggedSamples:
     """When a device took the samples that reached the log, and the number that it gave each; both are (time,)."""
 
     true_ns: Times  # since the start of the trial
@@ -30,7 +30,7 @@ class Samples:
         return int(self.seq[-1] - self.seq[0]) + 1 - len(self.seq) if len(self.seq) else 0
 
 
-def samples(duration_ns: int, rate_hz: float, drop_probability: float, rng: np.random.Generator) -> Samples:
+def samples(duration_ns: int, rate_hz: float, drop_probability: float, rng: np.random.Generator) -> LoggedSamples:
     """Return the samples of a device from 0 to ``duration_ns``.
 
     They are evenly spaced, of a random phase within one period, and each is lost with ``drop_probability``.
@@ -38,10 +38,10 @@ def samples(duration_ns: int, rate_hz: float, drop_probability: float, rng: np.r
     period_ns = 1e9 / rate_hz
     taken_ns = np.rint(np.arange(rng.random() * period_ns, duration_ns, period_ns)).astype(np.int64)
     seq = np.flatnonzero(rng.random(len(taken_ns)) >= drop_probability)
-    return Samples(taken_ns[seq], seq.astype(np.int64))
+    return LoggedSamples(taken_ns[seq], seq.astype(np.int64))
 
 
-def device_stamps(true_ns: Times, clock: Clock) -> Times:
+def device_stamps(true_ns: Times, clock: DeviceClock) -> Times:
     """Return what the device's clock reads at ``true_ns``, int64 (time,)."""
     read_ns: Times = true_ns + clock.offset_ns + np.rint(true_ns * clock.skew).astype(np.int64)
     return read_ns

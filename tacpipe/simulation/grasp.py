@@ -20,7 +20,16 @@ from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import depth_camera, fingertip_sp, grasp_truth, pinch
-from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, draw_thing, families, perform, read_sensors, sensors
+from tacpipe.simulation.grasp_scene import (
+    GraspRig,
+    GraspScene,
+    Readings,
+    draw_thing,
+    families,
+    perform,
+    read_sensors,
+    sensors,
+)
 
 START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
 GRASP_NS = 180_000_000_000  # time between two grasps of a session
@@ -29,7 +38,7 @@ READ_NS = 5_000_000_000  # time between the plan and the reading
 NOISE, BOUND = 4, 5  # streams of random numbers
 
 
-def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
+def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
     """Return trial ``index`` of the rig: cloud, grasp, reading, truth; or raw: scene, grasp, biotac_sp, scene_truth, truth.
 
     The same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
@@ -59,32 +68,32 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
     return RecordingOutput(streams, _attributes(scene, session(index, rig)))
 
 
-def stamp_ns(index: int, rig: Rig) -> int:
+def stamp_ns(index: int, rig: GraspRig) -> int:
     """Return when trial ``index`` takes place, UTC nanoseconds: objects take turns session by session."""
     turn, number = divmod(_number(index, rig), SESSION)
     return START_NS + ((turn * _objects(rig) + index % _objects(rig)) * SESSION + number) * GRASP_NS
 
 
-def session(index: int, rig: Rig) -> int:
+def session(index: int, rig: GraspRig) -> int:
     """Return in which session of its object trial ``index`` is, from 1."""
     return _number(index, rig) // SESSION + 1
 
 
-def _objects(rig: Rig) -> int:
+def _objects(rig: GraspRig) -> int:
     return 1 if rig.spheres else len(families(rig)) * rig.objects
 
 
-def _number(index: int, rig: Rig) -> int:
+def _number(index: int, rig: GraspRig) -> int:
     """Return which of the grasps of its object a trial is, from 0."""
     return index // _objects(rig)
 
 
 def _readings_over_time(
     hand: fingertip_sp.Sensors,
-    scene: Scene,
+    scene: GraspScene,
     readings: Readings,
-    course: pinch.Course,
-    rig: Rig,
+    course: pinch.PinchCourse,
+    rig: GraspRig,
     rng: np.random.Generator,
 ) -> pa.Table:
     """Return the stream of both sensors while fingers close, hold and let go."""
@@ -101,7 +110,7 @@ def _logged(
     hand: fingertip_sp.Sensors,
     signal: Floats,
     speed_n_s: Floats,
-    rig: Rig,
+    rig: GraspRig,
     rng: np.random.Generator,
 ) -> pa.Table:
     """Return a stream of readings of what sensors show (time, finger, channel), with noise."""
@@ -109,7 +118,7 @@ def _logged(
     return schema.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
 
 
-def _attributes(scene: Scene, session: int) -> dict[str, Attribute]:
+def _attributes(scene: GraspScene, session: int) -> dict[str, Attribute]:
     return {
         "sensor": "biotac-sp",
         "simulated": True,
@@ -119,7 +128,7 @@ def _attributes(scene: Scene, session: int) -> dict[str, Attribute]:
     }
 
 
-def _check(rig: Rig) -> None:
+def _check(rig: GraspRig) -> None:
     """Refuse a rig that cannot be."""
     if rig.objects < 1:
         raise TacpipeError(f"objects is {rig.objects}; a family needs 1 or more.")

@@ -28,7 +28,7 @@ SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 
 
 @dataclass(frozen=True)
-class Rig:
+class GraspRig:
     """The objects and the quality of the sensors. The fields are those of the stage's params.
 
     Controls: ``spheres`` makes all objects alike but for their size, ``one_pose`` leaves the cloud only the object to
@@ -48,7 +48,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Scene:
+class GraspScene:
     """The true course of a trial."""
 
     thing: Thing
@@ -70,7 +70,7 @@ class Readings:
     signal: Floats
 
 
-def families(rig: Rig) -> tuple[str, ...]:
+def families(rig: GraspRig) -> tuple[str, ...]:
     """Return the families that a rig grasps, raising `TacpipeError` for an unknown one."""
     names = household.FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
     unknown = [name for name in names if name not in household.FAMILIES]
@@ -81,7 +81,7 @@ def families(rig: Rig) -> tuple[str, ...]:
     return ("sphere",) if rig.spheres else names
 
 
-def draw_thing(seed: int, index: int, rig: Rig = Rig()) -> Thing:
+def draw_thing(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
     """Return what trial ``index`` grasps: the same object whichever others there are, but for spheres of all sizes."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
@@ -98,7 +98,7 @@ def sensors(seed: int) -> fingertip_sp.Sensors:
     return fingertip_sp.sensors(np.random.default_rng([seed, SENSORS]))
 
 
-def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
+def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
     """Return what truly happens in trial ``index``; raises `TacpipeError` if in `TRIES` poses nothing could be grasped."""
     thing = draw_thing(seed, index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
@@ -119,12 +119,12 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
         colours = depth_camera.painted(placed.inward(direction * depth_m[:, None]), rng)
         situation = pinch.situation(placed, grasp, thing.compliance_1_pa)
         hidden = pinch.unseen(rng, 1, rig.effort_spread)
-        scene = Scene(thing, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
+        scene = GraspScene(thing, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
         return scene if scale == 1 else _scaled(scene, scale)
     raise TacpipeError(f"The object {thing.name} could not be seen and grasped in {TRIES} poses; take another seed.")
 
 
-def read_sensors(hand: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Readings:
+def read_sensors(hand: fingertip_sp.Sensors, scene: GraspScene, t_ns: int, rig: GraspRig = GraspRig()) -> Readings:
     """Return what both sensors measure of a scene at ``t_ns``; where the camera is does not matter."""
     touch = pinch.touch(scene.situation, scene.hidden)
     off = fingertip_sp.drift(hand.phases_rad, rig.drift_count_day, t_ns)
@@ -132,7 +132,7 @@ def read_sensors(hand: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig =
     return Readings(touch, off, signal + off)
 
 
-def _scaled(scene: Scene, scale: float) -> Scene:
+def _scaled(scene: GraspScene, scale: float) -> GraspScene:
     """Return a scene with all lengths times ``scale``: the camera sees the same, only nearer and smaller or the reverse."""
     thing = replace(scene.thing, shape=Ellipsoid(np.full(3, household.REFERENCE_M * scale)))
     placed = Placed(thing.shape, scene.placed.rotation, scene.placed.origin_m * scale)

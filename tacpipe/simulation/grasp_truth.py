@@ -10,10 +10,12 @@ import pyarrow as pa
 from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.simulation import fingertip_sp, touch_bound
-from tacpipe.simulation.grasp_scene import Readings, Rig, Scene
+from tacpipe.simulation.grasp_scene import GraspRig, GraspScene, Readings
 
 
-def bound(hand: fingertip_sp.Sensors, scene: Scene, rig: Rig, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def bound(
+    hand: fingertip_sp.Sensors, scene: GraspScene, rig: GraspRig, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Return mean and variance of what the sensors may read, given the geometry alone, each (finger, channel)."""
     possible = touch_bound.readings(
         scene.situation,
@@ -27,7 +29,7 @@ def bound(hand: fingertip_sp.Sensors, scene: Scene, rig: Rig, rng: np.random.Gen
 
 
 def table(
-    t_ns: int, scene: Scene, sensed: Readings, estimate: tuple[Floats, Floats], moments_ns: Mapping[str, int]
+    t_ns: int, scene: GraspScene, sensed: Readings, estimate: tuple[Floats, Floats], moments_ns: Mapping[str, int]
 ) -> pa.Table:
     """Return the stream ``truth``: of each finger, gt_mf_… and gt_th_…, then of the object.
 
@@ -57,7 +59,7 @@ def table(
     return schema.stream(np.array([t_ns]), values, [*fields, *moments])
 
 
-def _finger(finger: int, scene: Scene, sensed: Readings) -> list[tuple[str, str, str, float]]:
+def _finger(finger: int, scene: GraspScene, sensed: Readings) -> list[tuple[str, str, str, float]]:
     """Return name, unit, quantity and value of what is true of a finger."""
     touch, situation = sensed.touch, scene.situation
     columns = [

@@ -42,7 +42,7 @@ GYRATION_M = 0.06  # radius of gyration of a small bottle
 
 
 @dataclass(frozen=True)
-class Grasp:
+class HeldObject:
     """The object in the grasp, and the parameters of the grasp."""
 
     mass_kg: float
@@ -95,7 +95,9 @@ def onset_m_s2(mass_kg: float, grip_n: float, friction: float) -> float:
     return 2 * friction * grip_n / mass_kg - GRAVITY_M_S2
 
 
-def carry(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None = None, *, rate_hz: float = 1000.0) -> Contact:
+def carry(
+    grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None = None, *, rate_hz: float = 1000.0
+) -> Contact:
     """Return the contact while the hand accelerates by ``acceleration_m_s2`` (time, axis), in its own frame.
 
     ``rise_m`` (time,) is the hand's height above the place where the object stands on the table; without it there is no
@@ -120,11 +122,11 @@ def run_profile(
     commanded = np.asarray(acceleration_m_s2, dtype=np.float64)
     if commanded.ndim == 1:
         commanded = np.column_stack([np.zeros((len(commanded), 2)), commanded])
-    grasp = Grasp(mass_kg, friction, np.full(len(commanded), grip_n))
+    grasp = HeldObject(mass_kg, friction, np.full(len(commanded), grip_n))
     return carry(grasp, commanded, rate_hz=rate_hz)
 
 
-def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_s: float) -> Floats:
+def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, step_s: float) -> Floats:
     """Return force x and z, displacement x and z, velocity x and z, and state (time, 7).
 
     The state is 0 in stick or before contact, 1 in slip and 2 once dropped. A loop over plain numbers: which state a row
@@ -211,7 +213,7 @@ def _fall(
     return np.column_stack([displacement, velocity])
 
 
-def _twist(grasp: Grasp, force_n: Floats, is_held: Bools, step_s: float) -> tuple[Floats, Floats]:
+def _twist(grasp: HeldObject, force_n: Floats, is_held: Bools, step_s: float) -> tuple[Floats, Floats]:
     """Return torque about y and rotation of the object against the fingers (time,).
 
     The centre of mass hangs ``lever_m`` next to the grasp at angle 0 and swings down as the object turns; friction holds

@@ -63,7 +63,7 @@ LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the l
 
 
 @dataclass(frozen=True)
-class Rig:
+class PickRig:
     """The handling of the bottle and the logging of the streams. The fields are those of the stage's params.
 
     To study one thing at a time: ``friction_scale=4`` never slips, ``effort=1.15`` slips because of the plan alone,
@@ -90,19 +90,19 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Scene:
+class PickScene:
     """The true course of a trial before logging; arrays are (time, …) at 1 kHz."""
 
     protocol: str
     path: trajectory.Trajectory
     finger_m: Floats  # (time,)
-    grasp: mechanics.Grasp
+    grasp: mechanics.HeldObject
     contact: mechanics.Contact
     skins: tuple[taxels.Skin, taxels.Skin]
     loss_ns: int | None  # when the grip gave way
 
 
-def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
+def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> RecordingOutput:
     """Return trial ``index`` of the rig: the streams xela1, xela2, robot, proximity and truth, and what is known of them.
 
     The same seed, index and rig give the same values. Attributes that begin with ``gt_`` and the columns of ``truth``,
@@ -124,7 +124,7 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
         rng = np.random.default_rng([seed, index, 1, number])
         samples = faults.samples(duration_ns, rate_hz, rig.drop_probability, rng)
         offset, skew = rng.uniform(-1, 1, 2)
-        clock = faults.Clock(round(offset * offset_ms * 1e6), float(skew * rig.clock_skew_ppm * 1e-6))
+        clock = faults.DeviceClock(round(offset * offset_ms * 1e6), float(skew * rig.clock_skew_ppm * 1e-6))
         arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
         measured, fields = _measured(name, scene, samples.true_ns, rig, rng)
 
@@ -147,7 +147,7 @@ def _in_blocks(rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill)
     return gathered.rows()
 
 
-def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
+def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     """Return what truly happens in trial ``index``; how its streams are logged changes nothing of it."""
     rng = np.random.default_rng([seed, index])
     approach_s, pause_s = rng.uniform(*APPROACH_S), rng.uniform(*PAUSE_S)
@@ -162,23 +162,23 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
         squeeze = _ease((path.t_ns / 1e9 - approach_s) / RAMP_S)
     mass_kg = float(MASSES_KG[rng.integers(len(MASSES_KG))])
     load_n = np.linalg.norm(
-        mechanics.Grasp(mass_kg, 1.0, squeeze).demand_n(path.hand_acceleration_m_s2)[:, ::2], axis=1
+        mechanics.HeldObject(mass_kg, 1.0, squeeze).demand_n(path.hand_acceleration_m_s2)[:, ::2], axis=1
     )
     grip_n, friction = _grip(mass_kg, float(load_n.max()), rig.effort, rng)
-    grasp = mechanics.Grasp(mass_kg, friction * rig.friction_scale, grip_n * squeeze, rig.lever_m)
+    grasp = mechanics.HeldObject(mass_kg, friction * rig.friction_scale, grip_n * squeeze, rig.lever_m)
     loss_ns = None
     if rng.random() < rig.grip_loss_probability:
         row = _loss_row(load_n, grasp, path.rise_m, rig.grip_loss, rng)
         loss_ns = int(path.t_ns[row])
         weaker = 1 - rig.grip_loss * _ease((path.t_ns - loss_ns) / 1e9 / LOSS_S)
-        grasp = mechanics.Grasp(mass_kg, grasp.friction, grasp.grip_n * weaker, rig.lever_m)
+        grasp = mechanics.HeldObject(mass_kg, grasp.friction, grasp.grip_n * weaker, rig.lever_m)
     rise_m = None if rig.still else path.rise_m
     contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
     skins = (taxels.skin(rng), taxels.skin(rng))
-    return Scene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
+    return PickScene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
 
 
-def touch(scene: Scene, finger: int, true_ns: Times, *, creep: float = taxels.CREEP) -> Floats:
+def touch(scene: PickScene, finger: int, true_ns: Times, *, creep: float = taxels.CREEP) -> Floats:
     """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis)."""
     contact = scene.contact
     rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
@@ -198,7 +198,7 @@ def touch(scene: Scene, finger: int, true_ns: Times, *, creep: float = taxels.CR
 
 
 def _measured(
-    name: str, scene: Scene, true_ns: Times, rig: Rig, rng: np.random.Generator
+    name: str, scene: PickScene, true_ns: Times, rig: PickRig, rng: np.random.Generator
 ) -> tuple[Callable[[slice], AnyArray], list[Any]]:
     """Return what a device logs of some of the samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
@@ -235,7 +235,9 @@ def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator
             return grip_n, friction
 
 
-def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: float, rng: np.random.Generator) -> int:
+def _loss_row(
+    load_n: Floats, grasp: mechanics.HeldObject, rise_m: Floats, loss: float, rng: np.random.Generator
+) -> int:
     """Return a random row in which the grip gives way while the hand is up: one after which the load is too much.
 
     The load must stay so from where the grip has given way until `SLIDE_S` later. Where that is nowhere so, any row
@@ -250,7 +252,7 @@ def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: floa
     return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
 
 
-def interpolation(scene: Scene, true_ns: Times) -> Any:
+def interpolation(scene: PickScene, true_ns: Times) -> Any:
     """Return a function that interpolates values at 1 kHz (time,) or (time, axis) to ``true_ns``."""
     rows = np.clip(np.searchsorted(scene.path.t_ns, true_ns, side="right"), 1, len(scene.path.t_ns) - 1)
     before_ns = scene.path.t_ns[rows - 1]
@@ -264,7 +266,7 @@ def interpolation(scene: Scene, true_ns: Times) -> Any:
     return at
 
 
-def arm(scene: Scene, true_ns: Times) -> Floats:
+def arm(scene: PickScene, true_ns: Times) -> Floats:
     """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
     at = interpolation(scene, true_ns)
     half = at(scene.path.yaw_rad) / 2
@@ -277,7 +279,7 @@ def _clock_fields() -> list[Any]:
     return [device, pa.field("seq", pa.int64(), metadata={"unit": "1", "quantity": "sequence"})]
 
 
-def _truth(scene: Scene, start_ns: int) -> Callable[[slice], pa.Table]:
+def _truth(scene: PickScene, start_ns: int) -> Callable[[slice], pa.Table]:
     """Return a function that returns some rows of the stream ``truth`` at 1 kHz."""
     contact, acceleration_m_s2 = scene.contact, scene.path.acceleration_m_s2
 
@@ -311,7 +313,7 @@ def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[
     ]
 
 
-def _attributes(scene: Scene, index: int, start_ns: int, rig: Rig) -> dict[str, Attribute]:
+def _attributes(scene: PickScene, index: int, start_ns: int, rig: PickRig) -> dict[str, Attribute]:
     contact, grasp = scene.contact, scene.grasp
     onset_ns = None if contact.onset is None else start_ns + int(scene.path.t_ns[contact.onset])
     return {

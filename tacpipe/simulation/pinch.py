@@ -173,7 +173,7 @@ JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the h
 
 
 @dataclass(frozen=True)
-class Course:
+class PinchCourse:
     """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
 
     t_ns: Times
@@ -181,7 +181,7 @@ class Course:
     moments_ns: dict[str, int]  # contact: first touch; hold: the force is reached; release: it begins to fall
 
 
-def course(start_ns: int, rng: np.random.Generator) -> Course:
+def course(start_ns: int, rng: np.random.Generator) -> PinchCourse:
     """Return a course that starts at ``start_ns``; how long each part lasts is random."""
     free_s, closing_s, held_s = (float(rng.uniform(*limits)) for limits in (FREE_S, CLOSING_S, HELD_S))
     knots_s = np.cumsum([free_s, closing_s, held_s, RELEASE_S])
@@ -189,7 +189,7 @@ def course(start_ns: int, rng: np.random.Generator) -> Course:
     fraction = np.interp(true_s, knots_s, (0.0, 1.0, 1.0, 0.0))
     true_ns = np.rint(true_s * 1e9).astype(np.int64)
     moments = zip(("contact", "hold", "release"), knots_s, strict=False)
-    return Course(
+    return PinchCourse(
         start_ns + faults.arrivals(true_ns, JITTER_NS, rng),
         fraction**2 * (3 - 2 * fraction),  # smooth start and stop
         {name: start_ns + round(1e9 * float(at_s)) for name, at_s in moments},

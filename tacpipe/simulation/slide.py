@@ -55,7 +55,7 @@ MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
 
 
 @dataclass(frozen=True)
-class Rig:
+class SlideRig:
     """The materials and the quality of the sensors. The fields are those of the stage's params.
 
     Controls: with ``identical_materials`` nothing but the session distinguishes one class from another, with
@@ -78,7 +78,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Place:
+class TrialPlace:
     """The place of a trial in the plan of the rig; all but ``number`` count from 1, except that material 0 is any."""
 
     sensor: str
@@ -88,10 +88,10 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SlideScene:
     """The true course of a trial at the sensor's samples; arrays are (time,) unless stated otherwise."""
 
-    place: Place
+    place: TrialPlace
     material: texture.Material
     surface: texture.Waves
     true_ns: Times  # since the start of the trial
@@ -104,21 +104,21 @@ class Scene:
     pressure_count: Counts  # pressure of the finger's fluid as logged, empty for RoboSkin
 
 
-def place(index: int, rig: Rig) -> Place:
+def place(index: int, rig: SlideRig) -> TrialPlace:
     """Return what trial ``index`` is a trial of."""
     number, position = divmod(index, len(SENSORS) * rig.materials)
     session = number % rig.sessions + 1
-    return Place(SENSORS[position % len(SENSORS)], position // len(SENSORS) + 1, session, number)
+    return TrialPlace(SENSORS[position % len(SENSORS)], position // len(SENSORS) + 1, session, number)
 
 
-def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.Material:
+def material(seed: int, sensor: str, number: int, rig: SlideRig = SlideRig()) -> texture.Material:
     """Return material ``number`` as ``sensor`` measures it: the same for both sensors where they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
     index = 0 if rig.identical_materials else number
     return texture.material(np.random.default_rng([seed, MATERIAL, source, index]))
 
 
-def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
+def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> RecordingOutput:
     """Return trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some of the BioTac the arm's.
 
     The same seed, index and rig give the same values. Columns of ``truth``, on the true times of the tactile samples,
@@ -143,7 +143,7 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     return RecordingOutput(streams, _attributes(scene.place))
 
 
-def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
+def perform(seed: int, index: int, rig: SlideRig = SlideRig()) -> SlideScene:
     """Return what truly happens in trial ``index``."""
     slot = place(index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
@@ -155,7 +155,7 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     return _rolled(slot, surface_material, surface, force_n, rig, rng)
 
 
-def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
+def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig()) -> Floats:
     """Return what each channel measures in a trial (time, channel), counts without noise."""
     gain, lean, along_m, aperture_m = sensitivity(scene)
     contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
@@ -165,7 +165,7 @@ def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
     return counts
 
 
-def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
+def sensitivity(scene: SlideScene) -> tuple[Floats, Floats, Floats, float]:
     """Return counts per newton (time, channel), d (time, channel), xi (channel,) in metres, and the aperture's sigma."""
     if scene.place.sensor == "biotac":
         shape = (len(scene.true_ns), schema.ELECTRODES)
@@ -175,7 +175,7 @@ def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
     return gain, forearm.leans(scene.patch_m), forearm.ALONG_M, forearm.APERTURE_M
 
 
-def nuisance(seed: int, index: int, number: int, rig: Rig = Rig()) -> tuple[float, Floats]:
+def nuisance(seed: int, index: int, number: int, rig: SlideRig = SlideRig()) -> tuple[float, Floats]:
     """Return the gain of a trial's session and the offset of each of ``number`` channels in that trial, N (channel,)."""
     slot = place(index, rig)
     rng = np.random.default_rng([seed, SESSION, SENSORS.index(slot.sensor), slot.material, slot.session])
@@ -187,13 +187,13 @@ def nuisance(seed: int, index: int, number: int, rig: Rig = Rig()) -> tuple[floa
 
 
 def _drawn(
-    slot: Place,
+    slot: TrialPlace,
     surface_material: texture.Material,
     surface: texture.Waves,
     force_n: float,
-    rig: Rig,
+    rig: SlideRig,
     rng: np.random.Generator,
-) -> Scene:
+) -> SlideScene:
     """Return a slide of the BioTac, which starts with the first sample whose pressure is above the trigger."""
     rate_hz = fingertip.RATE_HZ
     touch_s, phase_s = rng.uniform(*HOVER_S), rng.random() / rate_hz
@@ -213,7 +213,7 @@ def _drawn(
     sliding_n = (1 - settling) * coming_n[first] + settling * force_n
     pressed_n = np.where(since_s < 0, coming_n[:rows], sliding_n * lifting)
     phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(lasts_s * rate_hz), 0, 1))
-    return Scene(
+    return SlideScene(
         slot,
         surface_material,
         surface,
@@ -229,13 +229,13 @@ def _drawn(
 
 
 def _rolled(
-    slot: Place,
+    slot: TrialPlace,
     surface_material: texture.Material,
     surface: texture.Waves,
     force_n: float,
-    rig: Rig,
+    rig: SlideRig,
     rng: np.random.Generator,
-) -> Scene:
+) -> SlideScene:
     """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
     variation = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
@@ -244,7 +244,7 @@ def _rolled(
     speed = rig.roboskin_speed_m_s * (1 + variation * np.sin(turn * at_s + phase))
     way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
-    return Scene(
+    return SlideScene(
         slot,
         surface_material,
         surface,
@@ -269,7 +269,7 @@ def _way(since_s: Floats, lasts_s: float, limit_m_s: float, rng: np.random.Gener
     return np.interp(since_s, grid, position), np.interp(since_s, grid, speed, left=0.0, right=0.0)
 
 
-def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) -> list[Any]:
+def _finger(scene: SlideScene, signal: Floats, rig: SlideRig, rng: np.random.Generator) -> list[Any]:
     """Return the 44 columns of the stream biotac, each (time,)."""
     electrodes = fingertip.read(signal, rig.noise_scale, rng)
     touched = scene.true_ns[int((scene.force_n > 0).argmax())]
@@ -284,7 +284,7 @@ def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) ->
     return [tdc, tac, scene.pressure_count, *pac.T, *electrodes.T]
 
 
-def _arm(scene: Scene, start_ns: int, rig: Rig, rng: np.random.Generator) -> dict[str, pa.Table]:
+def _arm(scene: SlideScene, start_ns: int, rig: SlideRig, rng: np.random.Generator) -> dict[str, pa.Table]:
     """Return the streams twist and wrench of the arm, on its own clock and with the silences of its link.
 
     The arm slides along -x, and z is up. Nobody estimates angular velocity: it is NaN, as in the published recordings.
@@ -313,7 +313,7 @@ def _arm(scene: Scene, start_ns: int, rig: Rig, rng: np.random.Generator) -> dic
     }
 
 
-def _truth(scene: Scene, start_ns: int) -> pa.Table:
+def _truth(scene: SlideScene, start_ns: int) -> pa.Table:
     """Return the stream ``truth``, at the true times of the tactile samples."""
     fields = [
         schema.float_field("gt_position_m", "m", "position"),
@@ -327,7 +327,7 @@ def _truth(scene: Scene, start_ns: int) -> pa.Table:
     return schema.stream(start_ns + scene.true_ns, columns, fields)
 
 
-def _attributes(slot: Place) -> dict[str, Attribute]:
+def _attributes(slot: TrialPlace) -> dict[str, Attribute]:
     return {
         "sensor": slot.sensor,
         "simulated": True,
@@ -339,7 +339,7 @@ def _attributes(slot: Place) -> dict[str, Attribute]:
     }
 
 
-def _check(rig: Rig) -> None:
+def _check(rig: SlideRig) -> None:
     if rig.spectra not in SPECTRA:
         raise TacpipeError(f"There are no spectra {rig.spectra!r}; those of the sensors are shared or independent.")
     for name in ("materials", "sessions"):

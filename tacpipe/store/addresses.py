@@ -38,7 +38,7 @@ _PLAIN = {"region": "region", "endpoint_url": "endpoint"}
 
 
 @dataclass(frozen=True)
-class Address:
+class BucketAddress:
     """Address of a store in object storage."""
 
     scheme: str
@@ -50,7 +50,7 @@ class Address:
 
 
 @dataclass
-class Settings:
+class ClientSettings:
     """Settings of the client in addition to the address; their representation shows no credential."""
 
     config: dict[str, Any] = field(default_factory=dict, repr=False)
@@ -59,7 +59,7 @@ class Settings:
     url: str = ""  # Replaces the address if not empty
 
 
-def parsed(text: str) -> Address | Path:
+def parsed(text: str) -> BucketAddress | Path:
     """Parse an address or a path; ``file:///lab/store`` is a path too.
 
     Raises `UsageError` for an unsupported scheme, and for an address with credentials or options.
@@ -90,20 +90,20 @@ def parsed(text: str) -> Address | Path:
         )
     if scheme == "az" and "/" not in path:
         raise UsageError(f"{scheme}://{path} names no container. Give az://ACCOUNT/CONTAINER/FOLDER.")
-    return Address(scheme, path)
+    return BucketAddress(scheme, path)
 
 
-def settings(address: Address, environment: Mapping[str, str] = os.environ) -> Settings:
+def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ) -> ClientSettings:
     """Return the settings that the client does not take from the environment: those of a profile, and whether TLS is used.
 
     Raises `UsageError` if the selected profile does not exist.
     """
     if address.scheme == "az":  # the client takes the account as a setting
         account, _, container_path = address.path.partition("/")
-        return Settings({"account_name": account}, url=f"az://{container_path}")
+        return ClientSettings({"account_name": account}, url=f"az://{container_path}")
     if address.scheme != "s3":
-        return Settings()
-    client_settings = Settings(
+        return ClientSettings()
+    client_settings = ClientSettings(
         {"disable_bulk_delete": True}
     )  # Not every server supports it, and objects are deleted singly
     profile = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
@@ -117,7 +117,7 @@ def settings(address: Address, environment: Mapping[str, str] = os.environ) -> S
     return client_settings
 
 
-def _fill(client_settings: Settings, profile_name: str, environment: Mapping[str, str]) -> None:
+def _fill(client_settings: ClientSettings, profile_name: str, environment: Mapping[str, str]) -> None:
     """Add the settings of the profile; credentials in the environment take precedence, as in other tools."""
     home = Path(environment.get("HOME") or "~").expanduser() / ".aws"
     files = [

@@ -18,7 +18,7 @@ from tacpipe.errors import StorageError, UsageError
 from tacpipe.io import memory, regular
 from tacpipe.plugins import extras
 from tacpipe.store import addresses
-from tacpipe.store.addresses import Address
+from tacpipe.store.addresses import BucketAddress
 from tacpipe.store.backend import Entry
 
 Result = TypeVar("Result")
@@ -38,7 +38,7 @@ _METADATA = ("169.254.169.254", "metadata.google.internal")  # asked last, where
 class Bucket:
     """A folder of a bucket. Safe to use from several threads; credentials never leave the client."""
 
-    def __init__(self, address: Address | str, client: Any = None) -> None:
+    def __init__(self, address: BucketAddress | str, client: Any = None) -> None:
         self.place = str(address)
         self._client = client if isinstance(address, str) else _connected(address)
         self._large = Semaphore(_LARGE)
@@ -281,7 +281,7 @@ def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
         yield part
 
 
-def _connected(address: Address) -> Any:
+def _connected(address: BucketAddress) -> Any:
     """Return obstore's client of an address, with the credentials that the environment or a profile gives."""
     with extras.explain_missing(f"A store at {address.scheme}://"):
         from obstore.exceptions import BaseError

@@ -19,7 +19,7 @@ from tacpipe.io import progress, threads
 from tacpipe.io.files import Draft, present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
-from tacpipe.store.addresses import Address
+from tacpipe.store.addresses import BucketAddress
 from tacpipe.store.backend import AT_ONCE
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.remote import RemoteStore
@@ -31,7 +31,7 @@ _buckets: dict[tuple[int, Path], Bucket] = {}  # Buckets of this process: a clie
 _stores: set[tuple[int, Path]] = set()  # Buckets that hold a store
 
 
-def folder(address: Address) -> Path:
+def folder(address: BucketAddress) -> Path:
     """Return the folder in front of a bucket: below ``TACPIPE_CACHE``, else below the cache of this user.
 
     Its name holds a digest of the address and of the server: the same address at another one is another store.
@@ -54,7 +54,7 @@ class CachedStore(Store):
 
     distant = True
 
-    def __init__(self, address: Address, run: str = "") -> None:
+    def __init__(self, address: BucketAddress, run: str = "") -> None:
         super().__init__(folder(address), run)
         self.address = address
         self._remote: RemoteStore | None = None

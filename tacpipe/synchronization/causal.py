@@ -31,7 +31,7 @@ class Reading:
     compared: Sequence[int] = ()  # columns that are compared to detect a repeated sample
 
 
-class Rows(NamedTuple):
+class GridRows(NamedTuple):
     """Some rows of a grid, in order; `newest_ns`, `gap` and `values` are by stream."""
 
     t_ns: Times  # (row,)
@@ -101,7 +101,7 @@ class Grid:
             self.late[stream] += int(np.count_nonzero(t_ns <= self._until_ns))
         source.push(t_ns, values)
 
-    def rows(self, until_ns: int) -> Rows:
+    def rows(self, until_ns: int) -> GridRows:
         """Return the rows up to ``until_ns`` that were not made yet: all samples up to then were pushed."""
         after_ns, self._until_ns = self._until_ns, max(until_ns, self._until_ns or until_ns)
         grid_ns = self._grid(after_ns, self._until_ns)
@@ -117,7 +117,7 @@ class Grid:
                 newest_ns[name][has_samples], values[name][has_samples] = source.at(at_ns)
                 gap[name][has_samples] = is_overdue(newest_ns[name][has_samples], at_ns, self._gap_ns[name])
             source.forget(self._until_ns)
-        return Rows(grid_ns, has_samples, newest_ns, gap, values)
+        return GridRows(grid_ns, has_samples, newest_ns, gap, values)
 
     def _grid(self, after_ns: int | None, until_ns: int) -> Times:
         """Return the grid points after ``after_ns`` up to ``until_ns`` (row,)."""

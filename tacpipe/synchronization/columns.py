@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.synchronization import streams
-from tacpipe.synchronization.streams import Stream
+from tacpipe.synchronization.streams import TimedStream
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,7 +22,7 @@ Keep = Callable[[Any], Any]  # puts values (grid,) aside and returns them
 BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
 
 
-def channels(stream: Stream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
+def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
     """Return field and values of each channel on the grid, in the order of the stream; ``keep`` takes each as it is made."""
     import pyarrow as pa
 
@@ -53,7 +53,7 @@ def channels(stream: Stream, grid_ns: Times, exact: Int64s | None, keep: Keep) -
     return [grid_columns[name] for name in stream.channels]
 
 
-def held_channels(stream: Stream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
+def held_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
     """Return field and values of each channel on the grid, from samples that had come by each point alone.
 
     A channel keeps its newest sample, and its type; a proximity sensor has the median of the last `PAST_NS`. Each point
@@ -76,12 +76,12 @@ def held_channels(stream: Stream, grid_ns: Times, keep: Keep) -> list[GridColumn
     return grid_columns
 
 
-def _at_rows(stream: Stream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
+def _at_rows(stream: TimedStream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
     """Return field and values of a channel at some rows, its type kept; ``interpolation`` names the method."""
     return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
 
 
-def _blocks(stream: Stream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
+def _blocks(stream: TimedStream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
     """Return the channels that are interpolated at once: the four of a quaternion, else as many as fit a block."""
     if interpolation == "slerp":
         parts = [stream.columns.schema.field(name) for name in members]
@@ -91,7 +91,7 @@ def _blocks(stream: Stream, members: list[str], interpolation: str, points: int)
     return [members[first : first + size] for first in range(0, len(members), size)]
 
 
-def _between_samples(stream: Stream, names: list[str], interpolation: str, grid_ns: Times, used: Any) -> Floats:
+def _between_samples(stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any) -> Floats:
     """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
     import numpy as np
 
@@ -112,7 +112,7 @@ def _as_stored(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
     return kind, keep(np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype()))
 
 
-def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
+def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
     """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
     import numpy as np
 
@@ -123,7 +123,7 @@ def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> 
     return _masks(stream.name, stream.repeated[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
 
 
-def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times:
+def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
     """Return how long after each point the last sample arrived that `channels` reads there, shape (grid,), 0 or more."""
     import numpy as np
 
@@ -135,7 +135,7 @@ def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times
     return ahead_ns
 
 
-def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
+def held_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
     """Return where the newest sample was held, where it is older than ``gap_ns``, and how old it is."""
     from tacpipe.signals.resampling import is_overdue, newest_rows
 

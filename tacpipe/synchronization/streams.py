@@ -95,7 +95,7 @@ OF_SESSIONS = ("time", "plan", "prediction", "latency", "alarm", "material")
 
 
 @dataclass(frozen=True)
-class Stream:
+class TimedStream:
     """One stream of a recording, and when its samples were taken on the host's clock."""
 
     name: str
@@ -158,13 +158,13 @@ def holds_signal(schema: pa.Schema) -> bool:
     )
 
 
-def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> Stream:
+def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> TimedStream:
     """Return a stream with its samples on the host's clock; ``clock`` names the stamps: device, arrival or auto.
 
     Raises `TacpipeError` for stamps that are absent, run backwards or give no clock.
     """
     arrival_ns = _stamps(recording, name, columns)
-    stream = Stream(name, columns, arrival_ns, _repeated_rows(columns), arrival_ns)
+    stream = TimedStream(name, columns, arrival_ns, _repeated_rows(columns), arrival_ns)
     if clock == "arrival" or stream.truth:
         return stream
     if DEVICE not in columns.column_names:
@@ -230,7 +230,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
     return t_ns
 
 
-def without_wraps(stream: Stream, keep: Callable[[Any], Any]) -> tuple[Stream, int]:
+def without_wraps(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[TimedStream, int]:
     """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any.
 
     ``keep`` puts the values of such a channel aside and returns them.
@@ -284,8 +284,8 @@ def grid(
     recording: str,
     kind: str,
     rate_hz: float | None,
-    streams: Mapping[str, Stream],
-    master: Stream,
+    streams: Mapping[str, TimedStream],
+    master: TimedStream,
     *,
     hold_values: bool,
 ) -> tuple[Int64s, Int64s]:

@@ -12,7 +12,7 @@ from tacpipe.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Chain:
+class OpenedChain:
     """The stages that a model was trained behind, and what they fitted: those of the opened ``model``."""
 
     model: Dataset
@@ -23,7 +23,7 @@ class Chain:
         return self.model.source.chain
 
 
-def opened(recordings: Dataset | Recording, chain: Chain | None) -> Dataset:
+def opened(recordings: Dataset | Recording, chain: OpenedChain | None) -> Dataset:
     """Return a dataset, or the one of a recording alone, after the stages of ``chain``; None: as it is.
 
     Those stages that it has not been through yet are run, as ``tacpipe predict`` does. Raises `UsageError` for anything

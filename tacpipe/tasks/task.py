@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tacpipe.plugins.requirements import Requirements
     from tacpipe.plugins.stage import AnyStage, Result
     from tacpipe.tasks.calibrated import CalibrationRequest
-    from tacpipe.tasks.opened import Chain
+    from tacpipe.tasks.opened import OpenedChain
 
 Files = Mapping[str, bytes]  # the files of a model by name
 GraspPredictor = Callable[[Any, "Cloud", "Grasp"], dict[str, float]]
@@ -99,7 +99,7 @@ class Task(ABC):
         """Return a table of predictions for each recording, or one of all."""
 
     @abstractmethod
-    def load(self, files: Files, chain: Chain | None = None) -> LoadedModel:
+    def load(self, files: Files, chain: OpenedChain | None = None) -> LoadedModel:
         """Return the model among ``files``, which may be untrusted, trained behind the stages of ``chain``."""
 
     @property

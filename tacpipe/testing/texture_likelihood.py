@@ -33,7 +33,7 @@ FINE = 16  # wave numbers at which a taper's spectrum is known, between two of t
 
 
 @dataclass(frozen=True)
-class Track:
+class SlideTrack:
     """Measurements along the way; arrays are (place,)."""
 
     texture_n: Floats
@@ -41,18 +41,18 @@ class Track:
     taper: Floats  # its squares add up to one; 0 where nothing was measured
 
 
-def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.Rig) -> float:
+def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.SlideRig) -> float:
     """Return the fraction of trials ``indices`` of the rig whose material is classified correctly."""
     materials = [slide.place(index, rig).material for index in indices]
     return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(materials)))
 
 
-def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.Rig) -> Int32s:
+def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.SlideRig) -> Int32s:
     """Return the material that each of trials ``indices`` of the rig most likely is of (trial,), 1 to ``rig.materials``."""
     return np.array([log_likelihoods(seed, index, rig).argmax() + 1 for index in indices], np.int32)
 
 
-def log_likelihoods(seed: int, index: int, rig: slide.Rig) -> Floats:
+def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
     """Return Whittle's log-likelihood of each material for trial ``index`` (material,), but for a constant."""
     sensor = slide.place(index, rig).sensor
     track = felt_track(seed, index, rig)
@@ -73,7 +73,7 @@ def log_likelihoods(seed: int, index: int, rig: slide.Rig) -> Floats:
     return np.array(likelihoods)
 
 
-def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
+def felt_track(seed: int, index: int, rig: slide.SlideRig) -> SlideTrack:
     """Return the track of trial ``index``: what each channel measured, less its mean, put together where it was measured."""
     scene = slide.perform(seed, index, rig)
     sensor = scene.place.sensor
@@ -104,4 +104,4 @@ def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
     contact_n = np.where(enough, summed / divisor, 0.0)
     contact_n -= (taper * contact_n).sum() / taper.sum()
     noise_n2 = ((rig.noise_scale * noise) ** 2 + rounding) / divisor
-    return Track(contact_n, noise_n2, taper / np.sqrt((taper**2).sum()))
+    return SlideTrack(contact_n, noise_n2, taper / np.sqrt((taper**2).sum()))

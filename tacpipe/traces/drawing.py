@@ -80,7 +80,7 @@ POINTS, ROWS, LINES = 240, 8, 4  # largest numbers of points per line, rows, and
 COLOURS = ("#0969da", "#d1480c", "#1a7f37", "#8250df")
 
 
-class Row(NamedTuple):
+class PictureRow(NamedTuple):
     """One row of the picture."""
 
     name: str
@@ -88,17 +88,21 @@ class Row(NamedTuple):
     values: Floats  # (time, channel)
 
 
-def rows(curves: Sequence[Curves], touched: Sequence[Taxels]) -> list[Row]:
+def rows(curves: Sequence[Curves], touched: Sequence[Taxels]) -> list[PictureRow]:
     """Return what is drawn: the mean distance of each finger's taxels from rest first, then the other channels."""
     touch_rows = [
-        Row(f"{taxels.name} touch" + (f" ({taxels.unit})" if taxels.unit else ""), taxels.t_ns, taxels.load[:, None])
+        PictureRow(
+            f"{taxels.name} touch" + (f" ({taxels.unit})" if taxels.unit else ""), taxels.t_ns, taxels.load[:, None]
+        )
         for taxels in touched
         if len(taxels.t_ns) > 1
     ]
-    return touch_rows + [Row(stream_curves.title, stream_curves.t_ns, stream_curves.values) for stream_curves in curves]
+    return touch_rows + [
+        PictureRow(stream_curves.title, stream_curves.t_ns, stream_curves.values) for stream_curves in curves
+    ]
 
 
-def svg(all_rows: Sequence[Row]) -> str:
+def svg(all_rows: Sequence[PictureRow]) -> str:
     """Return the rows as one SVG picture of at most eight rows; the empty text where there is none."""
     if not all_rows:
         return ""
@@ -117,7 +121,7 @@ def svg(all_rows: Sequence[Row]) -> str:
     return "".join(parts)
 
 
-def _row(row: Row, top: int, start_ns: int, stop_ns: int) -> list[str]:
+def _row(row: PictureRow, top: int, start_ns: int, stop_ns: int) -> list[str]:
     t_ns, values = envelope(row.t_ns, row.values[:, :LINES], POINTS)
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)

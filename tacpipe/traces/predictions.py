@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class DrawnForecast:
     """A model's prediction for one finger ``step`` rows ahead and the measured values; both are changes from rest."""
 
     step: int
@@ -37,7 +37,7 @@ class Forecast:
         return np.asarray(np.abs(self.predicted.change - self.measured.change).mean(axis=(1, 2)))
 
 
-def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[Forecast]:
+def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[DrawnForecast]:
     """Return the forecasts in a recording of `tacpipe predict`, or of `tacpipe evaluate`, finger by finger, step by step.
 
     A column is matched by its name: ``xela1_taxel01_z_t5`` is the channel ``taxel01_z`` of the stream ``xela1``, 5 rows
@@ -60,7 +60,7 @@ def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[Forecast]:
     ]
 
 
-def of_values(values: Mapping[str, float], measured: Sequence[Taxels]) -> list[Forecast]:
+def of_values(values: Mapping[str, float], measured: Sequence[Taxels]) -> list[DrawnForecast]:
     """Return what a model predicted for the only reading of two BioTac SP, finger by finger, as forecasts of step 0.
 
     ``values`` are named by target, as `tacpipe.channels.biotac_sp.value_columns` names them.
@@ -73,11 +73,11 @@ def of_values(values: Mapping[str, float], measured: Sequence[Taxels]) -> list[F
         value_names = dict(zip(biotac_sp.columns(target), biotac_sp.value_columns(target), strict=True))
         if all(value_names.get(channel) in values for channel in taxels.channels):
             predicted = np.array([values[value_names[channel]] for channel in taxels.channels], dtype=np.float64)
-            forecasts.append(Forecast(0, replace(taxels, change=predicted.reshape(1, -1, 1)), taxels))
+            forecasts.append(DrawnForecast(0, replace(taxels, change=predicted.reshape(1, -1, 1)), taxels))
     return forecasts
 
 
-def _of_step(table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels: Taxels) -> list[Forecast]:
+def _of_step(table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels: Taxels) -> list[DrawnForecast]:
     prefix = f"{taxels.stream}_" if taxels.stream else ""
     names = [f"{prefix}{channel}_t{step}" for channel in taxels.channels]
     if not set(names) <= columns:
@@ -88,7 +88,9 @@ def _of_step(table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels:
     measured = linear(taxels.t_ns, taxels.change.reshape(len(taxels.t_ns), -1), target_ns[covered])
     predicted = matrix(table, names)[covered]
     at = replace(taxels, t_ns=target_ns[covered])
-    return [Forecast(step, replace(at, change=predicted.reshape(shape)), replace(at, change=measured.reshape(shape)))]
+    return [
+        DrawnForecast(step, replace(at, change=predicted.reshape(shape)), replace(at, change=measured.reshape(shape)))
+    ]
 
 
 MODEL, SCORE = "model", "score_"

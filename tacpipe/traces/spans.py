@@ -31,7 +31,7 @@ class Span(NamedTuple):
     stop_ns: int
 
 
-class Event(NamedTuple):
+class FaultMark(NamedTuple):
     """A fault at one moment of a recording."""
 
     t_ns: int
@@ -164,11 +164,11 @@ def merged(spans: Sequence[Span], lane: str = "gaps") -> list[Span]:
     return merged_spans
 
 
-def events(table: pa.Table) -> list[Event]:
+def events(table: pa.Table) -> list[FaultMark]:
     """Return the rows of a stream of events, in the order of time."""
     rows = table.to_pylist()
     parsed = [
-        Event(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event_text(row))
+        FaultMark(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event_text(row))
         for row in rows
     ]
     return sorted(parsed)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tacpipe.io import progress, terminal
-from tacpipe.training.following import HISTORY, Follower, Line, Network
+from tacpipe.training.following import HISTORY, Follower, Line, TrainedNetwork
 
 REDRAW_S = 0.1  # least time between two readings of the loss: each waits for the device
 _DIGEST = 64  # letters of a folder that is named by a key
@@ -26,7 +26,7 @@ def on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
     if progress.is_quiet():
         yield []
     elif not progress.is_visible():
-        yield [Lines(workspace)]
+        yield [EpochLines(workspace)]
     else:
         bar = Bar(stage, workspace)
         try:
@@ -52,12 +52,12 @@ class _Shown:
     def __init__(self, workspace: Path | None) -> None:
         self._workspace = workspace
         self._announced = False
-        self.network = Network(1)
+        self.network = TrainedNetwork(1)
         self.history: list[Line] = []
         self._resumed = 0  # epochs before an interruption
         self._begun_s = 0.0
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Report which file grows, once, and from which epoch a training resumes."""
         self.network, self.history, self._resumed = network, list(history), len(history)
         self._begun_s = time.monotonic()
@@ -100,12 +100,12 @@ class _Shown:
         return f"{duration(epoch_s * (self.network.epochs - len(self.history) - passed))} left"
 
 
-class Lines(_Shown):
+class EpochLines(_Shown):
     """A line an epoch."""
 
     _before_s = 0.0
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Report as `_Shown` does, and measure the first epoch from here."""
         super().begin(network, history)
         self._before_s = self._begun_s
@@ -141,7 +141,7 @@ class Bar(_Shown):
         self._drawn_s = 0.0
         self._batches = 0
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Have the bar count the epochs of this network."""
         super().begin(network, history)
         self._batches, self._drawn_s = 0, 0.0

@@ -22,7 +22,7 @@ Line = dict[str, Any]  # one line of the history: the results of an epoch, as JS
 
 
 @dataclass(frozen=True)
-class Network:
+class TrainedNetwork:
     """One of the networks that a stage trains: which it is, and how long it may take."""
 
     epochs: int  # upper limit
@@ -39,7 +39,7 @@ class Network:
 class Follower(Protocol):
     """Receive calls as a training proceeds."""
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """A network is trained from here; ``history`` are its epochs before an interruption."""
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
@@ -101,7 +101,7 @@ def trackers() -> tuple[Follower, ...]:
 
 
 @contextlib.contextmanager
-def network(described: Network, history: Sequence[Line]) -> Iterator[Followers]:
+def network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Followers]:
     """Yield the followers of a network that is trained in the block."""
     followers, trained = _current.get(), False
     for follower in followers:
@@ -115,7 +115,7 @@ def network(described: Network, history: Sequence[Line]) -> Iterator[Followers]:
 
 
 @contextlib.contextmanager
-def resumable(network: Network, epochs_trained: int) -> Iterator[None]:
+def resumable(network: TrainedNetwork, epochs_trained: int) -> Iterator[None]:
     """Have an interrupt of the epoch in the block stated with the epoch that the same command resumes from."""
     name = f" of {network.name}" if network.name else ""
     epoch = f"epoch {epochs_trained + 1} of {network.epochs}"
@@ -133,7 +133,7 @@ class _HistoryFile:
         self._labels: Mapping[str, Any] = {}
         self._failed = False
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         self._labels = network.labels
         if self._handle is None and not self._failed:
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -182,7 +182,7 @@ class Sender:
     def __init__(self, send: Callable[[Message], None]) -> None:
         self._send, self._sent_s = send, time.monotonic()
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Send which network is trained, and its epochs before an interruption."""
         self._send({"begin": {**asdict(network), "labels": dict(network.labels)}, "history": list(history)})
 
@@ -210,13 +210,13 @@ class Receiver:
 
     def __init__(self, followers: Sequence[Follower]) -> None:
         self._followers = followers
-        self._network: Network | None = None
+        self._network: TrainedNetwork | None = None
         self._epochs = 0  # epochs of the network that the followers have received
 
     def take(self, message: Message) -> None:
         """Call the followers with what a message holds."""
         if "begin" in message:
-            self._begin(Network(**message["begin"]), message["history"])
+            self._begin(TrainedNetwork(**message["begin"]), message["history"])
         elif "batch" in message:
             for follower in self._followers:
                 follower.batch(message["batch"], lambda: float(message["loss"]))
@@ -230,7 +230,7 @@ class Receiver:
         if self._network is not None:
             self._end(trained=False)
 
-    def _begin(self, network: Network, history: Sequence[Line]) -> None:
+    def _begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         if network == self._network:
             for line in history:
                 self._line(line, 0.0)

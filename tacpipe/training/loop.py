@@ -1,9 +1,9 @@
 """The training loop: Adam, clipped gradients, early stopping, and a checkpoint after every epoch.
 
-What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
-picked by index, so no loader stands between the data and the step. All randomness (initial weights, dropout, shuffles)
-comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
-gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
+What is learned comes as `TrainingWork`: its batches, its loss, and what is watched after each epoch. Batches are rows of
+tensors picked by index, so no loader stands between the data and the step. All randomness (initial weights, dropout,
+shuffles) comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and
+resumed gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tacpipe.io.files import readable_errors, sync_folder, write_whole
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.models.tensors import under
 from tacpipe.training import following
-from tacpipe.training.following import Followers, Network
+from tacpipe.training.following import Followers, TrainedNetwork
 from tacpipe.training.following import Line as Line
 from tacpipe.training.schedule import Schedule as Schedule
 
@@ -148,14 +148,14 @@ Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with th
 
 
 @dataclass(frozen=True)
-class Part:
+class WindowSet:
     """Training or validation windows: how many, and the mean loss of some."""
 
     count: int
     loss: Loss
 
 
-class Work(Protocol):
+class TrainingWork(Protocol):
     """Define a training: the batches of an epoch, the loss of each, and the validation after the epoch."""
 
     def batches(self, epoch: int) -> Sequence[Any]:
@@ -175,11 +175,11 @@ class Work(Protocol):
 
 
 @dataclass(frozen=True)
-class Windows:
+class WindowTraining:
     """The work of most models: training windows in another order every epoch, chosen by the validation loss."""
 
-    training: Part
-    validation: Part
+    training: WindowSet
+    validation: WindowSet
     batch: int
 
     def __post_init__(self) -> None:
@@ -225,7 +225,7 @@ class Trained:
 
 
 @dataclass
-class _Run:
+class _TrainingState:
     """Hold the state that an epoch changes; all of it is in the checkpoint."""
 
     model: nn.Module
@@ -265,7 +265,7 @@ class _Run:
 
 def train(
     build: Callable[[], nn.Module],
-    work: Work,
+    work: TrainingWork,
     schedule: Schedule,
     workspace: Path,
     *,
@@ -285,9 +285,9 @@ def train(
         torch.manual_seed(schedule.seed)
         model = build()
         learned = [weight for weight in model.parameters() if weight.requires_grad]
-        run = _Run(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [])
+        run = _TrainingState(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [])
         run.resume(workspace)
-        _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
+        _follow(run, work, schedule, workspace, TrainedNetwork(schedule.epochs, number, count, labels or {}))
     return Trained(
         {name: value.cpu() for name, value in run.best.items()},
         run.history,
@@ -295,7 +295,9 @@ def train(
     )
 
 
-def _follow(run: _Run, work: Work, schedule: Schedule, workspace: Path, network: Network) -> None:
+def _follow(
+    run: _TrainingState, work: TrainingWork, schedule: Schedule, workspace: Path, network: TrainedNetwork
+) -> None:
     """Train all epochs that are left, each reported to the followers."""
     random = torch.get_rng_state()
     with following.network(network, list(run.history)) as followers:
@@ -309,7 +311,7 @@ def _follow(run: _Run, work: Work, schedule: Schedule, workspace: Path, network:
                 followers.line(line, schedule.of_epoch(epochs_trained + 1))
 
 
-def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> Line:
+def _epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, followers: Followers) -> Line:
     """Train for one epoch, add its line to the history and return it."""
     run.model.train()
     epoch = len(run.history)

@@ -21,8 +21,8 @@ from tacpipe.traces import curves, paths, spans, taxels
 from tacpipe.traces import predictions as forecasts
 from tacpipe.traces.curves import TIME, Curves, described
 from tacpipe.traces.paths import Path
-from tacpipe.traces.predictions import Classification, Forecast
-from tacpipe.traces.spans import Event, Span
+from tacpipe.traces.predictions import Classification, DrawnForecast
+from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Contents:
+class DrawnContents:
     """The contents of a recording that are drawn."""
 
     name: str
@@ -71,11 +71,11 @@ class Contents:
     taxels: list[Taxels] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
     gaps: list[Span] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
+    events: list[FaultMark] = field(default_factory=list)
     paths: list[Path] = field(default_factory=list)
     clouds: list[Points] = field(default_factory=list)
     frames: list[Frames] = field(default_factory=list)
-    forecasts: list[Forecast] = field(default_factory=list)
+    forecasts: list[DrawnForecast] = field(default_factory=list)
     predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
     classification: Classification | None = None  # class that it predicted for the whole recording
 
@@ -117,7 +117,7 @@ class Contents:
 
 def of(
     recording: Recording, predictions: pa.Table | None = None, row: pa.Table | None = None, *, chain: StageChain = ()
-) -> Contents:
+) -> DrawnContents:
     """Return what is drawn of a recording.
 
     ``predictions`` is its table in a dataset of predictions or results, ``row`` its row where that has one each.
@@ -128,7 +128,7 @@ def of(
     return _split_contacts(contents, chain)
 
 
-def for_picture(recording: Recording, *, chain: StageChain = ()) -> Contents:
+def for_picture(recording: Recording, *, chain: StageChain = ()) -> DrawnContents:
     """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
 
     These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
@@ -154,7 +154,7 @@ def for_picture(recording: Recording, *, chain: StageChain = ()) -> Contents:
     return replace(contents, gaps=gaps)
 
 
-def _split_contacts(contents: Contents, chain: StageChain) -> Contents:
+def _split_contacts(contents: DrawnContents, chain: StageChain) -> DrawnContents:
     """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
     params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
     if not params or params[-1].get("begins") == "grasped" or not contents.taxels:
@@ -211,11 +211,11 @@ def _of_tables(
     tables: Mapping[str, pa.Table],
     predictions: pa.Table | None = None,
     row: pa.Table | None = None,
-) -> Contents:
+) -> DrawnContents:
     predicted = {} if row is None else _values(row)
     only_table = tables[""] if set(tables) == {""} else None
     if only_table is not None and TIME not in only_table.column_names:  # a split, or one row per recording
-        return Contents(name, attributes, {"": (only_table.num_rows, None)})
+        return DrawnContents(name, attributes, {"": (only_table.num_rows, None)})
     streams = split_tables(tables)
     truth = _truth(tables)
     touched = taxels.of_streams(streams)
@@ -232,7 +232,7 @@ def _of_tables(
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
     ahead = [] if predictions is None else forecasts.of_table(predictions, touched)
     ahead += forecasts.of_values(predicted, touched)
-    return Contents(
+    return DrawnContents(
         name,
         attributes,
         {stream: (table.num_rows, None if stream in clouds else rate_hz(table)) for stream, table in streams.items()},
@@ -303,7 +303,7 @@ def _frames(stream: str, table: pa.Table) -> list[Frames]:
 MOST = 40  # labels
 
 
-def to_markdown(contents: Contents) -> str:
+def to_markdown(contents: DrawnContents) -> str:
     """Return the labels, streams and events of a recording as Markdown."""
     lines = [f"# {plain(contents.name)}", "", f"{contents.duration_s:.3g} s", ""]
     labels = contents.labels

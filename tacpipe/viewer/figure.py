@@ -18,7 +18,7 @@ from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
 from tacpipe.traces.spans import CONTACT, PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
-from tacpipe.viewer.contents import Contents
+from tacpipe.viewer.contents import DrawnContents
 
 ENDINGS = (".png", ".svg", ".pdf")
 WIDTH_IN, DPI = 11.0, 110
@@ -39,7 +39,7 @@ class Panel(NamedTuple):
     names: tuple[str, ...]
 
 
-def panels(contents: Contents) -> list[Panel]:
+def panels(contents: DrawnContents) -> list[Panel]:
     """Return what is plotted over time, the touch of all fingers of one unit first, then the streams, at most ten."""
     found = []
     touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
@@ -53,7 +53,7 @@ def panels(contents: Contents) -> list[Panel]:
     return found + [Panel(curve.title, curve.t_ns, curve.values, curve.names) for curve in curves[:PANELS]]
 
 
-def draw(contents: Contents, path: Path) -> None:
+def draw(contents: DrawnContents, path: Path) -> None:
     """Write a picture of a recording to ``path``, whose ending is .png, .svg or .pdf.
 
     Raises `UsageError` for another ending and where there is nothing to draw, `TacpipeError` if matplotlib is not installed
@@ -75,7 +75,7 @@ def draw(contents: Contents, path: Path) -> None:
         write_whole(str(path), content.getvalue(), f"{path}.draft")
 
 
-def _over_time(contents: Contents, lines: Sequence[Panel]) -> Any:
+def _over_time(contents: DrawnContents, lines: Sequence[Panel]) -> Any:
     from matplotlib.figure import Figure
 
     start_ns, stop_ns = contents.ends_ns
@@ -109,7 +109,7 @@ def _over_time(contents: Contents, lines: Sequence[Panel]) -> Any:
     return figure
 
 
-def _title(contents: Contents) -> str:
+def _title(contents: DrawnContents) -> str:
     labels = [f"{name}: {value}" for name, value in contents.labels.items() if _is_label(name, value)]
     return " · ".join([plain(contents.name), *(plain(label) for label in labels[:5])])
 
@@ -119,7 +119,7 @@ def _is_label(name: str, value: object) -> bool:
     return isinstance(value, str | bool) and not name.startswith("grid") and name not in ("trial", "simulated")
 
 
-def _lanes(contents: Contents) -> dict[str, list[Span]]:
+def _lanes(contents: DrawnContents) -> dict[str, list[Span]]:
     lanes: dict[str, list[Span]] = {}
     for span in (*contents.spans, *merged(contents.gaps)):
         lanes.setdefault(span.lane, []).append(span)
@@ -195,7 +195,7 @@ def _image(axes: Any, finger: Taxels, start_ns: int, stop_ns: int) -> None:
     axes.set_ylabel("taxel")
 
 
-def _at_once(contents: Contents) -> Any:
+def _at_once(contents: DrawnContents) -> Any:
     """Draw maps of taxels of which there is one reading."""
     from matplotlib.figure import Figure
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer import stream
-from tacpipe.viewer.contents import Contents
+from tacpipe.viewer.contents import DrawnContents
 
 LANE, LEAST, MOST = 0.35, 1.1, 2.2  # height of the spans next to that of the touch, 3: a lane, and its limits
 MAPS_A_ROW = 3
 SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of a longer one
 
 
-def signature(contents: Contents) -> tuple[Any, ...]:
+def signature(contents: DrawnContents) -> tuple[Any, ...]:
     """Return what the layout depends on; recordings with the same one share it."""
     titles = (
         sorted(f"{curve.stream} {curve.title}" for curve in contents.curves),
@@ -34,7 +34,7 @@ def signature(contents: Contents) -> tuple[Any, ...]:
     return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), prediction)
 
 
-def blueprint(contents: Contents, *, with_list: bool = False) -> Any:
+def blueprint(contents: DrawnContents, *, with_list: bool = False) -> Any:
     """Return the layout of a recording's views as Rerun's blueprint."""
     import rerun.blueprint as rrb
 
@@ -53,7 +53,7 @@ def blueprint(contents: Contents, *, with_list: bool = False) -> Any:
     )
 
 
-def _playing(contents: Contents) -> Any:
+def _playing(contents: DrawnContents) -> Any:
     """Return the panel of time: a long recording plays the seconds around its largest touch, over and over."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -71,7 +71,7 @@ def _playing(contents: Contents) -> Any:
     )
 
 
-def loop_s(contents: Contents) -> tuple[float, float] | None:
+def loop_s(contents: DrawnContents) -> tuple[float, float] | None:
     """Return the part of a recording of more than 20 s that plays at first, seconds from its start; None for all."""
     touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     if contents.duration_s <= SHORT_S or not touched:
@@ -89,7 +89,7 @@ def _stacked(parts: list[tuple[Any, float]]) -> Any:
     return rrb.Vertical(*views, row_shares=list(shares)) if len(views) > 1 else views[0]
 
 
-def _times(contents: Contents) -> list[tuple[Any, float]]:
+def _times(contents: DrawnContents) -> list[tuple[Any, float]]:
     """Return the views with a time axis, with their heights."""
     import rerun.blueprint as rrb
 
@@ -114,7 +114,7 @@ def _times(contents: Contents) -> list[tuple[Any, float]]:
     return views
 
 
-def _tabs(contents: Contents) -> list[Any]:
+def _tabs(contents: DrawnContents) -> list[Any]:
     """Return a tab a stream, one of each finger's taxels, and that of the ground truth."""
     import rerun.blueprint as rrb
 
@@ -141,7 +141,7 @@ def _tabs(contents: Contents) -> list[Any]:
     return tabs
 
 
-def _space(contents: Contents) -> Any:
+def _space(contents: DrawnContents) -> Any:
     """Return the view of paths and clouds, seen from a side from which all of them are in sight."""
     import rerun.blueprint as rrb
 
@@ -161,7 +161,7 @@ def _space(contents: Contents) -> Any:
     return rrb.Spatial3DView(origin=stream.SPACE, name="Space (m)", eye_controls=eye)
 
 
-def _carpet(contents: Contents) -> Any:
+def _carpet(contents: DrawnContents) -> Any:
     import rerun.blueprint as rrb
 
     width, height = stream.carpet_size(contents)
@@ -169,7 +169,7 @@ def _carpet(contents: Contents) -> Any:
     return rrb.Spatial2DView(origin=stream.CARPET, name="All taxels over the recording", visual_bounds=bounds)
 
 
-def _moments(contents: Contents) -> list[tuple[Any, float]]:
+def _moments(contents: DrawnContents) -> list[tuple[Any, float]]:
     """Return the views of the moment at the cursor, with their heights."""
     import rerun.blueprint as rrb
 
@@ -188,7 +188,7 @@ def _moments(contents: Contents) -> list[tuple[Any, float]]:
     return views
 
 
-def _places(contents: Contents) -> tuple[Any, float]:
+def _places(contents: DrawnContents) -> tuple[Any, float]:
     """Return the tabs with what lies in space, cameras, and the recording's labels, with their height."""
     import rerun.blueprint as rrb
 
@@ -201,7 +201,7 @@ def _places(contents: Contents) -> tuple[Any, float]:
     return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
 
 
-def _map(name: str, finger: Taxels, contents: Contents) -> Any:
+def _map(name: str, finger: Taxels, contents: DrawnContents) -> Any:
     import rerun.blueprint as rrb
 
     x, y = stream.map_bounds(finger)
@@ -211,7 +211,7 @@ def _map(name: str, finger: Taxels, contents: Contents) -> Any:
     )
 
 
-def _maps(contents: Contents) -> list[tuple[str, Taxels]]:
+def _maps(contents: DrawnContents) -> list[tuple[str, Taxels]]:
     """Return the maps by name, of measured taxels and of what was predicted of them."""
     names = []
     for finger in contents.taxels:
@@ -221,13 +221,13 @@ def _maps(contents: Contents) -> list[tuple[str, Taxels]]:
     return names
 
 
-def _unit(contents: Contents) -> str:
+def _unit(contents: DrawnContents) -> str:
     """Return the unit of the taxels, empty where they have several."""
     units = {finger.unit for finger in contents.taxels}
     return units.pop() if len(units) == 1 else ""
 
 
-def _map_title(name: str, finger: Taxels, contents: Contents) -> str:
+def _map_title(name: str, finger: Taxels, contents: DrawnContents) -> str:
     """Return the title of a map, short enough for three of them in a row."""
     steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
     if not steps or name == finger.name:

@@ -21,7 +21,7 @@ from threading import Thread
 from urllib.parse import quote
 
 from tacpipe.errors import TacpipeError
-from tacpipe.viewer.contents import Contents
+from tacpipe.viewer.contents import DrawnContents
 
 NAME = "tacpipe"
 ENDING = ".rrd"
@@ -29,7 +29,7 @@ UNSAFE = r"[/\\:\x00]"  # characters that no file name may have
 
 
 def write(
-    recordings: Iterable[Contents], folder: Path, dataset: str, *, with_list: bool = True, all_rows: bool = False
+    recordings: Iterable[DrawnContents], folder: Path, dataset: str, *, with_list: bool = True, all_rows: bool = False
 ) -> list[Path]:
     """Write a file of Rerun's for each recording and return the files; the viewer lists them by name below ``dataset``.
 
@@ -49,7 +49,7 @@ def write(
         recording.save(paths[-1])
         recording.send_recording_name(contents.name)
         recording.send_blueprint(layout.blueprint(contents, with_list=with_list))
-        stream.Stream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
+        stream.RerunStream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
         recording.disconnect()  # writes what is left
     return paths
 

@@ -15,10 +15,10 @@ from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
 from tacpipe.traces.curves import Curves
 from tacpipe.traces.paths import Path
-from tacpipe.traces.predictions import Classification, Forecast
+from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
-from tacpipe.viewer.contents import Contents, Frames, Points, to_markdown
+from tacpipe.viewer.contents import DrawnContents, Frames, Points, to_markdown
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -41,13 +41,13 @@ EVENT_WIDTH = 1 / 200  # drawn length of an event, as a fraction of the recordin
 RAMP = 24  # steps of a colour scale
 
 
-class Stream:
+class RerunStream:
     """Writes one recording's contents to a stream of Rerun's; times count from ``start_ns``."""
 
     def __init__(self, recording: rr.RecordingStream, start_ns: int, *, all_rows: bool = False) -> None:
         self._recording, self._start_ns, self._all_rows = recording, start_ns, all_rows
 
-    def send(self, contents: Contents) -> None:
+    def send(self, contents: DrawnContents) -> None:
         """Write everything that is drawn of a recording."""
         for place, finger in enumerate(contents.taxels):
             self._touch(finger, place)
@@ -168,7 +168,7 @@ class Stream:
         self._static((*parts, "ramp"), boxes)
         self._static((*parts, "ends"), text)
 
-    def _forecasts(self, forecasts: Sequence[Forecast]) -> None:
+    def _forecasts(self, forecasts: Sequence[DrawnForecast]) -> None:
         """Write measured and predicted load of each finger, the errors, and the maps of the farthest step."""
         for name in dict.fromkeys(member.measured.name for member in forecasts):
             steps = [member for member in forecasts if member.measured.name == name]
@@ -184,7 +184,7 @@ class Stream:
             low, high = taxels.scale(last.residual.magnitude)  # one of its own, or small errors are not seen
             self._map((MAPS, residual), last.residual, low, high, max(high, taxels.LEAST))
 
-    def _errors(self, name: str, steps: Sequence[Forecast]) -> None:
+    def _errors(self, name: str, steps: Sequence[DrawnForecast]) -> None:
         """Write the load of a finger as measured and as predicted at each step, and the errors."""
         measured_line, last = [("measured", drawing.MEASURED)], steps[-1].measured
         self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
@@ -196,7 +196,7 @@ class Stream:
             )
             self._lines((ERROR, *parts), forecast.predicted.t_ns, forecast.error[:, None], names_and_colours)
 
-    def _carpet(self, contents: Contents) -> None:
+    def _carpet(self, contents: DrawnContents) -> None:
         """Write all taxels over the whole recording as one image, and a line in it at the cursor."""
         rr = _rerun()
         fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
@@ -223,7 +223,7 @@ class Stream:
         self._static((CARPET, "cursor"), rr.LineStrips2D.from_fields(colors=[(255, 255, 255)], radii=1.0))
         self._columns((CARPET, "cursor"), cursor_ns, rr.LineStrips2D.columns(strips=list(strips)))
 
-    def _spans(self, contents: Contents) -> None:
+    def _spans(self, contents: DrawnContents) -> None:
         start_ns, stop_ns = contents.ends_ns
         width_ns = int((stop_ns - start_ns) * EVENT_WIDTH)
         happened = [
@@ -333,7 +333,7 @@ def map_name(name: str, compared: str, step: int) -> str:
     return f"{name} {compared} t+{step}" if step else f"{name} {compared}"
 
 
-def carpet_size(contents: Contents) -> tuple[int, int]:
+def carpet_size(contents: DrawnContents) -> tuple[int, int]:
     """Return width and height of the carpet in pixels: wide, whatever the number of taxels."""
     fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     rows = sum(len(finger.names) for finger in fingers) + max(len(fingers) - 1, 0)  # one row between two fingers

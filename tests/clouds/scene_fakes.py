@@ -9,11 +9,11 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.clouds.segmentation import Limits
+from tacpipe.clouds.segmentation import SegmentationLimits
 
 STEP = 0.003  # Spacing of the rays, as tangents: 3.3 mm on the table
 DEPTH_M = 1.1  # Depth of the table's middle
-LIMITS = Limits(
+LIMITS = SegmentationLimits(
     plane_m=0.006,
     plane_fraction=0.2,
     plane_trials=1000,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
 from tacpipe.metrics.pairing import Measure
 
 QUESTION = Question("known")
@@ -43,8 +43,10 @@ def run(
     clusters: Mapping[str, str] | None = None,
     question: Question = QUESTION,
     **about: Any,
-) -> Run:
+) -> ComparedRun:
     """A run of predictors with these errors by recording."""
-    measured = Errors(MEAN, {name: sums(values) for name, values in errors.items()}, clusters)
+    measured = PredictorErrors(MEAN, {name: sums(values) for name, values in errors.items()}, clusters)
     settings = about.pop("settings", {})
-    return Run(about.pop("dataset", None), "weighing", method, settings, {question: measured}, seed=seed, **about)
+    return ComparedRun(
+        about.pop("dataset", None), "weighing", method, settings, {question: measured}, seed=seed, **about
+    )

@@ -16,7 +16,7 @@ import pytest
 from tacpipe.cli import compare
 from tacpipe.cli.compare import Compared
 from tacpipe.comparison import engine, runs
-from tacpipe.comparison.runs import Question, Run
+from tacpipe.comparison.runs import ComparedRun, Question
 from tacpipe.comparison.specification import report_on
 from tacpipe.engine import pipeline
 from tacpipe.metrics import headline
@@ -32,11 +32,11 @@ def dataset(data: str = "d" * 64) -> Any:
     return SimpleNamespace(source=SimpleNamespace(inputs={"datasets": [{"dataset": data, "manifest": data}]}))
 
 
-def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, Run]:
+def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, ComparedRun]:
     return path, run({"model": errors, "mean": BASE}, dataset=dataset(data), **about)
 
 
-def compared(*named_results: tuple[str, Run], pool: bool = True) -> Compared:
+def compared(*named_results: tuple[str, ComparedRun], pool: bool = True) -> Compared:
     task, all_runs = report_on("weighing"), [result for _, result in named_results]
     methods = runs.grouped(all_runs) if pool else runs.separate(all_runs)
     return Compared({path: result.dataset for path, result in named_results}, engine.comparisons(task, methods), pool)
@@ -160,7 +160,7 @@ def test_a_result_without_errors_of_recordings_is_left_out_by_name(
 def test_errors_in_other_units_are_other_comparisons_with_their_own_unit() -> None:
     """The runs share method, settings and question, and one of them has ten times the error in another unit."""
 
-    def in_millinewton(path: str, errors: list[float]) -> tuple[str, Run]:
+    def in_millinewton(path: str, errors: list[float]) -> tuple[str, ComparedRun]:
         place, newton = weighed(errors, path)
         question, of_question = next(iter(newton.questions.items()))
         measure = dataclasses.replace(of_question.measure, unit="mN")

@@ -9,13 +9,13 @@ import pytest
 from scipy import stats
 
 from tacpipe.comparison.engine import observations, paired_runs
-from tacpipe.comparison.runs import Run
+from tacpipe.comparison.runs import ComparedRun
 from tests.comparison.comparison_fakes import QUESTION, run
 
 ONE, OTHER = np.array([1.0, 2.0, 4.0]), np.array([2.0, 5.0, 6.0])
 
 
-def runs(*means: float, **about: list[int]) -> list[Run]:
+def runs(*means: float, **about: list[int]) -> list[ComparedRun]:
     """A run of two recordings a mean error."""
     return [
         run({"model": [mean - 0.5, mean + 0.5]}, **{name: values[place] for name, values in about.items()})  # type: ignore[arg-type]

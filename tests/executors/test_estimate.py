@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import grid
-from tacpipe.training.following import Network
+from tacpipe.training.following import TrainedNetwork
 from tests.conftest import Lab
 
 TRAIN = "train forward data/segments --split data/split --hidden 8 --epochs 2"
@@ -18,7 +18,7 @@ def test_what_is_left_of_all_networks_is_added_up(monkeypatch: pytest.MonkeyPatc
     clock = iter([0.0, 10.0, 11.0, 13.0, 15.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     stopwatch = grid._Stopwatch()
-    stopwatch.begin(Network(epochs=20, number=2, count=3), [{}] * 5)
+    stopwatch.begin(TrainedNetwork(epochs=20, number=2, count=3), [{}] * 5)
     stopwatch.batch(0.1, lambda: 0.0)  # the first one is not counted
     stopwatch.batch(0.2, lambda: 0.0)
     with pytest.raises(grid._TimedError):

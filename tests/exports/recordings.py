@@ -110,7 +110,7 @@ def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -
         }
         recordings[name] = {"attributes": dict(sorted(attributes.items())), "shards": shards}
     output = Manifest(ACQUIRE, 1, {}, recordings=recordings)
-    directory.change(store, folder, lambda: directory.Change(output))
+    directory.change(store, folder, lambda: directory.DirectoryChange(output))
     return folder
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.formats.containers.container import EpisodeContents, SourceStream, Time
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Fake:
     def episodes(self) -> Sequence[str]:
         return list(self._content().get("episodes", {}))
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         return self.read(None, episode)
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         content = self._content()
         streams = content["streams"] if episode is None else content["episodes"][episode]
-        return Contents(
+        return EpisodeContents(
             [_stream(name, value) for name, value in streams.items() if sources is None or name in sources],
             {"robot": content.get("robot", "panda")},
             content.get("skipped", {}),

@@ -14,11 +14,11 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Kind
 from tacpipe.formats.table import contained, layout, recordings
-from tacpipe.formats.table.contained import Command, Params
+from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats import fake_container
 
-COMMAND = Command("xdf")
+COMMAND = ContainerCommand("xdf")
 NONE = Params()
 
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tacpipe.datasets import paths, recording_names
 from tacpipe.engine import computing
-from tacpipe.engine.keys import Done, Task
+from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import UsageError
 from tacpipe.formats.published import PREFIX, trials, valid
 from tacpipe.io import files, regular
@@ -261,7 +261,7 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
     real, compute = regular.opened, computing.compute
     hashed: list[bool] = []
 
-    def counted(task: Task) -> Done:
+    def counted(task: WorkerTask) -> Done:
         hashed.append(True)
         return compute(task)
 

@@ -9,13 +9,13 @@ import math
 import pytest
 
 from tacpipe.metrics import headline
-from tacpipe.metrics.headline import Headline, Row
+from tacpipe.metrics.headline import Headline, HeadlineRow
 from tests.test_headline import ONE
 
 
 def headline_of_part(gain: float, part: str = "", target: str = "", error: float = 7.5) -> Headline:
     return dataclasses.replace(
-        ONE, gain=gain, low=gain - 0.1, high=gain + 0.1, part=part, target=target, model=Row("net", (error,))
+        ONE, gain=gain, low=gain - 0.1, high=gain + 0.1, part=part, target=target, model=HeadlineRow("net", (error,))
     )
 
 

@@ -23,8 +23,8 @@ from tacpipe.links.link import Link, LinkLostError, parse
 from tacpipe.links.opening import open_link
 from tacpipe.links.probing import recognise
 from tacpipe.recording import recorder, rig
-from tacpipe.recording.reading import Reading
-from tacpipe.recording.spool import Note
+from tacpipe.recording.reading import LinkReader
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import Station
 from tacpipe.sensors import lsl
 from tacpipe.sensors.framing import Chunks
@@ -105,7 +105,7 @@ def test_every_sample_that_was_sent_comes_with_its_stamp_and_the_correction_of_l
             with pytest.raises(LinkLostError, match="wrist"):
                 while True:
                     packets += link.read(0.1)
-    samples = Reading(build_lsl(FORCE)).feed(Chunks.of(packets))
+    samples = LinkReader(build_lsl(FORCE)).feed(Chunks.of(packets))
     forces, corrections = samples.values
     assert forces.tolist() == [[row, 2 * row, 3 * row] for row in range(sent)]
     assert samples.t_device_ns is not None and (np.diff(samples.t_device_ns) > 0).all()
@@ -127,7 +127,7 @@ def test_markers_are_events_as_text() -> None:
         packets = read_until(link, lambda received: len(received) > 5)
     (options,) = lsl.options(Chunks.of(packets))
     sensor = build_lsl(options)
-    (texts, _) = Reading(sensor).feed(Chunks.of(packets)).values
+    (texts, _) = LinkReader(sensor).feed(Chunks.of(packets)).values
     assert texts[:, 0].tolist() == [f"trial {row} ✓" for row in range(len(texts))] and len(texts)
     assert next((field.name, field.type) for field in sensor.fields()) == ("event", pa.string())
 
@@ -152,11 +152,15 @@ def test_an_outlet_that_ended_is_opened_anew_when_it_is_back() -> None:
         blocks: list[Any] = []
         _collect_until(station, blocks, lambda: _samples(blocks) > 20)
         stop_outlet(process)
-    _collect_until(station, blocks, lambda: any(isinstance(block, Note) and block.what == "lost" for block in blocks))
+    _collect_until(
+        station, blocks, lambda: any(isinstance(block, StreamNote) and block.what == "lost" for block in blocks)
+    )
     with outlet("force", name, first=1_000_000):
         _collect_until(station, blocks, lambda: any(_values(blocks) >= 1_000_000))
     station.stop()
-    assert [block.what for block in blocks if isinstance(block, Note) and block.what in ("opened", "lost")][:3] == [
+    assert [block.what for block in blocks if isinstance(block, StreamNote) and block.what in ("opened", "lost")][
+        :3
+    ] == [
         "opened",
         "lost",
         "opened",

@@ -17,7 +17,7 @@ import pytest
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import ports
-from tacpipe.sensors.sensor import Line, Sensor
+from tacpipe.sensors.sensor import Sensor, SerialLine
 from tests.links.peers import Quiet, open_address
 
 HOLDER = """
@@ -56,7 +56,7 @@ def test_any_rate_of_baud_can_be_set(baud: int, terminal: tuple[int, str]) -> No
 
 def test_control_lines_that_a_terminal_does_not_have_do_no_harm(terminal: tuple[int, str]) -> None:
     class Wired(Quiet):
-        line = Line(dtr=True, rts=False)
+        line = SerialLine(dtr=True, rts=False)
 
     link = open_address(f"serial:{terminal[1]}", Wired())
     link.write(b"ok")
@@ -68,7 +68,7 @@ def test_what_comes_while_a_device_boots_is_thrown_away(
     terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Booting(Quiet):
-        line = Line(settle_s=1.5)
+        line = SerialLine(settle_s=1.5)
 
     slept = []
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.live import publishing
 from tacpipe.tasks.forward.live.alarms import State
-from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 
 SOON_S = 120.0
@@ -20,8 +20,8 @@ COUNT = 5
 def forecast() -> tuple[Any, list[Any]]:
     values = np.array([[1.5, -2.25], [3.0, 1e-3]], np.float32)
     alarms = {"load": State(0, 0.5), "slip": State(1, 2.0)}
-    messages = [Message(seq, seq, values + seq if seq % 2 else None, alarms=alarms) for seq in range(COUNT)]
-    return Description(("a", "b"), (1, 2), "count", 50.0, "models/forward"), messages
+    messages = [ForecastMessage(seq, seq, values + seq if seq % 2 else None, alarms=alarms) for seq in range(COUNT)]
+    return ForecastDescription(("a", "b"), (1, 2), "count", 50.0, "models/forward"), messages
 
 
 def material() -> tuple[Any, list[Any]]:

@@ -26,7 +26,7 @@ from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs
 from tacpipe.tasks.forward.alarms import axes
 from tacpipe.tasks.forward.live.alarms import Alarms
-from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
+from tacpipe.tasks.forward.live.chain import Beginning, Cause, GridForecast
 from tacpipe.tasks.forward.live.engine import ForecastEngine
 from tacpipe.tasks.forward.live.task import ForwardSettings
 
@@ -74,7 +74,7 @@ class Persistence:
             since_ns = int(t_ns[0]) - self.beginning.origin_ns
             self._next_ns = self.beginning.origin_ns + -(-since_ns // PERIOD_NS) * PERIOD_NS
 
-    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return a forecast for each grid point, on request for the newest alone."""
         forecasts = []
         self._passed_ns = max(self._passed_ns, t_ns)
@@ -88,15 +88,15 @@ class Persistence:
             ]
         return forecasts
 
-    def _at(self, point_ns: int) -> Forecast:
+    def _at(self, point_ns: int) -> GridForecast:
         while len(self._samples) > 1 and self._samples[1][0] <= point_ns:
             self._samples.pop(0)
         at_ns, now = self._samples[0]
         if point_ns - at_ns > GAP_NS:
-            return Forecast(point_ns, at_ns, None, now, Cause.GAP, ("skin",))
+            return GridForecast(point_ns, at_ns, None, now, Cause.GAP, ("skin",))
         ahead = np.repeat(now[None], HORIZON, axis=0)
         band = ahead[..., None] + self.quantiles - 50 if len(self.quantiles) else None
-        return Forecast(point_ns, at_ns, ahead, now, Cause.NONE, quantiles=band)
+        return GridForecast(point_ns, at_ns, ahead, now, Cause.NONE, quantiles=band)
 
 
 def model_of(task: str, **config: Any) -> LiveModel:

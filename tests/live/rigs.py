@@ -16,7 +16,7 @@ from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
-from tacpipe.tasks.forward.live.chain import Chain, Forecast
+from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 from tests.stage_params import fitting
 
@@ -99,14 +99,14 @@ def model(
     return (forward_calibration.calibrate(files, ASKED, parts[0], parts[2]) if calibrated else files), steps
 
 
-def chain(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> Chain:
+def chain(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> LiveChain:
     """The chain of a model, for the streams of a recording."""
-    return Chain.for_model(
+    return LiveChain.for_model(
         *files_and_steps, {name: table.schema for name, table in recording.tables.items()}, quantiles=quantiles
     )
 
 
-def all_forecasts(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> list[Forecast]:
+def all_forecasts(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> list[GridForecast]:
     """The forecasts of a recording that is given whole."""
     fed = chain(files_and_steps, recording, quantiles)
     for name, table in recording.tables.items():

@@ -15,7 +15,7 @@ from tacpipe.tasks.forward.alarms import Loads, axes
 from tacpipe.tasks.forward.headline import MODEL
 from tacpipe.tasks.forward.live import alarms
 from tacpipe.tasks.forward.live.alarms import LOAD, NAMES, SLIP, Alarms
-from tacpipe.tasks.forward.slips import Rows, SlipAlarms
+from tacpipe.tasks.forward.slips import SlipAlarms, SlipRows
 
 LAYOUT = [{"stream": "skin", "axis": axis, "taxel": str(taxel)} for taxel in (1, 2) for axis in "xyz"]
 HORIZON, RATE_HZ = 10, 50.0
@@ -61,7 +61,7 @@ def added(truth: Floats, ahead: Floats, slips: Bools | None, shear: Floats | Non
     loads = Loads(LAYOUT, HORIZON, [truth], [np.zeros(len(truth), np.int64)], {MODEL: [ahead]}, [1 / RATE_HZ])
     t_ns = np.arange(len(truth), dtype=np.int64) * round(1e9 / RATE_HZ)
     scores = {} if shear is None else {MODEL: shear}
-    return loads, SlipAlarms(LAYOUT, np.array(FLOORS), HORIZON, [Rows(t_ns, slips, scores)])
+    return loads, SlipAlarms(LAYOUT, np.array(FLOORS), HORIZON, [SlipRows(t_ns, slips, scores)])
 
 
 def steady(seed: int, rows: int = 20_000) -> tuple[Floats, Floats]:

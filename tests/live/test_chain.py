@@ -21,7 +21,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
+from tacpipe.tasks.forward.live.chain import BLOCKING, Beginning, Cause, GridForecast, LiveChain
 from tacpipe.tasks.forward.predictors import forecasts
 from tests.fake_recordings import FakeRecording, dataset
 from tests.live import rigs
@@ -58,10 +58,10 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
     }
 
 
-def same(forecasts: Sequence[Forecast], expected: Sequence[Forecast]) -> bool:
+def same(forecasts: Sequence[GridForecast], expected: Sequence[GridForecast]) -> bool:
     """Return whether forecasts are equal to the last bit."""
 
-    def content(forecast: Forecast) -> tuple[Any, ...]:
+    def content(forecast: GridForecast) -> tuple[Any, ...]:
         arrays = (
             None if values is None else values.tobytes()
             for values in (forecast.count, forecast.now, forecast.quantiles)
@@ -217,7 +217,7 @@ def test_samples_that_come_after_their_grid_point_are_counted_and_read_from_then
 def test_a_plan_is_read_from_its_arrival_and_replaces_the_plan_before(models: dict[str, Made]) -> None:
     at_ns = T0 + 1000 * MS
 
-    def forecasts_with(plans: Sequence[tuple[int, float]]) -> dict[int, Forecast]:
+    def forecasts_with(plans: Sequence[tuple[int, float]]) -> dict[int, GridForecast]:
         fed = rigs.chain(models["planned"], GIVEN)
         for name, table in GIVEN.tables.items():
             fed.push(name, table)
@@ -302,7 +302,7 @@ def test_a_rig_of_other_streams_than_the_models_is_refused_by_the_name_of_what_d
 ) -> None:
     streams = change({name: table.schema for name, table in GIVEN.tables.items()})
     with pytest.raises(TacpipeError, match=pattern):
-        Chain.for_model(*models["planned"], streams)
+        LiveChain.for_model(*models["planned"], streams)
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_a_model_behind_stages_that_look_ahead_is_refused_by_their_name(
     models: dict[str, Made], steps: Any, pattern: str
 ) -> None:
     with pytest.raises(TacpipeError, match=pattern):
-        Chain.for_model(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
+        LiveChain.for_model(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
 
 
 def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_path: Path) -> None:
@@ -327,17 +327,17 @@ def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_p
     look_ahead = json.loads(interpolated[0]["config.json"])["look_ahead"]
     assert 0 < look_ahead["mean_ms"] < look_ahead["max_ms"]
     with pytest.raises(TacpipeError, match=f"at most {look_ahead['max_ms']:g} ms.*--allow-look-ahead"):
-        Chain.for_model(*interpolated, schemas)
-    assert Chain.for_model(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
+        LiveChain.for_model(*interpolated, schemas)
+    assert LiveChain.for_model(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
     older = json.loads(interpolated[0]["config.json"])
     del older["look_ahead"]
     step = {"stage": "synchronize", "version": 2, "params": {"grid": "logged", "rate_hz": 50.0}, "fitted": None}
     files = {**interpolated[0], "config.json": json.dumps(older).encode()}
     contacts = rigs.step("segment.contacts")
     with pytest.raises(TacpipeError, match="interpolated"):
-        Chain.for_model(files, [step, contacts], schemas)
+        LiveChain.for_model(files, [step, contacts], schemas)
     causal_step = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
-    assert Chain.for_model(files, [causal_step, contacts], schemas).streams
+    assert LiveChain.for_model(files, [causal_step, contacts], schemas).streams
 
 
 @pytest.mark.parametrize("kind", ["raw", "latents", "logged"])
@@ -353,7 +353,7 @@ def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_cont
     assert first.beginning is None
     first.advance(half_ns)
     schemas = {name: table.schema for name, table in calm.tables.items()}
-    second = Chain.for_model(*models[kind], schemas, beginning=first.beginning)
+    second = LiveChain.for_model(*models[kind], schemas, beginning=first.beginning)
     for name, table in calm.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
     forecasts = [forecast for forecast in second.advance(T0 + 2900 * MS) if forecast.count is not None]
@@ -375,7 +375,7 @@ def test_counts_that_had_run_over_their_end_are_continued_at_the_turn_that_is_ne
     beginning = first.beginning
     assert beginning is not None
     assert Beginning.from_json(json.loads(json.dumps(beginning.to_json()))) == beginning
-    second = Chain.for_model(*models["raw"], schemas, beginning=beginning)
+    second = LiveChain.for_model(*models["raw"], schemas, beginning=beginning)
     for name, table in recording.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
     forecasts = [forecast for forecast in second.advance(T0 + 2900 * MS) if forecast.count is not None]

@@ -10,7 +10,7 @@ import pytest
 
 from tacpipe.live.websocket import WebsocketPublisher
 from tacpipe.tasks.forward.live.alarms import State
-from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 from tests.live.test_publishers import free_port
 from tests.recording.live import ROOT, awaited
 
@@ -31,12 +31,14 @@ def test_the_client_is_short() -> None:
 def test_the_client_reports_a_slip_that_is_predicted(tmp_path: Path) -> None:
     (tmp_path / "client.py").write_text(client().replace("SILENT_S = 0.04", "SILENT_S = 60"))
     port = free_port()
-    publisher = WebsocketPublisher(f"127.0.0.1:{port}", Description(("a", "b"), (1, 2, 3), "count", 50.0, "model"))
+    publisher = WebsocketPublisher(
+        f"127.0.0.1:{port}", ForecastDescription(("a", "b"), (1, 2, 3), "count", 50.0, "model")
+    )
     words = [sys.executable, "client.py", f"ws://127.0.0.1:{port}", "4"]
     with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
         awaited(lambda: publisher.subscribers == 1)
         for seq, (state, cause) in enumerate([(0, ""), (1, ""), (1, ""), (-1, "nothing new comes from xela1")]):
-            publisher.publish(Message(seq, seq, None, cause, alarms={"slip": State(state, 0.5)}))
+            publisher.publish(ForecastMessage(seq, seq, None, cause, alarms={"slip": State(state, 0.5)}))
         out, _ = process.communicate(timeout=600)
     publisher.close()
     first, *changes = out.splitlines()

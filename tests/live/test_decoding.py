@@ -7,7 +7,7 @@ import pytest
 
 from tacpipe.live.decoding import Decoder
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tests.sensors import made
@@ -44,5 +44,5 @@ def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
 
 def test_a_row_waits_for_what_a_lost_link_leaves() -> None:
     decoder, _ = decoder_and_packets("xela")
-    decoder.take(Note(ROW_NS + 1, "stream", LOST))
+    decoder.take(StreamNote(ROW_NS + 1, "stream", LOST))
     assert decoder.may_hold(ROW_NS)

@@ -10,14 +10,14 @@ import pytest
 
 from tacpipe.live import wire
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward.live.alarms import Alarms
 from tacpipe.tasks.forward.live.chain import Cause
 from tacpipe.tasks.forward.live.engine import EARLY_NS, ForecastEngine
-from tacpipe.tasks.forward.live.messages import Message
+from tacpipe.tasks.forward.live.messages import ForecastMessage
 from tests.live.persistent import CHANNELS, HORIZON, PERIOD_NS, Persistence
 from tests.sensors import made
 
@@ -41,14 +41,14 @@ class Session:
 
     def begin(self) -> None:
         """Begin a recording."""
-        self.engine.take("", Note(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
-        self.engine.take("skin", Note(START_NS, "skin", BEGAN))
+        self.engine.take("", StreamNote(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
+        self.engine.take("skin", StreamNote(START_NS, "skin", BEGAN))
 
     def send(self, first: int, last: int) -> None:
         """Have frames arrive, one each period after the start."""
         self.engine.take("skin", Chunks.of([(START_NS + n * PERIOD_NS, self.packets[n]) for n in range(first, last)]))
 
-    def at(self, periods: float) -> list[Message]:
+    def at(self, periods: float) -> list[ForecastMessage]:
         """Return what is published so long after the start, once what belongs to it has settled."""
         return self.engine.step(START_NS + round(periods * PERIOD_NS) + SETTLE_NS)
 
@@ -109,7 +109,7 @@ def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> 
 @pytest.mark.parametrize("cut", [1, 3, 7, 50])
 def test_how_the_bytes_were_cut_changes_no_forecast(cut: int) -> None:
     whole, cut_session = Session(), Session()
-    published: list[list[Message]] = []
+    published: list[list[ForecastMessage]] = []
     for running, size in ((whole, 1), (cut_session, cut)):
         running.begin()
         messages = []
@@ -157,7 +157,7 @@ def test_where_no_row_can_be_made_at_all_that_is_reported_with_the_silent_stream
 def test_a_link_that_is_lost_and_back_goes_on_without_a_new_session(session: Session) -> None:
     session.send(0, 5)
     session.at(4)
-    session.engine.take("skin", Note(START_NS + 5 * PERIOD_NS, "skin", LOST, "unplugged"))
+    session.engine.take("skin", StreamNote(START_NS + 5 * PERIOD_NS, "skin", LOST, "unplugged"))
     session.at(12)
     session.send(20, 21)
     (message,) = session.at(20)
@@ -168,7 +168,7 @@ def test_after_blocks_were_thrown_away_a_new_chain_begins_and_the_cause_is_repor
     session.send(0, 5)
     session.at(4)
     before = session.engine.chain
-    session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
+    session.engine.take("", StreamNote(START_NS, "", wire.OVERFLOW))
     assert session.engine.chain is not before and session.engine.overflows == 1
     messages = [message for periods in range(5, 10) for message in session.at(periods)]
     assert messages and "overload" in messages[0].cause and messages[0].values is None
@@ -203,7 +203,7 @@ def test_bytes_that_are_no_frame_cost_no_forecast(session: Session) -> None:
 def test_after_the_recording_nothing_is_predicted_until_the_next_one_begins(session: Session) -> None:
     session.send(0, 1)
     assert len(session.at(0)) == 1
-    session.engine.take("", Note(START_NS + PERIOD_NS, "", wire.END))
+    session.engine.take("", StreamNote(START_NS + PERIOD_NS, "", wire.END))
     session.send(1, 3)
     assert session.at(3) == []
     session.begin()
@@ -216,10 +216,10 @@ def test_after_blocks_were_thrown_away_and_after_a_process_that_ended_the_grid_i
     session.at(4)
     beginning = session.engine.chain.beginning
     assert beginning is not None and beginning.origin_ns == START_NS + OFFSET_NS
-    session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
+    session.engine.take("", StreamNote(START_NS, "", wire.OVERFLOW))
     assert session.engine.chain.beginning == beginning
     restarted = Session()
-    restarted.engine.take("", Note(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
+    restarted.engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
     restarted.begin()
     late = START_NS + 7 * PERIOD_NS + PERIOD_NS // 3
     restarted.engine.take("skin", Chunks.of([(late, restarted.packets[7])]))

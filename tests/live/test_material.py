@@ -17,12 +17,12 @@ from tacpipe.live.settings import Settings
 from tacpipe.metrics import calibration
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
-from tacpipe.simulation.slide import Rig, simulate_trial
+from tacpipe.simulation.slide import SlideRig, simulate_trial
 from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import sensor_calibration
@@ -47,7 +47,7 @@ SLIDE_COLUMNS = ["class", "rows", "seen", "ended", "slide"]
 EVERY_NS = 100_000_000
 SETTLE_NS = 2_000_000
 OFFSET_NS = 10**18
-RIG = Rig(materials=3, pac=False, arm_every=0)
+RIG = SlideRig(materials=3, pac=False, arm_every=0)
 TRAINED, UNSEEN = range(3), 3
 KINDS: dict[str, dict[str, Any]] = {
     "statistics": {"architecture": "statistics"},
@@ -105,8 +105,8 @@ class Session:
 
     def begin(self) -> None:
         """Begin the recording."""
-        self.engine.take("", Note(0, "", wire.BEGIN, str(OFFSET_NS)))
-        self.engine.take("finger", Note(0, "finger", BEGAN))
+        self.engine.take("", StreamNote(0, "", wire.BEGIN, str(OFFSET_NS)))
+        self.engine.take("finger", StreamNote(0, "finger", BEGAN))
 
     def run(self, until_ns: int, cut: int = 7) -> list[MaterialMessage]:
         """Have all arrive up to a time, some at once, and return what is published meanwhile."""
@@ -121,8 +121,8 @@ class Session:
 
     def end(self) -> MaterialMessage:
         """End the recording and return the last message."""
-        self.engine.take("", Note(0, "", wire.END))
-        self.engine.take("finger", Note(0, "finger", OVER))
+        self.engine.take("", StreamNote(0, "", wire.END))
+        self.engine.take("finger", StreamNote(0, "finger", OVER))
         return self.engine.step(int(self.t_ns[-1]) + 10**9)[-1]
 
 
@@ -312,12 +312,12 @@ def test_a_pause_is_refused_where_only_an_arm_could_end_a_slide(models: dict[str
 
 def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dict[str, Opened]) -> None:
     session = Session(models["statistics"])
-    session.engine.take("", Note(0, "", wire.CONTINUE, "{}"))
+    session.engine.take("", StreamNote(0, "", wire.CONTINUE, "{}"))
     session.begin()
     messages = session.run(int(session.t_ns[300]))
     assert messages and {message.cause for message in messages} == {RESTARTED}
     session.begin()
-    session.engine.take("", Note(0, "", wire.OVERFLOW))
+    session.engine.take("", StreamNote(0, "", wire.OVERFLOW))
     assert {message.cause for message in session.run(int(session.t_ns[400]))} == {THROWN}
     next_session = Session(models["statistics"])
     next_session.begin()
@@ -360,7 +360,7 @@ def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: 
 
 
 def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -> None:
-    rig = Rig(materials=2, pac=False, arm_every=0)
+    rig = SlideRig(materials=2, pac=False, arm_every=0)
     parts = [
         slides(rig, indices(rig, ["biotac", "roboskin"], chosen_trials), frames=FRAMES)
         for chosen_trials in (range(2), [2])

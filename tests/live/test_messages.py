@@ -16,15 +16,17 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import LATENCIES, Live
 from tacpipe.sensors.plan import Plan, is_plan, packet
 from tacpipe.tasks.forward.live.alarms import State
-from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 
 VALUES = np.random.default_rng(0).normal(0, 1000, (3, 5)).astype(np.float32)
 CHANNELS = tuple(f"c{number}" for number in range(5))
 
 
-def message(values: Float32s | None = VALUES) -> Message:
+def message(values: Float32s | None = VALUES) -> ForecastMessage:
     states = {"load": State(1, 2.5), "slip": State(-1, math.nan)}
-    return Message(7, 10**18, values, "why", 4, states, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1)
+    return ForecastMessage(
+        7, 10**18, values, "why", 4, states, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1
+    )
 
 
 def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> None:
@@ -36,7 +38,7 @@ def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> N
 
 
 def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None:
-    about = Description(CHANNELS, (1, 2, 3), "count", 50.0, "m")
+    about = ForecastDescription(CHANNELS, (1, 2, 3), "count", 50.0, "m")
     assert not {"quantiles"} & {*message().to_dict(), *about.to_dict(), *about.schema()}
     plain, about = message(), replace(about, quantiles=(10, 90))
     with_quantiles = replace(plain, levels=(10, 90), quantiles=np.stack([VALUES - 1, VALUES + 1]))

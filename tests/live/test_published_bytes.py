@@ -32,10 +32,10 @@ Case = tuple[Description, Sequence[Message], dict[str, Live]]
 
 
 def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
-    about = forward.Description(("a", "b"), (1, 3), unit, 50.0, "m", levels)
+    about = forward.ForecastDescription(("a", "b"), (1, 3), unit, 50.0, "m", levels)
     quantiles = np.stack([VALUES - 1, VALUES + 1]) if levels else None
     cause, flags = ("", 0) if levels else ("why", 64)
-    answer = forward.Message(
+    answer = forward.ForecastMessage(
         7, T_NS, VALUES, cause, flags, STATES, T_NS - 5, age_ms=4.5, levels=levels, quantiles=quantiles, **MEASURED
     )
     sizes: dict[str, Any] = {"channels": ("a", "b"), "steps": (1, 3), "quantiles": levels, "unit": unit}
@@ -43,7 +43,7 @@ def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
         "forecast": Live(task="forward", output="forecast", **sizes),
         "alarm": Live(task="forward", output="alarm", alarms=("load", "slip")),
     }
-    return about, [answer, forward.Message(8, T_NS, None, "no", 3, levels=levels)], streams
+    return about, [answer, forward.ForecastMessage(8, T_NS, None, "no", 3, levels=levels)], streams
 
 
 def materials() -> Case:

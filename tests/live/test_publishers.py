@@ -17,11 +17,11 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.live import publishing
 from tacpipe.live.publishing import UdpPublisher
 from tacpipe.live.websocket import BEHIND, CONNECTIONS, QUEUED, TOKEN, WebsocketPublisher
-from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 from tests.recording.live import awaited
 
-ABOUT = Description(("a", "b"), (1, 2), "count", 50.0, "models/forward")
+ABOUT = ForecastDescription(("a", "b"), (1, 2), "count", 50.0, "models/forward")
 HANDSHAKE = (
     b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
@@ -29,8 +29,8 @@ HANDSHAKE = (
 VALUES = np.array([[1.5, -2.25], [3.0, 1e-3]], dtype=np.float32)
 
 
-def message(seq: int, values: Any = VALUES) -> Message:
-    return Message(seq, 10**18 + seq, values)
+def message(seq: int, values: Any = VALUES) -> ForecastMessage:
+    return ForecastMessage(seq, 10**18 + seq, values)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe.tasks.forward.live.chain import Chain
+from tacpipe.tasks.forward.live.chain import LiveChain
 from tacpipe.tasks.forward.live.inputs import plan_table
 from tests.conftest import Lab
 from tests.live.sessions import CALIBRATED, TRAINED
@@ -55,7 +55,7 @@ def session(tables: dict[str, pa.Table]) -> list[Any]:
     """The forecasts of a session in which each sample came alone, two milliseconds late."""
     model = tacpipe.open("models/g")
     schemas = {name: table.schema for name, table in tables.items()}
-    chain = Chain.for_model(model.files, model.source.chain, schemas, quantiles=QUANTILES)
+    chain = LiveChain.for_model(model.files, model.source.chain, schemas, quantiles=QUANTILES)
     arrivals = sorted(
         (t_ns, name, row)
         for name, table in tables.items()

@@ -11,11 +11,11 @@ from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.live.decoding import likely_schema
 from tacpipe.recording import rig as rigs_of
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward import causal
-from tacpipe.tasks.forward.live.chain import Cause, Chain
+from tacpipe.tasks.forward.live.chain import Cause, LiveChain
 from tacpipe.tasks.forward.live.plans import Targets
 from tests.fake_recordings import FakeRecording
 from tests.live import rigs
@@ -58,11 +58,11 @@ def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> 
         before += block_values.shape[1]
     assert samples.values[block].shape[0] == 40
     packets = made.pieces(sensor, sensor.encode(samples))
-    batch = Reading(sensor).feed(Chunks.of(list(zip(t_ns.tolist(), packets, strict=True))))
-    from tacpipe.live.decoding import Columns, batch_schema
+    batch = LinkReader(sensor).feed(Chunks.of(list(zip(t_ns.tolist(), packets, strict=True))))
+    from tacpipe.live.decoding import BatchColumns, batch_schema
 
     targets = Targets("robot", likely_schema(sensor))
-    targets.push(Columns(batch, batch_schema(batch, sensor), 0))
+    targets.push(BatchColumns(batch, batch_schema(batch, sensor), 0))
     last = int(batch.t_ns[-1])
     state = targets.state(last)
     row = int(np.searchsorted(t_ns, last))
@@ -95,7 +95,7 @@ def aimed(seed: int) -> FakeRecording:
 
 
 def fed(model: Made, recording: FakeRecording, cuts: list[int], plan_from: str = "robot") -> list[Any]:
-    chain = Chain.for_model(
+    chain = LiveChain.for_model(
         *model, {name: table.schema for name, table in recording.tables.items()}, plan_from=plan_from
     )
     forecasts = []

@@ -18,7 +18,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import wire
 from tacpipe.live.messages import packets
 from tacpipe.recording import rig as rigs_of
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
@@ -73,8 +73,8 @@ class Session:
         self.sensor = rigs_of.build_sensor("grasps", {} if folder is None else {"folder": str(folder)}, "requests")
         self.engine = TouchEngine({"requests": self.sensor}, Predictor.load(files), touch_ranking.criterion(rank))
         self.t_ns = 0
-        self.engine.take("", Note(0, "", wire.BEGIN, str(OFFSET_NS)))
-        self.engine.take("requests", Note(0, "requests", BEGAN))
+        self.engine.take("", StreamNote(0, "", wire.BEGIN, str(OFFSET_NS)))
+        self.engine.take("requests", StreamNote(0, "requests", BEGAN))
 
     def send(self, *requests: Any) -> None:
         """Have requests arrive, a millisecond apart."""

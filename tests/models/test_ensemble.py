@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from tacpipe.models.forecasts import Ensemble, Shrunk, build, persistence_weights
-from tacpipe.models.windows import Windows
+from tacpipe.models.windows import ForecastWindows
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
 
 
@@ -23,7 +23,7 @@ def network(seed: int) -> nn.Module:
     return member.eval()
 
 
-def calibrated(count: int) -> tuple[list[nn.Module], Ensemble, Windows]:
+def calibrated(count: int) -> tuple[list[nn.Module], Ensemble, ForecastWindows]:
     members, inputs = [network(seed) for seed in range(count)], windows(40)
     ensemble = Ensemble(members)
     ensemble.calibrate(inputs, ahead(inputs))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import ChangeForecast, grid
 from tacpipe.models.forecasts import RecurrentForecast, build
-from tacpipe.models.windows import ARM, POSE, Windows
+from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.plugins import registry
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
 
@@ -43,7 +43,7 @@ def model(architecture: str, *, changes: bool = False, trained: bool = False, **
     return evaluated
 
 
-def change(network: nn.Module, inputs: Windows) -> Tensor:
+def change(network: nn.Module, inputs: ForecastWindows) -> Tensor:
     with torch.no_grad():
         predicted: Tensor = network(inputs)
     return predicted - inputs.touch[-1]
@@ -80,7 +80,7 @@ def test_the_plan_of_a_step_changes_only_it_and_later_ones(architecture: str) ->
 def test_windows_of_a_batch_do_not_see_each_other(architecture: str) -> None:
     network, inputs = model(architecture, trained=True), windows()
     before, order = change(network, inputs), torch.tensor([4, 2, 0, 5, 1, 3])
-    dealt = Windows(inputs.touch[:, order], inputs.arm[:, order], inputs.finger[:, order])
+    dealt = ForecastWindows(inputs.touch[:, order], inputs.arm[:, order], inputs.finger[:, order])
     assert torch.allclose(change(network, dealt), before[:, order], atol=1e-3)
     touch = inputs.touch.clone()
     touch[:-1, 0] += 50

@@ -13,7 +13,7 @@ from sklearn.preprocessing import StandardScaler
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models import linear
-from tacpipe.models.linear import Baselines, Windows
+from tacpipe.models.linear import FittedBaselines, Windows
 
 CONTEXT, HORIZON, CHANNELS, STATES = 5, 4, 3, 2
 
@@ -38,8 +38,8 @@ def walk(seed: int, rows: int = 200, context: int = CONTEXT) -> Windows:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Baselines:
-    return Baselines.fit(walk(1), walk(2))
+def fitted() -> FittedBaselines:
+    return FittedBaselines.fit(walk(1), walk(2))
 
 
 def features(part: Windows, plan: bool) -> np.ndarray:
@@ -56,7 +56,7 @@ def increments(part: Windows) -> np.ndarray:
 
 @pytest.mark.parametrize(("name", "plan"), [("ridge", False), ("ridge_actions", True)])
 def test_a_ridge_is_that_of_scikit_learn_at_the_alpha_that_validates_best(
-    fitted: Baselines, name: str, plan: bool
+    fitted: FittedBaselines, name: str, plan: bool
 ) -> None:
     training, validation = walk(1), walk(2)
     oracles = [
@@ -77,7 +77,7 @@ def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(
     frames = walk(1)[0][:, -1].repeat(repeats, axis=0)  # (time, channel), each frame held
     windows = cut(frames, np.zeros((len(frames), STATES)))
     past, _, ahead = (array.astype(np.float64) for array in windows)
-    fitted = Baselines.fit(windows, windows)
+    fitted = FittedBaselines.fit(windows, windows)
 
     def trend(phi: float, lag: int) -> np.ndarray:
         slope = (past[:, -1] - past[:, -1 - lag]) / lag
@@ -95,7 +95,7 @@ def test_a_trend_that_is_damped_by_0_6_a_step_is_predicted_exactly() -> None:
     steps = np.outer(0.6 ** np.arange(CONTEXT + HORIZON), [200.0, -100.0, 50.0])
     values = 1000 + np.cumsum(np.stack([steps, -2 * steps, 3 * steps]), axis=1)
     windows = values[:, :CONTEXT], np.zeros((3, CONTEXT + HORIZON, STATES)), values[:, CONTEXT:]
-    baselines = Baselines.fit(windows, windows)
+    baselines = FittedBaselines.fit(windows, windows)
     assert (baselines.phi, baselines.lag) == (0.6, 1)
     np.testing.assert_allclose(baselines.predict(*windows[:2])["damped_trend"], windows[2], rtol=1e-5)
 
@@ -103,12 +103,12 @@ def test_a_trend_that_is_damped_by_0_6_a_step_is_predicted_exactly() -> None:
 def test_where_nothing_goes_on_the_trend_is_persistence() -> None:
     rng = np.random.default_rng(3)
     noise = cut(rng.normal(size=(400, CHANNELS)), np.zeros((400, STATES)))
-    baselines = Baselines.fit(noise, noise)
+    baselines = FittedBaselines.fit(noise, noise)
     assert (baselines.phi, baselines.lag) == (0.0, 1)
     assert np.array_equal(baselines.predict(*noise[:2])["damped_trend"], np.repeat(noise[0][:, -1:], HORIZON, axis=1))
 
 
-def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fitted: Baselines) -> None:
+def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fitted: FittedBaselines) -> None:
     past, _, ahead = (array.astype(np.float64) for array in walk(1))
     x = np.concatenate([past[:, :-1, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
     y = np.concatenate([ahead[:, :, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
@@ -122,7 +122,7 @@ def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fi
         )
 
 
-def test_the_mean_is_that_of_what_was_to_be_predicted_in_training(fitted: Baselines) -> None:
+def test_the_mean_is_that_of_what_was_to_be_predicted_in_training(fitted: FittedBaselines) -> None:
     predicted = fitted.predict(*walk(2)[:2])["train_mean"]
     np.testing.assert_allclose(predicted[7, 3], walk(1)[2].astype(np.float64).mean(axis=(0, 1)), rtol=1e-6)
     assert (predicted == predicted[0, 0]).all()
@@ -134,7 +134,7 @@ def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
         acceleration = np.random.default_rng(seed).normal(size=(600, 1))
         return cut(2 * 300 * acceleration * [[1.0, 0.5, -0.2]], np.hstack([acceleration, np.zeros_like(acceleration)]))
 
-    baselines = Baselines.fit(held_mass(1), held_mass(2))
+    baselines = FittedBaselines.fit(held_mass(1), held_mass(2))
     past, motion, ahead = held_mass(3)
     predicted = baselines.predict(past, motion)
     error = {name: float(np.square(values - ahead).mean()) for name, values in predicted.items()}
@@ -143,7 +143,7 @@ def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
     assert error["damped_trend"] > error["train_mean"]
 
 
-def test_only_the_ridge_with_actions_knows_the_plan(fitted: Baselines) -> None:
+def test_only_the_ridge_with_actions_knows_the_plan(fitted: FittedBaselines) -> None:
     past, motion, _ = walk(2)
     changed = motion.copy()
     changed[:, CONTEXT:] += 0.1
@@ -151,7 +151,7 @@ def test_only_the_ridge_with_actions_knows_the_plan(fitted: Baselines) -> None:
     assert [name for name in linear.NAMES if not np.array_equal(before[name], after[name])] == ["ridge_actions"]
 
 
-def test_all_but_the_mean_move_with_the_level_of_the_counts(fitted: Baselines) -> None:
+def test_all_but_the_mean_move_with_the_level_of_the_counts(fitted: FittedBaselines) -> None:
     past, motion, _ = walk(2)
     before, after = fitted.predict(past, motion), fitted.predict(past + np.float32(512), motion)
     for name in linear.NAMES:
@@ -159,14 +159,14 @@ def test_all_but_the_mean_move_with_the_level_of_the_counts(fitted: Baselines) -
 
 
 def test_a_forecast_does_not_depend_on_the_windows_beside_it_nor_the_fit_on_its_pieces(
-    fitted: Baselines, monkeypatch: pytest.MonkeyPatch
+    fitted: FittedBaselines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     past, motion, _ = walk(2)
     batched, single = fitted.predict(past, motion), fitted.predict(past[9:10], motion[9:10])
     for name in linear.NAMES:
         np.testing.assert_allclose(single[name][0], batched[name][9], rtol=1e-5)
     monkeypatch.setattr(linear, "CHUNK", 7)
-    pieces = Baselines.fit(walk(1), walk(2)).predict(past, motion)
+    pieces = FittedBaselines.fit(walk(1), walk(2)).predict(past, motion)
     for name in linear.NAMES:
         np.testing.assert_allclose(pieces[name], batched[name], rtol=1e-5)
 
@@ -179,7 +179,7 @@ def test_channels_and_states_that_stand_still_in_training_are_left_where_they_ar
         motion[:, :, 0] = np.nextafter(np.float32(0.3), sides)  # still but for the last bit
         return past, motion, ahead
 
-    baselines = Baselines.fit(constant_windows(1), constant_windows(2))
+    baselines = FittedBaselines.fit(constant_windows(1), constant_windows(2))
     past, motion, _ = constant_windows(3)
     stirred = motion.copy()
     stirred[:, :, 0] += 1
@@ -192,13 +192,13 @@ def test_channels_and_states_that_stand_still_in_training_are_left_where_they_ar
 
 def test_windows_in_which_nothing_moves_give_persistence() -> None:
     constant_windows = cut(np.full((30, CHANNELS), 5.0), np.full((30, STATES), 0.3))
-    baselines = Baselines.fit(constant_windows, constant_windows)
+    baselines = FittedBaselines.fit(constant_windows, constant_windows)
     for values in baselines.predict(*constant_windows[:2]).values():
         np.testing.assert_allclose(values, 5.0)
 
 
 def test_a_single_past_frame_has_no_trend_but_a_motion() -> None:
-    baselines = Baselines.fit(walk(1, context=1), walk(2, context=1))
+    baselines = FittedBaselines.fit(walk(1, context=1), walk(2, context=1))
     past, motion, _ = walk(3, context=1)
     predicted = baselines.predict(past, motion)
     assert baselines.chosen["damped_trend.lag"] == 0
@@ -206,8 +206,8 @@ def test_a_single_past_frame_has_no_trend_but_a_motion() -> None:
     assert np.ptp(predicted["ridge"] - past) > 1
 
 
-def test_baselines_read_back_are_the_same(fitted: Baselines) -> None:
-    read = Baselines.from_tensors(load(save(fitted.to_tensors())))
+def test_baselines_read_back_are_the_same(fitted: FittedBaselines) -> None:
+    read = FittedBaselines.from_tensors(load(save(fitted.to_tensors())))
     assert read.chosen == fitted.chosen
     before, after = fitted.predict(*walk(2)[:2]), read.predict(*walk(2)[:2])
     assert tuple(after) == linear.NAMES
@@ -221,21 +221,21 @@ def test_windows_that_are_none_or_do_not_fit_are_refused() -> None:
     past, motion, ahead = walk(1)
     none = past[:0], motion[:0], ahead[:0]
     with pytest.raises(TacpipeError, match="training recordings hold no window"):
-        Baselines.fit(none, walk(2))
+        FittedBaselines.fit(none, walk(2))
     with pytest.raises(TacpipeError, match="validation recordings hold no window"):
-        Baselines.fit(walk(1), none)
+        FittedBaselines.fit(walk(1), none)
     for part in ((past, motion[:, 1:], ahead), (past, motion, ahead[:, :, 1:]), (past[1:], motion, ahead)):
         with pytest.raises(TacpipeError, match="do not fit one another"):
-            Baselines.fit(part, walk(2))
+            FittedBaselines.fit(part, walk(2))
     with pytest.raises(TacpipeError, match="do not fit training windows"):
-        Baselines.fit(walk(1), (past[:, 1:], motion[:, 1:], ahead))
+        FittedBaselines.fit(walk(1), (past[:, 1:], motion[:, 1:], ahead))
     broken = past.copy()
     broken[3, 2, 1] = np.nan
     with pytest.raises(TacpipeError, match="not finite"):
-        Baselines.fit((broken, motion, ahead), walk(2))
+        FittedBaselines.fit((broken, motion, ahead), walk(2))
 
 
-def test_a_past_that_was_not_fitted_is_refused(fitted: Baselines) -> None:
+def test_a_past_that_was_not_fitted_is_refused(fitted: FittedBaselines) -> None:
     past, motion, _ = walk(2)
     for part in ((past[:, 1:], motion), (past, motion[:, 1:]), (past, motion[:, :, 1:]), (past[1:], motion)):
         with pytest.raises(TacpipeError, match="do not fit the baselines"):

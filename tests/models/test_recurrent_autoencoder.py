@@ -9,13 +9,13 @@ from torch import nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.recurrent_autoencoder import (
+    AutoencoderShape,
     RecurrentAutoencoder,
     RecurrentClassifier,
-    Shape,
     parameters,
 )
 
-BIOTAC, ROBOSKIN = Shape(19, 20), Shape(60, 20, header="cnn")
+BIOTAC, ROBOSKIN = AutoencoderShape(19, 20), AutoencoderShape(60, 20, header="cnn")
 
 
 def test_the_networks_have_as_many_weights_as_the_published_ones() -> None:
@@ -72,7 +72,7 @@ class Plainly(nn.Module):
 @pytest.mark.parametrize("decoder", ["D1", "D2"])
 def test_a_network_says_what_the_same_one_of_plain_layers_says(header: str, channels: int, decoder: str) -> None:
     torch.manual_seed(3)
-    ours = RecurrentAutoencoder(Shape(channels, 5, header=header, decoder=decoder))
+    ours = RecurrentAutoencoder(AutoencoderShape(channels, 5, header=header, decoder=decoder))
     frames = torch.rand(7, 4, channels)
     expected = Plainly(ours)(frames)
     for ours_part, plain_part in zip(ours(frames), expected, strict=True):
@@ -114,7 +114,7 @@ def test_the_classifier_alone_has_its_last_state_for_latents_and_makes_no_frames
 
 @pytest.mark.parametrize("kind", [RecurrentAutoencoder, RecurrentClassifier])
 def test_dropout_leaves_out_latents_in_training_only(kind: type[RecurrentAutoencoder | RecurrentClassifier]) -> None:
-    network = kind(Shape(19, 20, dropout=0.5))
+    network = kind(AutoencoderShape(19, 20, dropout=0.5))
     frames = torch.rand(4, 64, 19)
     network.eval()
     assert torch.equal(network(frames).scores, network(frames).scores)
@@ -124,10 +124,10 @@ def test_dropout_leaves_out_latents_in_training_only(kind: type[RecurrentAutoenc
 
 def test_what_cannot_be_built_is_refused_with_what_can() -> None:
     with pytest.raises(TacpipeError, match="no decoder 'D3'; there are D1 and D2"):
-        RecurrentAutoencoder(Shape(19, 20, decoder="D3"))
+        RecurrentAutoencoder(AutoencoderShape(19, 20, decoder="D3"))
     with pytest.raises(TacpipeError, match="a grid of 6 x 10 channels and this sensor has 19"):
-        RecurrentAutoencoder(Shape(19, 20, header="cnn"))
+        RecurrentAutoencoder(AutoencoderShape(19, 20, header="cnn"))
     with pytest.raises(TacpipeError, match="no header 'fft'"):
-        RecurrentAutoencoder(Shape(19, 20, header="fft"))
+        RecurrentAutoencoder(AutoencoderShape(19, 20, header="fft"))
     with pytest.raises(TacpipeError, match="the sensor digit; the recordings have biotac"):
         recurrent_autoencoder.chosen("digit=mlp", {"biotac": 19})

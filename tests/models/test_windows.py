@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tacpipe.models.windows import POSE, Windows, motion, repeats, rotations, with_plans_of, without_plan
+from tacpipe.models.windows import POSE, ForecastWindows, motion, repeats, rotations, with_plans_of, without_plan
 from tests.models.window_fakes import CONTEXT, HORIZON, windows
 
 
-def moved(inputs: Windows, turn: Rotation, shift: list[float]) -> Windows:
+def moved(inputs: ForecastWindows, turn: Rotation, shift: list[float]) -> ForecastWindows:
     """The windows of the same arm on a base that is turned and shifted as a whole."""
     arm = inputs.arm.double().numpy()
     flat = arm.reshape(-1, arm.shape[-1])
@@ -23,7 +23,7 @@ def moved(inputs: Windows, turn: Rotation, shift: list[float]) -> Windows:
     return inputs._replace(arm=torch.from_numpy(np.hstack(parts).reshape(arm.shape)))
 
 
-def double(inputs: Windows) -> Windows:
+def double(inputs: ForecastWindows) -> ForecastWindows:
     """The same windows in double precision."""
     arm = inputs.arm.double()
     unit = torch.nn.functional.normalize(arm[..., 3:POSE], dim=-1)

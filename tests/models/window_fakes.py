@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tacpipe.models.windows import Windows
+from tacpipe.models.windows import ForecastWindows
 
 CONTEXT, HORIZON = 5, 4
 LAYOUT = [
@@ -16,7 +16,9 @@ LAYOUT = [
 ]
 
 
-def windows(count: int = 6, features: int = len(LAYOUT), context: int = CONTEXT, horizon: int = HORIZON) -> Windows:
+def windows(
+    count: int = 6, features: int = len(LAYOUT), context: int = CONTEXT, horizon: int = HORIZON
+) -> ForecastWindows:
     """Random windows; some frames of touch are held."""
     generator = torch.Generator().manual_seed(1)
 
@@ -32,10 +34,10 @@ def windows(count: int = 6, features: int = len(LAYOUT), context: int = CONTEXT,
     turned = torch.nn.functional.normalize(start + pace * steps, dim=-1)
     place = drawn(1, count, 3) + 0.01 * drawn(rows, count, 3).cumsum(0)
     arm = torch.cat([place, turned, 0.2 * drawn(rows, count, 6)], -1)
-    return Windows(touch, arm, 0.04 + 0.001 * drawn(context, count))
+    return ForecastWindows(touch, arm, 0.04 + 0.001 * drawn(context, count))
 
 
-def ahead(inputs: Windows) -> Tensor:
+def ahead(inputs: ForecastWindows) -> Tensor:
     """Touch that moves on from the last row (horizon, window, feature)."""
     generator = torch.Generator().manual_seed(2)
     shape = (inputs.horizon, *inputs.touch.shape[1:])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
 from tacpipe.comparison.specification import TaskReport
 from tacpipe.metrics.pairing import Measure
 
@@ -41,7 +41,7 @@ class WeighingReport(TaskReport):
 
     title = "weights of things"
 
-    def read(self, results: Sequence[Dataset]) -> list[Run]:
+    def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return a run a result: the errors of the model and of each baseline on each thing."""
         runs = []
         for result in results:
@@ -51,5 +51,9 @@ class WeighingReport(TaskReport):
                 for predictor, by_thing in errors.items()
             }
             about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}
-            runs.append(Run(result, self.name, **about, questions={Question("light things"): Errors(WEIGHT, sums)}))
+            runs.append(
+                ComparedRun(
+                    result, self.name, **about, questions={Question("light things"): PredictorErrors(WEIGHT, sums)}
+                )
+            )
         return runs

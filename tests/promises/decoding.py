@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.recording import rig
-from tacpipe.sensors.framing import Chunks, Run
+from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Sensor
 from tests.sensors import harm, made
 from tests.sensors.test_every_sensor import CASES, sent
@@ -55,7 +55,7 @@ def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: in
     """
     tested_sensor = sensor(case)
     framer = tested_sensor.framer()
-    runs: list[Run] = []
+    runs: list[FrameRun] = []
     lost_bytes = 0
     for start in range(0, len(pieces), at_once):
         stamped = [(1 + passing_ns * (start + row), piece) for row, piece in enumerate(pieces[start : start + at_once])]
@@ -69,7 +69,7 @@ def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: in
     return rows(tested_sensor, runs + new_runs)
 
 
-def rows(tested_sensor: Sensor, runs: Sequence[Run]) -> list[bytes]:
+def rows(tested_sensor: Sensor, runs: Sequence[FrameRun]) -> list[bytes]:
     """Return the samples of runs, each as its bytes."""
     with np.errstate(all="ignore"):
         decoded: Any = made.decoded(tested_sensor, runs)

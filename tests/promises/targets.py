@@ -170,7 +170,7 @@ def _spools() -> list[bytes]:
     written_spool = spool.Spool(_folder(), HEADER, ["a", "b"])
     for number in range(5):
         written_spool.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
-        written_spool.note(spool.Note(number, "a", "lost", "unplugged"))
+        written_spool.note(spool.StreamNote(number, "a", "lost", "unplugged"))
     written_spool.write()
     content = (written_spool.folder / "bytes").read_bytes()
     written_spool.close()

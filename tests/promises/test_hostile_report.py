@@ -15,7 +15,7 @@ import pytest
 
 from tacpipe.report import charts, page
 from tacpipe.report.blocks import Chart, Section
-from tacpipe.report.charts import Line
+from tacpipe.report.charts import Curve
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 from tests.promises.counts import count
 from tests.promises.limits import sample_cases
@@ -150,7 +150,7 @@ def test_nothing_that_a_label_holds_becomes_an_element_of_the_page(case: str) ->
 
 
 def test_the_words_of_a_chart_are_text_too() -> None:
-    spec = charts.lines([Line(HOSTILE, [1.0, 2.0], [0.1, 0.2])], HOSTILE, HOSTILE)
+    spec = charts.lines([Curve(HOSTILE, [1.0, 2.0], [0.1, 0.2])], HOSTILE, HOSTILE)
     tags = Tags()
     tags.feed(page.page([Section("t", "t", "", chart=Chart(HOSTILE, spec, HOSTILE))], "t").decode())
     assert "img" not in tags.tags and tags.runs == []

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from tacpipe.recording import clock, recorder
-from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool import Note
+from tacpipe.recording.rig import RigStream
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import Tally
 from tacpipe.sensors.framing import Chunks
 
@@ -52,7 +52,7 @@ class Script:
 class Station:
     """Replace `tacpipe.recording.station.Station` and give what is due."""
 
-    def __init__(self, script: Script, stream: Stream) -> None:
+    def __init__(self, script: Script, stream: RigStream) -> None:
         self.script, self.stream = script, stream
         self.error = None
         self._unread = [(START_NS + round(t_s * 1e9), data) for t_s, data in script.sent.get(stream.name, [])]
@@ -66,7 +66,7 @@ class Station:
     def stop(self) -> None:
         """End."""
 
-    def take(self) -> list[Chunks | Note]:
+    def take(self) -> list[Chunks | StreamNote]:
         """Return what came since the last call."""
         due = [chunk for chunk in self._unread if chunk[0] <= self.script.t_ns]
         self._unread = self._unread[len(due) :]
@@ -75,7 +75,7 @@ class Station:
             self._tally(self._chunks, self._bytes, due[-1][0])
         return [Chunks.of(due)] if due else []
 
-    def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
+    def begin(self, tally: Tally, early: list[Chunks | StreamNote] | None) -> list[Chunks | StreamNote]:
         """Return what came since the last call, and report to ``tally`` from now on."""
         blocks = self.take()
         counted = [] if early is None else [block for block in (*early, *blocks) if isinstance(block, Chunks)]
@@ -84,7 +84,7 @@ class Station:
         self._tally = tally
         return blocks
 
-    def end(self) -> list[Chunks | Note]:
+    def end(self) -> list[Chunks | StreamNote]:
         """Return what came since the last call, and stop reporting."""
         blocks = self.take()
         self._tally = None

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tacpipe.recording import appending
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spooled import Spooled
 from tests.conftest import Lab
 from tests.recording import force_rig, live
@@ -138,14 +138,14 @@ def test_a_duration_that_is_no_number_is_refused(lab: Lab, duration_s: Any) -> N
 
 def test_a_note_on_the_recording_is_read_with_any_stream_and_given_out_with_none(tmp_path: Path) -> None:
     spool = Spool(tmp_path, {"rig": ""}, ["a", "b"])
-    spool.note(Note(1, "b", "lost", "unplugged"))
-    spool.note(Note(2, "", "ended", "interrupted"))
+    spool.note(StreamNote(1, "b", "lost", "unplugged"))
+    spool.note(StreamNote(2, "", "ended", "interrupted"))
     spool.close()
     read = Spooled(spool.folder)
 
     assert read.ended == "recovered"  # nothing is read yet
     assert list(read.blocks("a")) == [] and read.ended == "interrupted" and not read.damage
-    assert list(read.blocks()) == [("b", Note(1, "b", "lost", "unplugged"))]
+    assert list(read.blocks()) == [("b", StreamNote(1, "b", "lost", "unplugged"))]
 
 
 def kept_spool(lab: Lab, err: str) -> Path:

@@ -16,7 +16,7 @@ from tacpipe.links.link import LinkLostError
 from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
@@ -48,12 +48,12 @@ def chunks(rows: range, all_frames: list[bytes], since_ns: int = 0) -> Chunks:
     return Chunks.of([(since_ns + row * PERIOD_NS, all_frames[row]) for row in rows])
 
 
-def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
+def spooled(folder: Path, **streams: list[Chunks | StreamNote]) -> Spooled:
     spool = Spool(folder, {"rig": RIG, "output": "rec", "recording": "r", "attributes": {}}, list(streams))
     for name, blocks in streams.items():
         count = size = 0
         for block in blocks:
-            if isinstance(block, Note):
+            if isinstance(block, StreamNote):
                 spool.note(block)
                 continue
             spool.append(name, block)
@@ -170,7 +170,7 @@ def test_a_stream_that_was_lost_when_the_recording_began_says_so(
             pass
         spool.close()
 
-    notes = [block for _, block in Spooled(spool.folder).blocks("a") if isinstance(block, Note)]
+    notes = [block for _, block in Spooled(spool.folder).blocks("a") if isinstance(block, StreamNote)]
     assert [note.what for note in notes] == [station.LOST]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing, station
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import Station
 from tests.conftest import Lab
@@ -66,7 +66,7 @@ def test_packets_of_other_senders_are_reported_once_a_second_and_at_the_end(
     live.awaited(lambda: not link.incoming)
     live.awaited(lambda: link.foreign == 600)
     for block in reader.end():
-        spool.note(block) if isinstance(block, Note) else spool.append("program", block)
+        spool.note(block) if isinstance(block, StreamNote) else spool.append("program", block)
     reader.stop()
     spool.close()
     sealed = sealing.stream(Spooled(spool.folder), rig, "program")

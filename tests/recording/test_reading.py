@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording.reading import Batch, Reading
+from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.sensors import framing
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
@@ -28,8 +28,8 @@ def chunks(parts: list[tuple[int, bytes]]) -> Chunks:
     return Chunks.of([(row * PERIOD_NS, data) for row, data in parts])
 
 
-def read(parts: list[tuple[int, bytes]], reading: Reading | None = None) -> tuple[list[Batch], Reading]:
-    reading = reading or Reading(SENSOR)
+def read(parts: list[tuple[int, bytes]], reading: LinkReader | None = None) -> tuple[list[Batch], LinkReader]:
+    reading = reading or LinkReader(SENSOR)
     return [reading.feed(chunks(parts)), reading.finish()], reading
 
 
@@ -89,7 +89,7 @@ def test_a_sample_that_comes_late_is_not_lost() -> None:
 
 
 def test_a_link_that_was_lost_costs_what_the_counter_says() -> None:
-    reading = Reading(SENSOR)
+    reading = LinkReader(SENSOR)
     sent = frames(2000)
     reading.feed(chunks(list(enumerate(sent[:500]))))
     broken = reading.broken()
@@ -100,7 +100,7 @@ def test_a_link_that_was_lost_costs_what_the_counter_says() -> None:
 
 
 def test_a_device_that_restarts_is_told_from_one_that_lost_much() -> None:
-    reading = Reading(SENSOR)
+    reading = LinkReader(SENSOR)
     reading.feed(chunks(list(enumerate(frames(500, first=30_000)))))
     after = reading.feed(chunks([(row + 1500, frame) for row, frame in enumerate(frames(10))]))
 
@@ -109,7 +109,7 @@ def test_a_device_that_restarts_is_told_from_one_that_lost_much() -> None:
 
 
 def test_an_outage_longer_than_the_counter_is_counted_by_the_clock() -> None:
-    reading = Reading(SENSOR)
+    reading = LinkReader(SENSOR)
     reading.feed(chunks(list(enumerate(frames(10)))))
     late = reading.feed(
         chunks([(100_000 + row, frame) for row, frame in enumerate(frames(10, first=100_000 % 65_536))])
@@ -122,7 +122,7 @@ def test_an_outage_longer_than_the_counter_is_counted_by_the_clock() -> None:
 def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[int], dropped: set[int]) -> None:
     sent = b"".join(frame for row, frame in enumerate(frames(100)) if row not in dropped)
     batches, first = read([(0, sent)])
-    reading = Reading(SENSOR)
+    reading = LinkReader(SENSOR)
     parts, place, step = [], 0, 0
     while place < len(sent):
         size = sizes[step % len(sizes)]
@@ -143,7 +143,7 @@ def test_a_device_s_clock_goes_on_where_it_begins_at_zero_again() -> None:
     taken_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
     values = (np.arange(len(taken_us), dtype=np.int16)[:, None],)
     sent = rig.encode(Samples(values, t_device_ns=taken_us % 2**32 * 1000))
-    reading = Reading(rig)
+    reading = LinkReader(rig)
     parts = [reading.feed(chunks([(row, bytes(frame))])) for row, frame in enumerate(sent)]
 
     stamps = [int(t_ns) for part in parts if part.t_device_ns is not None for t_ns in part.t_device_ns]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
 from tacpipe.recording import spool_folders, spooled
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 
@@ -24,7 +24,7 @@ STREAMS = ["a", "b"]
 HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": ""}
 
 
-def pairs(blocks: list[tuple[str, Chunks | Note]]) -> list[tuple[str, int, bytes]]:
+def pairs(blocks: list[tuple[str, Chunks | StreamNote]]) -> list[tuple[str, int, bytes]]:
     """Return stream, arrival and bytes of every chunk."""
     return [
         (name, t_ns, packet)
@@ -63,13 +63,13 @@ def test_what_was_appended_is_read_in_its_order(
     spool = Spool(tmp_path, HEADER, STREAMS)
     for name, chunks in parts:
         spool.append(name, Chunks.of(chunks))
-    spool.note(Note(7, "b", "lost", "unplugged"))
+    spool.note(StreamNote(7, "b", "lost", "unplugged"))
     spool.close()
 
     read = list(Spooled(spool.folder).blocks())
 
     assert pairs(read) == [(name, t_ns, data) for name, chunks in parts for t_ns, data in chunks]
-    assert read[-1] == ("b", Note(7, "b", "lost", "unplugged"))
+    assert read[-1] == ("b", StreamNote(7, "b", "lost", "unplugged"))
 
 
 def test_a_torn_end_costs_the_block_that_is_torn(tmp_path: Path) -> None:

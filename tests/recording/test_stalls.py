@@ -18,7 +18,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import READ_S, Station
 from tests.conftest import Lab
@@ -83,7 +83,7 @@ def recorded(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
     spool = Spool(folder, {"rig": "", "output": "", "recording": "r", "attributes": {}}, [name])
     reader._read()
     for block in reader.take():
-        spool.note(block) if isinstance(block, Note) else spool.append(name, block)
+        spool.note(block) if isinstance(block, StreamNote) else spool.append(name, block)
     spool.close()
     read = Spooled(spool.folder)
     read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}

@@ -113,13 +113,13 @@ def test_a_terminal_is_left_alone_where_no_key_is_asked_for(lab: Lab, rig: Emula
 def test_a_touch_begins_a_trial_and_its_end_ends_it(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     pad = Pad(lab)
 
-    class Seen(triggers.Contact):
+    class Seen(triggers.ContactTrigger):
         def touched(self) -> bool:
             if all(watch.rest_level is not None for watch in self._watches.values()):
                 pad.rested.set()
             return super().touched()
 
-    monkeypatch.setattr(triggers, "Contact", Seen)
+    monkeypatch.setattr(triggers, "ContactTrigger", Seen)
     pad.start()
     lab.run("acquire rig.toml -o rec --start contact --stop contact --contact-count 500")
     pad.ended.set()

@@ -13,8 +13,8 @@ from tacpipe.io import progress
 from tacpipe.links.link import Address
 from tacpipe.recording import clock, rig
 from tacpipe.recording import watch as view_of
-from tacpipe.recording.rig import Stream
-from tacpipe.recording.watch import View, Watch
+from tacpipe.recording.rig import RigStream
+from tacpipe.recording.watch import RigView, Watch
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tests.recording.test_reading import frames
@@ -26,7 +26,7 @@ NUMBERS = {"name": "taxel", "type": "u16", "count": TAXELS, "unit": "count", "qu
 @pytest.fixture
 def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
     """A force sensor of 1 kHz of which 7 samples of 400 were lost, at the end of these 0.4 s."""
-    watch = Watch(Stream("force", "optoforce", OptoForce(axes=3), Address("serial", "/dev/ttyACM0")))
+    watch = Watch(RigStream("force", "optoforce", OptoForce(axes=3), Address("serial", "/dev/ttyACM0")))
     sent = list(enumerate(frames(400)))
     watch.feed([Chunks.of([(row * 1_000_000, frame) for row, frame in sent[:100] + sent[107:]])])
     monkeypatch.setattr(clock, "now_ns", lambda: 400_000_000)
@@ -36,7 +36,7 @@ def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
 def pad(touched: int | None = None) -> Watch:
     """Return a pad that was at rest for a second, then had a taxel pressed."""
     sensor = rig.build_sensor("generic", {"rate_hz": 100, "packets": True, "numbers": [NUMBERS]}, "here")
-    watch = Watch(Stream("pad", "generic", sensor, Address("udp", ":4000")))
+    watch = Watch(RigStream("pad", "generic", sensor, Address("udp", ":4000")))
     idle = np.full(TAXELS, 100, "<u2")
     for tick in range(20):
         watch.feed([Chunks.of([(tick * 10_000_000, idle.tobytes())])])
@@ -47,7 +47,7 @@ def pad(touched: int | None = None) -> Watch:
     return watch
 
 
-def rendered(view: View, watches: dict[str, Watch], *, colours: bool = False) -> str:
+def rendered(view: RigView, watches: dict[str, Watch], *, colours: bool = False) -> str:
     """Return what the view draws on a terminal."""
     console = Console(file=io.StringIO(), width=100, force_terminal=colours, color_system="256" if colours else None)
     figures = {name: watch.figures(clock.now_ns()) for name, watch in watches.items()}
@@ -60,7 +60,7 @@ def test_lines_tell_rates_and_losses(
     force: Watch, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(view_of, "LINE_S", 0.0)
-    View({"force": force}).show("recording one, 3 s")
+    RigView({"force": force}).show("recording one, 3 s")
 
     # 393 samples in 399 ms; one step of 8 ms among 391 of 1 ms
     jitter_ms = np.std([8.0] + [1.0] * 391)
@@ -74,7 +74,7 @@ def test_lines_come_now_and_then_and_not_at_all_if_asked(
 ) -> None:
     now_s = [100.0]
     monkeypatch.setattr(clock, "now_s", lambda: now_s[0])
-    loud, quiet = View({"force": force}), View({"force": force}, quiet=True)
+    loud, quiet = RigView({"force": force}), RigView({"force": force}, quiet=True)
     for step in range(12):
         now_s[0] = 100.0 + step
         loud.show(f"{step}")
@@ -85,7 +85,7 @@ def test_lines_come_now_and_then_and_not_at_all_if_asked(
 
 def test_the_table_tells_every_stream_and_marks_the_ones_that_lose(force: Watch) -> None:
     watches = {"force": force, "pad": pad()}
-    text = rendered(View(watches), watches)
+    text = rendered(RigView(watches), watches)
 
     assert "recording one, 3 s" in text
     (row,) = [line for line in text.splitlines() if line.startswith("│ force")]
@@ -98,14 +98,14 @@ def test_the_table_tells_every_stream_and_marks_the_ones_that_lose(force: Watch)
         "7",
         "0",
     ]
-    coloured = rendered(View(watches), watches, colours=True)
+    coloured = rendered(RigView(watches), watches, colours=True)
     assert re.search(r"\x1b\[31m *force", coloured) and not re.search(r"\x1b\[31m *pad", coloured)
 
 
 def test_the_map_shows_the_taxel_that_is_pressed(force: Watch) -> None:
     for touched in (0, 5, TAXELS - 1):
         watches = {"pad": pad(touched)}
-        text = rendered(View(watches), watches, colours=True)
+        text = rendered(RigView(watches), watches, colours=True)
         cells = re.findall(r"\x1b\[(4[0-7]|48;5;\d+)m((?:  )+)\x1b\[0m", text)
         colours = [colour for colour, blanks in cells for _ in range(len(blanks) // 2)]
 
@@ -117,7 +117,7 @@ def test_the_map_shows_the_taxel_that_is_pressed(force: Watch) -> None:
 
 def test_a_map_has_rows_of_sixteen(force: Watch) -> None:
     watches = {"pad": pad(3)}
-    lines = rendered(View(watches), watches).splitlines()
+    lines = rendered(RigView(watches), watches).splitlines()
     start = next(number for number, line in enumerate(lines) if line.strip() == "pad")
 
     assert [len(line) for line in lines[start + 1 :]] == [2 * 16, 2 * (TAXELS - 16)]
@@ -129,7 +129,7 @@ def test_a_terminal_shows_the_view_and_is_left_clean(force: Watch, monkeypatch: 
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr(view_of, "FRAMES_HZ", 1000.0)
     monkeypatch.setattr("rich.console.Console.is_terminal", True)
-    with View({"force": force}).open() as view:
+    with RigView({"force": force}).open() as view:
         view._shown_s = 0.0
         view.show("recording one, 3 s")
 

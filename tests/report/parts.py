@@ -9,7 +9,7 @@ from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method, grouped
 from tacpipe.comparison.specification import report_on
 from tacpipe.report import sections
-from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Note, Section, Table
+from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Section, SmallPrint, Table
 from tacpipe.report.context import Context
 
 
@@ -80,7 +80,7 @@ def words(page_part: Section | Iterable[Block]) -> str:
     for block in blocks(page_part):
         if isinstance(block, Fold):
             texts += [block.title, block.about]
-        elif isinstance(block, Note):
+        elif isinstance(block, SmallPrint):
             texts.append(block.text)
         elif isinstance(block, Chart):
             texts += [block.title, block.caption]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.report import charts
-from tacpipe.report.charts import Dot, Line
+from tacpipe.report.charts import Curve, Dot
 
 
 def ranking(*dots: Dot) -> tuple[list[dict[str, Any]], list[float]]:
@@ -18,9 +18,9 @@ def ranking(*dots: Dot) -> tuple[list[dict[str, Any]], list[float]]:
 
 def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
     specs = [
-        charts.lines([Line("a", [0, 1], [np.nan, 2.0], [0.0, np.nan], [1.0, 3.0])], "x", "y", level=("zero", 0.0)),
-        charts.lines([Line("a", [1, 2], [0.1, 0.2]), Line("a", [1, 2], [0.1, 0.3], thin=True)], "x", "y", log=True),
-        charts.lines([Line("a", [0, 1], [0.2, 0.9])], "x", "y", diagonal=(0, 1)),
+        charts.lines([Curve("a", [0, 1], [np.nan, 2.0], [0.0, np.nan], [1.0, 3.0])], "x", "y", level=("zero", 0.0)),
+        charts.lines([Curve("a", [1, 2], [0.1, 0.2]), Curve("a", [1, 2], [0.1, 0.3], thin=True)], "x", "y", log=True),
+        charts.lines([Curve("a", [0, 1], [0.2, 0.9])], "x", "y", diagonal=(0, 1)),
         charts.marked([("a", 0.5, np.nan)], "x", "y"),
         charts.ranking([Dot("a", 0.5, np.nan, np.nan), Dot("b", np.nan, np.nan, np.nan)], "x"),
         charts.scatter([{"x": 1.0, "y": 2.0, "name": "a"}], "x", "y", diagonal=True, level=("c", np.nan)),
@@ -37,7 +37,7 @@ def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
 def test_names_keep_their_colour_from_chart_to_chart() -> None:
     scales = []
     for names in ("a", "b", "ab"):
-        spec = charts.lines([Line(name, [1, 2], [0.1, 0.2]) for name in names], "x", "y", order=["a", "b"])
+        spec = charts.lines([Curve(name, [1, 2], [0.1, 0.2]) for name in names], "x", "y", order=["a", "b"])
         scale = spec["layer"][-1]["encoding"]["color"]["scale"]
         scales.append(dict(zip(scale["domain"], scale["range"], strict=True)))
     assert {**scales[0], **scales[1]} == scales[2]
@@ -55,7 +55,7 @@ def test_one_method_that_is_far_off_does_not_press_the_others_together() -> None
 
 def test_a_chart_of_skill_ends_at_its_floor() -> None:
     spec = charts.lines(
-        [Line("far", [1, 2], [-1000.0, -500.0]), Line("near", [1, 2], [0.1, 0.2])], "x", "y", floor=-1.0
+        [Curve("far", [1, 2], [-1000.0, -500.0]), Curve("near", [1, 2], [0.1, 0.2])], "x", "y", floor=-1.0
     )
     assert spec["layer"][-1]["encoding"]["y"]["scale"]["domain"] == [-1.0, 0.2]
 
@@ -64,7 +64,7 @@ def test_a_long_line_is_thinned_and_keeps_its_extremes_and_its_gaps() -> None:
     y = np.sin(np.arange(100_000) / 700)
     y[41_234], y[70_000] = 7.0, -7.0
     y[50_000:52_000] = np.nan
-    spec = charts.lines([Line("a", np.arange(100_000.0), y)], "x", "y", points=False)
+    spec = charts.lines([Curve("a", np.arange(100_000.0), y)], "x", "y", points=False)
     drawn = [row["y"] for row in spec["data"]["values"]]
     assert len(drawn) <= charts.POINTS + 4
     assert (

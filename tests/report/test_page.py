@@ -14,7 +14,7 @@ import pytest
 from tacpipe.comparison import engine
 from tacpipe.errors import TacpipeError
 from tacpipe.report import page
-from tacpipe.report.blocks import Chart, Fold, Note, Section, table
+from tacpipe.report.blocks import Chart, Fold, Section, SmallPrint, table
 from tests.conftest import forget
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
 from tests.stages.learning_fakes import motion
@@ -197,7 +197,11 @@ def test_text_that_looks_like_markup_stays_text() -> None:
     name = "</script><b>& `rm x`"
     spec = {"data": {"values": [{"name": name, "x": 1.5}]}, "mark": "point"}
     section = Section(
-        "t", name, name, chart=Chart(name, spec, name), folds=[Fold(name, [Note(name), table(name, [name], [[name]])])]
+        "t",
+        name,
+        name,
+        chart=Chart(name, spec, name),
+        folds=[Fold(name, [SmallPrint(name), table(name, [name], [[name]])])],
     )
     content = page.page([section], name)
     assert name.replace("`", "") in check(content).replace("`", "")

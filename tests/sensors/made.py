@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bytes, Int64s
-from tacpipe.sensors.framing import Chunks, Framer, Loss, Run
+from tacpipe.sensors.framing import Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.sensors.text_framer import LineFramer
 
@@ -77,11 +77,11 @@ def pieces(sensor: Sensor, frames: Any) -> list[bytes]:
 
 def through(
     framer: Framer, chunks: Iterable[bytes], step_ns: int = 1000, at_once: int = 64
-) -> tuple[list[Run], list[Loss]]:
+) -> tuple[list[FrameRun], list[FramingLoss]]:
     """Feed chunks, ``step_ns`` after one another and some at once, and flush; return all that came out."""
     stamped = [(number * step_ns, chunk) for number, chunk in enumerate(chunks)]
-    runs: list[Run] = []
-    losses: list[Loss] = []
+    runs: list[FrameRun] = []
+    losses: list[FramingLoss] = []
     for start in range(0, len(stamped), at_once):
         new_runs, lost = framer.feed(Chunks.of(stamped[start : start + at_once]))
         runs, losses = runs + new_runs, losses + lost
@@ -89,7 +89,7 @@ def through(
     return runs + new_runs, losses + lost
 
 
-def decoded(sensor: Sensor, runs: Sequence[Run]) -> Samples:
+def decoded(sensor: Sensor, runs: Sequence[FrameRun]) -> Samples:
     """Return the samples of all runs, one after another."""
     decoded_runs = [part for run in runs if len(part := sensor.decode(run.frames))]
     if not decoded_runs:

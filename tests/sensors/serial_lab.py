@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray
-from tacpipe.sensors.framing import Chunks, Loss
+from tacpipe.sensors.framing import Chunks, FramingLoss
 from tacpipe.sensors.sensor import Device, Dialogue, Samples, Sensor
 
 
-def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[list[Samples], list[Loss]]:
+def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[list[Samples], list[FramingLoss]]:
     """Return what a driver makes of bytes that come in pieces of these sizes over and over."""
     framer, samples, losses = sensor.framer(), [], []
     place, step = 0, 0

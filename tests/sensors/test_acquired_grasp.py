@@ -14,7 +14,7 @@ from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp, estimated_wrist
 from tacpipe.plugins.registry import load
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.clouds import Clouds
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -25,7 +25,7 @@ from tests.fake_recordings import FakeRecording
 
 def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
     """Return the table of a stream of which one chunk came."""
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
     batch = reading.feed(Chunks.of([(5, chunk)]))
     assert not reading.account.lost
     columns = [column for block in batch.values for column in block.T]

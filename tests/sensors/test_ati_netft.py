@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.recording.reading import DEVICE, LINK, Reading
+from tacpipe.recording.reading import DEVICE, LINK, LinkReader
 from tacpipe.sensors.ati_netft import BIAS, START, STOP, AtiNetFT, request
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
@@ -50,7 +50,7 @@ def test_counts_become_newtons_by_the_boxs_own_scale() -> None:
 def test_a_lost_packet_and_a_sample_that_the_box_skipped_are_told_apart() -> None:
     sensor = AtiNetFT(rate_hz=1000)  # every seventh of the samples that the box takes
     sample_counts = {1: 703, 2: 710, 4: 724, 5: 738, 6: 745}  # packet 3 is lost; before packet 5 the box skipped one
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
 
     batch = reading.feed(Chunks.of([(1_000_000 * sent, record(sent, count)) for sent, count in sample_counts.items()]))
 

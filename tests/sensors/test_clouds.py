@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tacpipe.clouds import files, ply
 from tacpipe.clouds.cloud import Cloud, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.clouds import Clouds
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
@@ -49,7 +49,7 @@ def frame() -> DepthFrame:
 
 
 def test_each_point_of_a_cloud_is_a_row_with_the_clouds_stamp() -> None:
-    batch = Reading(Clouds()).feed(Chunks.of([(100, TEXT_PLY), (200, PCD)]))
+    batch = LinkReader(Clouds()).feed(Chunks.of([(100, TEXT_PLY), (200, PCD)]))
 
     assert batch.t_ns.tolist() == [100, 100, 200]  # the point that is not a number was not seen
     np.testing.assert_allclose(batch.values[0], [[0.1, 0.2, 0.7], [0.3, -0.2, 0.8], [0.1, 0.2, 0.7]], rtol=1e-6)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import pts
 from tacpipe.sensors.contactile import Contactile
-from tacpipe.sensors.framing import Chunks, Run
+from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Samples
 from tests.sensors import described, made
 
@@ -181,7 +181,7 @@ def session(first: int, count: int) -> list[bytes]:
     return made.pieces(ONE, ONE.encode(numbered))
 
 
-def counters(runs: list[Run]) -> list[int]:
+def counters(runs: list[FrameRun]) -> list[int]:
     seq = made.decoded(ONE, runs).seq
     return [] if seq is None else seq.tolist()
 

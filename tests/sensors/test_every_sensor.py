@@ -12,7 +12,7 @@ import pytest
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
-from tacpipe.sensors.framing import Run
+from tacpipe.sensors.framing import FrameRun
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.sensors.spacemouse import StateFramer
 from tacpipe.sensors.text_framer import LineFramer, TextFramer
@@ -99,7 +99,7 @@ def understood(sensor: Sensor, frames: Frames) -> Samples:
     """Return what frames say as `Sensor.encode` gave them: binary ones of several sizes one by one."""
     if isinstance(frames, np.ndarray) or isinstance(sensor.framer(), TextFramer | LineFramer | StateFramer):
         return sensor.decode(frames)
-    runs = [Run(np.frombuffer(frame, np.uint8)[None], np.zeros(1, dtype=np.int64)) for frame in frames]
+    runs = [FrameRun(np.frombuffer(frame, np.uint8)[None], np.zeros(1, dtype=np.int64)) for frame in frames]
     return made.decoded(sensor, runs)
 
 

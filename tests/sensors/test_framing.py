@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.sensors import checks, framing
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Chunks, Framing, Loss, PacketFramer, Run
+from tacpipe.sensors.framing import Chunks, FrameRun, Framing, FramingLoss, PacketFramer
 from tacpipe.sensors.text_framer import LineFramer
 
 
@@ -68,10 +68,10 @@ def numbered_frames(kind: str, count: int, seed: int) -> list[bytes]:
     return frames
 
 
-def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[Run], list[Loss]]:
+def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[FrameRun], list[FramingLoss]]:
     """Feed ``data`` in pieces of these sizes over and over, a nanosecond after one another."""
-    runs: list[Run] = []
-    losses: list[Loss] = []
+    runs: list[FrameRun] = []
+    losses: list[FramingLoss] = []
     place, step = 0, 0
     while place < len(data):
         piece = data[place : place + sizes[step % len(sizes)]]
@@ -82,7 +82,7 @@ def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[Run
     return runs + new_runs, losses + lost
 
 
-def frames_of(runs: list[Run]) -> list[bytes]:
+def frames_of(runs: list[FrameRun]) -> list[bytes]:
     return [bytes(frame) for run in runs for frame in run.frames]
 
 
@@ -164,8 +164,8 @@ def test_after_every_piece_each_byte_is_framed_lost_or_pending_and_frames_stand_
 ) -> None:
     stream, framing = data.draw(mixtures(kind)), KINDS[kind]
     framer = ByteFramer(framing)
-    runs: list[Run] = []
-    losses: list[Loss] = []
+    runs: list[FrameRun] = []
+    losses: list[FramingLoss] = []
     ends: list[int] = []  # End of each piece, whose number is its arrival time.
     for step in range(len(stream) + 1):
         start = ends[-1] if ends else 0

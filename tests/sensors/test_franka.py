@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.franka import STATE, Franka, whole
 from tacpipe.sensors.sensor import Samples
@@ -69,7 +69,7 @@ def test_a_state_by_hand_gives_its_numbers() -> None:
 
 
 def test_the_number_of_a_state_is_its_counter_and_its_time_in_milliseconds() -> None:
-    reading = Reading(Franka())
+    reading = LinkReader(Franka())
 
     batch = reading.feed(Chunks.of([(1_000_000 * number, state(9000 + number)) for number in (1, 2, 5, 6)]))
 

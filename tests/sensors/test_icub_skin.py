@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Chunks, Loss, Run
+from tacpipe.sensors.framing import Chunks, FrameRun, FramingLoss
 from tacpipe.sensors.icub_skin import CAN, IcubSkin, can_frame
 from tests.sensors import described, made
 
@@ -40,10 +40,10 @@ def timed(sent: list[list[bytes]], period_ns: int = 20 * MS) -> list[tuple[int, 
 
 def feed_in_batches(
     chunks: list[tuple[int, bytes]], at_once: int, sensor: IcubSkin = PATCH
-) -> tuple[list[bytes], list[Loss]]:
+) -> tuple[list[bytes], list[FramingLoss]]:
     framer = sensor.framer()
-    runs: list[Run] = []
-    losses: list[Loss] = []
+    runs: list[FrameRun] = []
+    losses: list[FramingLoss] = []
     for start in range(0, len(chunks), at_once):
         new_runs, lost = framer.feed(Chunks.of(chunks[start : start + at_once]))
         runs, losses = runs + new_runs, losses + lost

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import UsageError
-from tacpipe.recording.reading import LINK, Reading
+from tacpipe.recording.reading import LINK, LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.kuka_rsi import KukaRsi
 from tacpipe.sensors.sensor import Samples
@@ -60,7 +60,7 @@ def test_a_controllers_text_is_read_in_metres_and_rad() -> None:
 
 @pytest.mark.parametrize(("rate_hz", "step"), [(250.0, 4), (1000 / 12, 12), (83.33, 12)])
 def test_ipoc_grows_by_the_cycle_and_a_gap_is_a_lost_text(rate_hz: float, step: int) -> None:
-    reading = Reading(KukaRsi(rate_hz=rate_hz))
+    reading = LinkReader(KukaRsi(rate_hz=rate_hz))
 
     batch = reading.feed(Chunks.of([(step * 1_000_000 * n, TEXT % (1000 + step * n)) for n in (1, 2, 3, 5, 6)]))
 
@@ -129,7 +129,7 @@ def test_rsipis_server_takes_our_answers_and_we_read_its_texts(rsipi: Any) -> No
     server, sent = rsipi
     sensor = KukaRsi(outputs=("RIst", "RSol", "AIPos", "ASPos", "Delay.D"))
     server.state["RIst"]["X"], server.state["AIPos"]["A3"] = 1234.5, 45.0
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
 
     accepted = []
     for number in range(20):

@@ -15,7 +15,7 @@ from tacpipe.cli import sensors
 from tacpipe.errors import UsageError
 from tacpipe.links.probing import Report, recognise
 from tacpipe.recording import rig
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors import lines_guess
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.lines import Lines
@@ -166,7 +166,7 @@ def test_the_sum_of_a_published_nmea_sentence_is_right_and_a_flipped_digit_is_se
 
 def test_lost_lines_are_counted_by_their_counter_and_garbage_costs_no_more() -> None:
     sensor = lines(columns=[{"name": "n", "type": "u8"}, {"name": "taxel", "type": "u16"}], sequence={"column": "n"})
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
     text = "".join(f"{row % 256},{row}\n" for row in range(300) if row not in (100, 255, 256)).replace(
         "\n50,50", "\n5#0,50"
     )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import UsageError
-from tacpipe.recording.reading import LINK, Reading
+from tacpipe.recording.reading import LINK, LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.tap import Tap
@@ -53,7 +53,7 @@ def test_a_packet_of_several_lines_holds_as_many_records_with_its_stamp() -> Non
     sensor = Tap(numbers=("n",))
     packet = b"\n".join([line(n=1), b"", line(n=2)]) + b"\r\n"
 
-    batch = Reading(sensor).feed(Chunks.of([(5, line(n=0)), (7, packet)]))
+    batch = LinkReader(sensor).feed(Chunks.of([(5, line(n=0)), (7, packet)]))
 
     assert batch.values[1].tolist() == [[0.0], [1.0], [2.0]]
     assert batch.t_ns.tolist() == [5, 7, 7]
@@ -66,7 +66,7 @@ def test_an_event_stands_in_a_column_of_its_own() -> None:
 
 
 def test_a_counted_program_shows_what_was_lost_and_its_clock_is_kept() -> None:
-    reading = Reading(Tap(counted=True, timed=True))
+    reading = LinkReader(Tap(counted=True, timed=True))
 
     batch = reading.feed(Chunks.of([(n, line(seq=n, t_ns=1000 * n)) for n in (4, 5, 7)]))
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.ur_rtde import UrRtde
@@ -90,7 +90,7 @@ def test_texts_among_the_data_are_frames_without_samples_however_the_bytes_are_c
     sensor = UrRtde(outputs=("actual_q",))
     sent = [package(0.002 * number, *([number] * 6)) for number in range(1, 9)]
     data = b"".join([TEXT, *sent[:3], TEXT, *sent[3:]])
-    reading, place, step, batches = Reading(sensor), 0, 0, []
+    reading, place, step, batches = LinkReader(sensor), 0, 0, []
     while place < len(data):
         size = sizes[step % len(sizes)]
         batches.append(reading.feed(Chunks.of([(step, data[place : place + size])])))
@@ -106,7 +106,7 @@ def test_texts_among_the_data_are_frames_without_samples_however_the_bytes_are_c
 def test_a_text_as_long_as_a_data_package_holds_no_sample() -> None:
     sensor = UrRtde(outputs=("payload",))
     text = struct.pack(">HB", 20, ord("M")) + bytes(17)
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
 
     batch = reading.feed(Chunks.of([(1, package(1.0, 2.0) + text + package(1.1, 3.0) + text)]))
 
@@ -117,7 +117,7 @@ def test_a_package_with_a_wrong_size_is_none_and_those_after_it_are_found() -> N
     sensor = UrRtde(outputs=("actual_q",))
     sent = [package(0.002 * number, *([number] * 6)) for number in range(1, 20)]
     sent[5] = sent[5][:-8]
-    reading = Reading(sensor)
+    reading = LinkReader(sensor)
 
     batch, last_batch = reading.feed(Chunks.of([(1, b"".join(sent))])), reading.finish()
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.recording.reading import Reading
+from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.xela import WELCOME, Xela
@@ -62,7 +62,7 @@ def test_forces_are_nan_where_the_server_sends_none() -> None:
 
 
 def test_the_welcome_and_texts_of_other_sensors_hold_no_sample_and_are_no_loss() -> None:
-    reading = Reading(Xela(sensor=1))
+    reading = LinkReader(Xela(sensor=1))
 
     batch = reading.feed(Chunks.of([(1, WELCOME), (2, text(5)), (3, text(6, sensors=(2,))), (4, text(7))]))
 
@@ -71,7 +71,7 @@ def test_the_welcome_and_texts_of_other_sensors_hold_no_sample_and_are_no_loss()
 
 
 def test_a_number_that_is_missing_is_a_lost_message() -> None:
-    reading = Reading(Xela())
+    reading = LinkReader(Xela())
 
     reading.feed(Chunks.of([(10_000_000 * number, text(number)) for number in (1, 2, 4, 5)]))
 

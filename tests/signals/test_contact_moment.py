@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.contact import Limits, contact_row, settled_rows
+from tacpipe.signals.contact import ContactLimits, contact_row, settled_rows
 
-LIMITS = Limits(rest_s=0.5, on_count=20.0, settle_s=0.2, settled_count=3.0)
+LIMITS = ContactLimits(rest_s=0.5, on_count=20.0, settle_s=0.2, settled_count=3.0)
 STEP_NS = 10_000_000
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.signals import kinematics
-from tacpipe.signals.kinematics import IIWA14, PANDA, Chain
+from tacpipe.signals.kinematics import IIWA14, PANDA, KinematicChain
 
 TOOL = np.array([0.01, -0.02, 0.2])  # Position of the hand in the last link's frame, m
 STEP_S = 1e-4
@@ -21,7 +21,7 @@ def joints(rows: int = 200) -> tuple[AnyFloats, AnyFloats]:
     return size * np.sin(rate * time_s + phase), size * rate * np.cos(rate * time_s + phase)
 
 
-def elementary(joint_rad: AnyFloats, chain: Chain = PANDA) -> list[AnyFloats]:
+def elementary(joint_rad: AnyFloats, chain: KinematicChain = PANDA) -> list[AnyFloats]:
     """The frames of one row as Craig has them: turn and shift along x, then turn and shift along z."""
     reached: AnyFloats = np.eye(4)
     frames: list[AnyFloats] = []
@@ -41,7 +41,7 @@ def hand(joint_rad: AnyFloats) -> AnyFloats:
 
 
 @pytest.mark.parametrize("chain", [PANDA, IIWA14])
-def test_frames_are_the_product_of_elementary_motions(chain: Chain) -> None:
+def test_frames_are_the_product_of_elementary_motions(chain: KinematicChain) -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (20, 7))
     frames = kinematics.joint_frames(chain, angles)
     assert frames.shape == (20, 7, 4, 4)

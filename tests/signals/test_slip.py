@@ -14,7 +14,7 @@ from tacpipe.signals.resampling import median_around, uniform_grid
 RATE_HZ, SENSOR_HZ, CUTOFF_HZ = 50.0, 400.0, 5.0
 COUNT_PER_MM, NOISE_COUNT, REST_COUNT = 8.0, 0.8, 740.0
 STILL = 25
-LIMITS = slip.Limits()
+LIMITS = slip.SlipLimits()
 
 
 def readings(speed_mm_s: np.ndarray, noise_count: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -149,4 +149,4 @@ def test_few_rows_slip_nowhere(rows: int) -> None:
 )
 def test_limits_that_cannot_be_are_refused(values: dict[str, float], message: str) -> None:
     with pytest.raises(TacpipeError, match=message):
-        slip.Limits(**values)  # type: ignore[arg-type]
+        slip.SlipLimits(**values)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.io.hashing import digest
 from tacpipe.simulation.grasp import simulate_trial
-from tacpipe.simulation.grasp_scene import Rig
+from tacpipe.simulation.grasp_scene import GraspRig
 from tests.fake_recordings import FakeDataset, FakeRecording
 
 SEED = 5
@@ -25,7 +25,7 @@ class GraspShard(FakeRecording):
         return digest([self.name, repr(sorted(self.attributes.items())), repr(self.tables["reading"].to_pylist())])
 
 
-def grasps(rig: Rig, indices: Iterable[int], *, seed: int = SEED) -> Any:
+def grasps(rig: GraspRig, indices: Iterable[int], *, seed: int = SEED) -> Any:
     """Return the trials ``indices`` of a rig that is not raw."""
     shards: dict[str, Any] = {}
     for index in indices:

@@ -6,18 +6,18 @@ from collections.abc import Iterable
 from typing import Any
 
 from tacpipe.plugins.registry import load
-from tacpipe.simulation.slide import SENSORS, Rig, simulate_trial
+from tacpipe.simulation.slide import SENSORS, SlideRig, simulate_trial
 from tests.tasks.material.textures import Slide, dataset
 
 SEED = 3
 
 
-def index(sensor: str, material: int, number: int, rig: Rig) -> int:
+def index(sensor: str, material: int, number: int, rig: SlideRig) -> int:
     """Return the index of the ``number``-th trial of a sensor on a material."""
     return 2 * rig.materials * number + 2 * (material - 1) + SENSORS.index(sensor)
 
 
-def indices(rig: Rig, sensors: Iterable[str], numbers: Iterable[int]) -> list[int]:
+def indices(rig: SlideRig, sensors: Iterable[str], numbers: Iterable[int]) -> list[int]:
     number_list = list(numbers)
     return [
         index(sensor, kind, number, rig)
@@ -27,7 +27,7 @@ def indices(rig: Rig, sensors: Iterable[str], numbers: Iterable[int]) -> list[in
     ]
 
 
-def slides(rig: Rig, chosen: Iterable[int], *, seed: int = SEED, frames: int = 400) -> Any:
+def slides(rig: SlideRig, chosen: Iterable[int], *, seed: int = SEED, frames: int = 400) -> Any:
     """Return the slides of the trials ``chosen``, as `tacpipe segment slides` gives them."""
     stage = load("segment.slides")
     shards = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tacpipe.signals.repairs import held
-from tacpipe.simulation.faults import Clock, arrivals, device_stamps, hold, samples
+from tacpipe.simulation.faults import DeviceClock, arrivals, device_stamps, hold, samples
 
 
 def rng() -> np.random.Generator:
@@ -32,7 +32,7 @@ def test_the_numbers_of_the_samples_have_a_gap_where_one_is_lost() -> None:
 
 def test_a_device_clock_shows_offset_and_skew_and_no_jitter() -> None:
     true_ns = np.arange(0, 10**10, 10**7)
-    device_ns = device_stamps(true_ns, Clock(offset_ns=-7_000, skew=50e-6))
+    device_ns = device_stamps(true_ns, DeviceClock(offset_ns=-7_000, skew=50e-6))
     assert np.abs(device_ns - (true_ns * (1 + 50e-6) - 7_000)).max() <= 0.5
 
 

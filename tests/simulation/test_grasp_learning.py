@@ -15,7 +15,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.simulation.grasp_scene import Rig
+from tacpipe.simulation.grasp_scene import GraspRig
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.model import TouchModel
@@ -48,7 +48,7 @@ def evaluated(training: Any, tested: Any, workspace: Path, **changed: Any) -> Me
 def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_are_moved_together(
     tmp_path: Path,
 ) -> None:
-    dataset = grasps(Rig(), range(60))
+    dataset = grasps(GraspRig(), range(60))
     strong = TouchModel.load(trained(dataset, tmp_path, trees=20, leaf=2))
     rng = np.random.default_rng(0)
     for shard in list(dataset.recordings.values())[:12]:
@@ -62,7 +62,7 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
 
 @pytest.mark.long
 def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_show_it(tmp_path: Path) -> None:
-    rig = Rig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
+    rig = GraspRig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
     training, tested = grasps(rig, range(160)), grasps(rig, range(160, 240))
     pressures = {"targets": "pdc_th,pdc_mf"}
     scaled = {
@@ -82,7 +82,9 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
 
 @pytest.mark.long
 def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
-    rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # Drift would be learned from time.
+    rig = GraspRig(
+        families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0
+    )  # Drift would be learned from time.
     training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))
     metrics = evaluated(training, tested, tmp_path, leaf=2)
     for target in biotac_sp.TARGETS:
@@ -109,7 +111,7 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("remembered")
 def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
-    dataset = grasps(Rig(drift_count_day=0.0), range(240))
+    dataset = grasps(GraspRig(drift_count_day=0.0), range(240))
     names = list(dataset.recordings)
     gains: dict[str, list[float]] = {target: [] for target in biotac_sp.TARGETS}
     for fold in range(4):
@@ -130,7 +132,7 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
 def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and_who_is_told_can(
     tmp_path: Path,
 ) -> None:
-    rig = Rig(one_pose=True, shift=1.0, drift_count_day=0.0, families="cone,bow", objects=2, stiffness="rigid")
+    rig = GraspRig(one_pose=True, shift=1.0, drift_count_day=0.0, families="cone,bow", objects=2, stiffness="rigid")
     training, tested = grasps(rig, range(400)), grasps(rig, range(400, 600))
     small = {**POINTNET, "targets": "e_th,e_mf", "multi_target": True, "points": 32, "epochs": 20}
     errors = {}
@@ -154,7 +156,7 @@ def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
 def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_were_drawn(
     points: int, tmp_path: Path
 ) -> None:
-    dataset = grasps(Rig(), range(80))
+    dataset = grasps(GraspRig(), range(80))
     files = trained(dataset, tmp_path, **{**POINTNET, "points": points, "epochs": 5, "draws": 1, "targets": "pdc_th"})
     network = TouchModel.load(files)
     spread = _spread_over_draws(network, dataset)

@@ -19,20 +19,20 @@ from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import depth_camera, household
 from tacpipe.simulation.grasp import session, simulate_trial, stamp_ns
-from tacpipe.simulation.grasp_scene import Rig, Scene, draw_thing, perform
+from tacpipe.simulation.grasp_scene import GraspRig, GraspScene, draw_thing, perform
 from tests.simulation.grasp_datasets import SEED
 
-RIG = Rig()
+RIG = GraspRig()
 TRIALS = range(36)  # six of each family
 
 
 @cache
-def scene(index: int, rig: Rig = RIG) -> Scene:
+def scene(index: int, rig: GraspRig = RIG) -> GraspScene:
     return perform(SEED, index, rig)
 
 
 @cache
-def recording(index: int, rig: Rig = RIG) -> RecordingOutput:
+def recording(index: int, rig: GraspRig = RIG) -> RecordingOutput:
     return simulate_trial(SEED, index, rig)
 
 
@@ -40,7 +40,7 @@ def truth(recording_output: RecordingOutput) -> dict[str, Any]:
     return {name: values[0] for name, values in recording_output.streams["truth"].to_pydict().items()}
 
 
-def along_rays_m(view: Scene) -> np.ndarray:
+def along_rays_m(view: GraspScene) -> np.ndarray:
     """Return the depth error of each point of the cloud (point,)."""
     points = view.cloud.points_m.astype(np.float64)
     depth = view.placed.hit(np.zeros((1, 3)), points / points[:, 2:])
@@ -66,7 +66,7 @@ def test_no_point_is_hidden_by_the_body_itself(index: int) -> None:
         assert not inside(view, row).any()
 
 
-def inside(view: Scene, own_m: np.ndarray) -> np.ndarray:
+def inside(view: GraspScene, own_m: np.ndarray) -> np.ndarray:
     """Return whether points in the body's own frame are well inside it (point,)."""
     shape: Any = view.thing.shape
     x, y, z = own_m.T
@@ -82,7 +82,7 @@ def inside(view: Scene, own_m: np.ndarray) -> np.ndarray:
 
 def test_an_independent_ray_caster_sees_the_same_cylinder() -> None:
     o3d = pytest.importorskip("open3d")
-    rig = Rig(families="cylinder", noise_scale=0.0)
+    rig = GraspRig(families="cylinder", noise_scale=0.0)
     view = scene(1, rig)
     shape: Any = view.thing.shape
     mesh = o3d.geometry.TriangleMesh.create_cylinder(shape.bottom_m, 2 * shape.half_m, resolution=720)
@@ -183,7 +183,7 @@ def test_objects_take_turns_and_stay_what_they_are_when_others_are_left_out() ->
     names = Counter(draw_thing(SEED, index, RIG).name for index in range(60))
     assert set(names.values()) == {2}
     assert len(names) == 30
-    only_cone = draw_thing(SEED, 0, Rig(families="cone"))
+    only_cone = draw_thing(SEED, 0, GraspRig(families="cone"))
     mixed_cone = draw_thing(SEED, household.FAMILIES.index("cone"), RIG)
     assert (only_cone.name, only_cone.shape) == (mixed_cone.name, mixed_cone.shape) == ("cone-01", mixed_cone.shape)
 
@@ -205,7 +205,7 @@ def thing_name(index: int) -> str:
 def test_spheres_of_all_sizes_look_the_same_but_for_scale_and_are_gripped_through_the_centre(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rig = Rig(spheres=True)
+    rig = GraspRig(spheres=True)
     normalised = []
     for radius in (0.015, 0.05):
         monkeypatch.setattr(household, "SPHERES_M", (radius, radius))
@@ -222,7 +222,7 @@ def test_spheres_of_all_sizes_look_the_same_but_for_scale_and_are_gripped_throug
 
 
 def test_spheres_differ_in_size_and_so_in_what_is_felt() -> None:
-    rig = Rig(spheres=True, effort_spread=0.05)
+    rig = GraspRig(spheres=True, effort_spread=0.05)
     recordings = [recording(index, rig) for index in range(40)]
     opening = np.array([Grasp.of(grasp_recording.streams["grasp"]).opening_m for grasp_recording in recordings])
     pressure = np.array(
@@ -235,7 +235,7 @@ def test_spheres_differ_in_size_and_so_in_what_is_felt() -> None:
 
 
 def test_with_one_pose_each_object_lies_with_the_same_side_up() -> None:
-    rig = Rig(families="box", objects=1, one_pose=True)
+    rig = GraspRig(families="box", objects=1, one_pose=True)
     ups = {int(np.argmax(np.abs(scene(index, rig).placed.rotation.T @ scene(index, rig).up))) for index in range(12)}
     free = replace(rig, one_pose=False)
     free_sides = {
@@ -296,14 +296,14 @@ def test_sensors_feel_nothing_before_contact_and_the_whole_touch_while_it_is_hel
 @pytest.mark.parametrize(
     ("rig", "words"),
     [
-        (Rig(families="box,teapot"), "There is no family 'teapot'"),
-        (Rig(stiffness="jelly"), "There is no stiffness 'jelly'"),
-        (Rig(objects=0), "objects is 0"),
-        (Rig(shift=1.5), "shift is 1.5"),
-        (Rig(effort_spread=-1), "effort_spread is -1"),
-        (Rig(raw=True, spheres=True), "raw and spheres are both set"),
+        (GraspRig(families="box,teapot"), "There is no family 'teapot'"),
+        (GraspRig(stiffness="jelly"), "There is no stiffness 'jelly'"),
+        (GraspRig(objects=0), "objects is 0"),
+        (GraspRig(shift=1.5), "shift is 1.5"),
+        (GraspRig(effort_spread=-1), "effort_spread is -1"),
+        (GraspRig(raw=True, spheres=True), "raw and spheres are both set"),
     ],
 )
-def test_a_rig_that_cannot_be_is_refused(rig: Rig, words: str) -> None:
+def test_a_rig_that_cannot_be_is_refused(rig: GraspRig, words: str) -> None:
     with pytest.raises(TacpipeError, match=words):
         simulate_trial(SEED, 0, rig)

@@ -14,7 +14,7 @@ from tacpipe.simulation.mechanics import (
     KINETIC,
     PATCH_M,
     Contact,
-    Grasp,
+    HeldObject,
     carry,
     run_profile,
 )
@@ -38,7 +38,7 @@ def threshold_m_s2(mass_kg: float, grip_n: float, friction: float, rate_hz: floa
 
 
 def twisted(lever_m: float, friction: float = 0.5) -> Contact:
-    return carry(Grasp(0.36, friction, np.full(3000, 6.0), lever_m), np.zeros((3000, 3)))
+    return carry(HeldObject(0.36, friction, np.full(3000, 6.0), lever_m), np.zeros((3000, 3)))
 
 
 @pytest.mark.parametrize(
@@ -126,14 +126,14 @@ def test_the_sum_of_the_normal_forces_stays_and_their_difference_moves_the_objec
 
 def test_the_table_bears_the_weight_until_the_lift() -> None:
     rise = np.concatenate([np.zeros(500), np.linspace(0, 0.1, 1000)])
-    motion = carry(Grasp(0.36, 0.5, np.full(1500, 6.0)), np.zeros((1500, 3)), rise)
+    motion = carry(HeldObject(0.36, 0.5, np.full(1500, 6.0)), np.zeros((1500, 3)), rise)
     assert not motion.force_n[:500].any()
     assert motion.force_n[-1, 2] == pytest.approx(0.36 * GRAVITY_M_S2)
 
 
 def test_a_grip_that_is_too_weak_leaves_the_object_on_the_table() -> None:
     rise = np.concatenate([np.zeros(500), np.linspace(0, 0.1, 1000)])
-    motion = carry(Grasp(0.52, 0.35, np.full(1500, 4.0)), np.zeros((1500, 3)), rise)
+    motion = carry(HeldObject(0.52, 0.35, np.full(1500, 4.0)), np.zeros((1500, 3)), rise)
     assert motion.dropped[-1]
     np.testing.assert_allclose(rise[-1] + motion.displacement_m[-1, 1], 0.0, atol=1e-9)
 
@@ -141,7 +141,7 @@ def test_a_grip_that_is_too_weak_leaves_the_object_on_the_table() -> None:
 def test_an_object_let_go_falls_freely_and_lies_where_it_lands() -> None:
     rise = np.full(1500, 0.2)
     grip = np.where(np.arange(1500) < 500, 6.0, 0.5)
-    motion = carry(Grasp(0.36, 0.5, grip), np.zeros((1500, 3)), rise)
+    motion = carry(HeldObject(0.36, 0.5, grip), np.zeros((1500, 3)), rise)
     velocity = motion.velocity_m_s[:, 1]
     falling = motion.dropped & (velocity < 0)
     np.testing.assert_allclose(np.diff(velocity[falling]), -GRAVITY_M_S2 / 1000)

@@ -15,10 +15,10 @@ from tacpipe.signals.contact import rest_level
 from tacpipe.signals.repairs import held
 from tacpipe.simulation import taxels
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
-from tacpipe.simulation.pick_and_move import MASSES_KG, Rig, Scene, perform, simulate_trial, touch
+from tacpipe.simulation.pick_and_move import MASSES_KG, PickRig, PickScene, perform, simulate_trial, touch
 from tests.fake_recordings import column
 
-CLEAN = Rig(
+CLEAN = PickRig(
     hold_probability=0.0,
     drop_probability=0.0,
     noise_scale=0.0,
@@ -30,7 +30,7 @@ CLEAN = Rig(
 STUCK = replace(CLEAN, friction_scale=4.0)
 
 
-def aloft(scene: Scene) -> np.ndarray:
+def aloft(scene: PickScene) -> np.ndarray:
     in_air: np.ndarray = scene.path.rise_m > 0.01
     return in_air
 
@@ -42,7 +42,7 @@ def tactile(table: pa.Table) -> np.ndarray:
     return counts
 
 
-def decoded(scene: Scene, recording: Any, finger: int) -> np.ndarray:
+def decoded(scene: PickScene, recording: Any, finger: int) -> np.ndarray:
     """Return the force on a finger (time, axis) from its counts, with base, gains and cross-talk known."""
     force = taxels.forces(scene.skins[finger], tactile(recording.streams[f"xela{finger + 1}"]))
     summed: np.ndarray = force.sum(axis=1)
@@ -106,7 +106,7 @@ def test_nothing_is_borne_before_the_grasp_or_on_the_table() -> None:
 
 
 def test_with_friction_enough_nothing_ever_slips() -> None:
-    scenes = [perform(0, index, Rig(duration_s=6.0, friction_scale=4.0)) for index in range(100)]
+    scenes = [perform(0, index, PickRig(duration_s=6.0, friction_scale=4.0)) for index in range(100)]
     assert not any(scene.contact.slip.any() or scene.contact.displacement_m.any() for scene in scenes)
 
 
@@ -124,12 +124,12 @@ def test_by_default_some_trials_slip_some_drop_and_most_hold() -> None:
 
 @pytest.mark.parametrize(("effort", "slips"), [(0.95, 0), (1.05, 12)])
 def test_effort_decides_whether_the_plan_makes_the_object_slip(effort: float, slips: int) -> None:
-    scenes = [perform(1, index, Rig(effort=effort)) for index in range(12)]
+    scenes = [perform(1, index, PickRig(effort=effort)) for index in range(12)]
     assert sum(scene.contact.slip.any() for scene in scenes) == slips
 
 
 def test_a_grip_that_gives_way_is_what_makes_the_object_slip() -> None:
-    rig = Rig(effort=0.9, grip_loss_probability=1.0, grip_loss=0.3)
+    rig = PickRig(effort=0.9, grip_loss_probability=1.0, grip_loss=0.3)
     late_ms = []
     for index in range(20):
         scene = perform(1, index, rig)
@@ -201,7 +201,7 @@ def test_slip_is_when_the_object_moves_and_a_dropped_one_touches_nothing() -> No
 
 
 def test_every_stream_has_its_own_rate_and_the_clocks_of_host_and_device() -> None:
-    rig = Rig(duration_s=20.0)
+    rig = PickRig(duration_s=20.0)
     recording = simulate_trial(0, 2, rig)
     rates = {"xela1": 50, "xela2": 50, "robot": 1000, "proximity": 400}
     assert set(recording.streams) == {*rates, "truth"}
@@ -231,14 +231,14 @@ def test_every_stream_has_its_own_rate_and_the_clocks_of_host_and_device() -> No
 
 
 def test_the_clock_of_the_device_leaves_the_stamps_of_the_host_alone() -> None:
-    near, far = (simulate_trial(0, 1, Rig(clock_offset_ms=offset)).streams["xela1"] for offset in (0.0, 80.0))
+    near, far = (simulate_trial(0, 1, PickRig(clock_offset_ms=offset)).streams["xela1"] for offset in (0.0, 80.0))
     assert near.column("t_ns").equals(far.column("t_ns"))
     assert not near.column("t_device_ns").equals(far.column("t_device_ns"))
 
 
 @pytest.mark.parametrize("probability", [0.07, 0.75])
 def test_held_frames_repeat_values_and_have_stamps_of_their_own(probability: float) -> None:
-    streams = simulate_trial(0, 0, Rig(duration_s=40.0, hold_probability=probability)).streams
+    streams = simulate_trial(0, 0, PickRig(duration_s=40.0, hold_probability=probability)).streams
     for name in ("xela1", "xela2"):
         assert held(tactile(streams[name])).mean() == pytest.approx(probability, abs=0.03)
         assert (np.diff(column(streams[name], "t_device_ns")) > 0).all()
@@ -280,11 +280,11 @@ def test_ground_truth_is_marked_as_such() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(TacpipeError, match=r"trial of 1\.0 s"):
-        simulate_trial(0, 0, Rig(duration_s=1.0))
+        simulate_trial(0, 0, PickRig(duration_s=1.0))
     with pytest.raises(TacpipeError, match="'free'"):
-        simulate_trial(0, 0, Rig(protocol="free"))
+        simulate_trial(0, 0, PickRig(protocol="free"))
 
 
 def test_every_trial_of_four_seconds_has_a_lift() -> None:
     for index in range(100):
-        assert perform(9, index, Rig(duration_s=4.0)).path.rise_m.max() > 0
+        assert perform(9, index, PickRig(duration_s=4.0)).path.rise_m.max() > 0

@@ -93,7 +93,7 @@ def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return how far the channels of each finger, then of the arm, lie from the truth on the grid, in units of its sd."""
     rig = {"noise_scale": 0.0, "hold_probability": 0.0, "friction_scale": 4.0}
     table = synced(recorded(trial, **rig), clock=clock).streams[""]
-    scene = pick_and_move.perform(0, trial, pick_and_move.Rig(**rig))  # type: ignore[arg-type]
+    scene = pick_and_move.perform(0, trial, pick_and_move.PickRig(**rig))  # type: ignore[arg-type]
     true_ns = table.column("t_ns").to_numpy() - pick_and_move.START_NS - trial * pick_and_move.TRIAL_NS
     fingers = []
     for finger, skin in enumerate(scene.skins):

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.simulation.slide import Rig
+from tacpipe.simulation.slide import SlideRig
 from tacpipe.testing.texture_likelihood import likelihood_accuracy
 from tests.simulation.slide_datasets import SEED, indices, slides
 from tests.tasks.material.textures import dataset, evaluated, trained
 
-RIG = Rig(materials=8, pac=False, arm_every=0)
+RIG = SlideRig(materials=8, pac=False, arm_every=0)
 FEWER = replace(RIG, materials=6)  # Networks train for long, so they get fewer materials.
 BOTH = ("biotac", "roboskin")
 TRAINING, WATCHED, TESTED = range(30), range(30, 34), range(34, 44)
@@ -41,7 +41,7 @@ NETWORK = {
 }
 
 
-def parts(rig: Rig, frames: int = 400, sensors: tuple[str, ...] = BOTH) -> list[Any]:
+def parts(rig: SlideRig, frames: int = 400, sensors: tuple[str, ...] = BOTH) -> list[Any]:
     return [slides(rig, indices(rig, sensors, numbers), frames=frames) for numbers in (TRAINING, WATCHED, TESTED)]
 
 

@@ -18,10 +18,10 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.registry import load
 from tacpipe.signals.array_order import is_time, lag_one, scramble, unscramble
 from tacpipe.simulation import fingertip, forearm
-from tacpipe.simulation.slide import SENSORS, Rig, material, nuisance, place, simulate_trial
+from tacpipe.simulation.slide import SENSORS, SlideRig, material, nuisance, place, simulate_trial
 from tests.fake_recordings import column
 
-PLAIN = Rig(pac=False, arm_every=0)
+PLAIN = SlideRig(pac=False, arm_every=0)
 QUIET = replace(PLAIN, noise_scale=0.0, session_scale=0.0)
 APERTURE_M = {"biotac": 0.0006, "roboskin": 0.0018}
 stage = load("simulate.material")
@@ -38,7 +38,7 @@ def tactile(table: pa.Table) -> np.ndarray:
     return np.column_stack([column(table, name) for name in names]).astype(float)
 
 
-def middle(sensor: str, index: int, rig: Rig, seed: int = 0) -> np.ndarray:
+def middle(sensor: str, index: int, rig: SlideRig, seed: int = 0) -> np.ndarray:
     """Return the middle 400 frames of a slide of the BioTac, or all of RoboSkin (time, channel)."""
     streams = simulate_trial(seed, index, rig).streams
     counts = tactile(streams[sensor])
@@ -67,7 +67,7 @@ def test_the_dominant_peak_is_the_speed_over_the_wavelength_that_is_felt_most(
     assert np.mean(right) >= lowest_share
 
 
-def peak(sensor: str, number: int, rig: Rig) -> tuple[float, float]:
+def peak(sensor: str, number: int, rig: SlideRig) -> tuple[float, float]:
     """Return the frequency of the largest power of ten trials, summed over adjacent bins, and the bin width, in Hz."""
     speed_m_s, rate_hz, fine = rig.speed_m_s, 100.0 if sensor == "biotac" else 50.0, 8
     power: Any = 0.0
@@ -191,7 +191,7 @@ def test_time_of_roboskin_is_the_axis_that_the_rule_finds_until_it_is_scrambled(
 
 @given(st.integers(0, 2000), st.integers(1, 25), st.integers(1, 4))
 def test_trials_take_turns_over_sensors_then_materials_then_sessions(index: int, materials: int, sessions: int) -> None:
-    placed = place(index, Rig(materials=materials, sessions=sessions))
+    placed = place(index, SlideRig(materials=materials, sessions=sessions))
     assert placed.sensor == ("biotac", "roboskin")[index % 2]
     assert placed.material == index // 2 % materials + 1
     assert placed.number == index // (2 * materials)
@@ -286,7 +286,7 @@ def test_a_session_tells_the_class_of_identical_materials_and_another_session_do
 
 
 def test_sensors_share_their_materials_unless_their_spectra_are_independent() -> None:
-    independent = Rig(spectra="independent")
+    independent = SlideRig(spectra="independent")
     for number in (1, 7, 20):
         finger, arm = (material(0, sensor, number) for sensor in SENSORS)
         np.testing.assert_array_equal(finger.wavelength_m, arm.wavelength_m)
@@ -358,9 +358,9 @@ def test_the_same_seed_and_trial_give_the_same_bytes(index: int) -> None:
 
 
 def test_materials_sessions_and_trials_have_random_numbers_of_their_own() -> None:
-    three_sessions, single = Rig(sessions=3), Rig(sessions=1)
+    three_sessions, single = SlideRig(sessions=3), SlideRig(sessions=1)
     assert nuisance(0, trial("biotac", 0), 19, three_sessions)[0] == nuisance(0, trial("biotac", 0), 19, single)[0]
-    five_materials = Rig(materials=5)
+    five_materials = SlideRig(materials=5)
     np.testing.assert_array_equal(
         material(0, "biotac", 4, five_materials).wavelength_m, material(0, "biotac", 4, single).wavelength_m
     )
@@ -371,8 +371,8 @@ def test_materials_sessions_and_trials_have_random_numbers_of_their_own() -> Non
 
 def test_a_rig_that_cannot_be_is_refused() -> None:
     with pytest.raises(TacpipeError, match="'other'"):
-        simulate_trial(0, 0, Rig(spectra="other"))
+        simulate_trial(0, 0, SlideRig(spectra="other"))
     with pytest.raises(TacpipeError, match=r"materials is 0.*1"):
-        simulate_trial(0, 0, Rig(materials=0))
+        simulate_trial(0, 0, SlideRig(materials=0))
     with pytest.raises(TacpipeError, match=r"speed_m_s is 0\.0.*above 0"):
-        simulate_trial(0, 0, Rig(speed_m_s=0.0))
+        simulate_trial(0, 0, SlideRig(speed_m_s=0.0))

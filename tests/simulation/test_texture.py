@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.simulation import texture
-from tacpipe.simulation.slide import Rig
+from tacpipe.simulation.slide import SlideRig
 from tacpipe.testing.texture_likelihood import likelihood_accuracy, likelihood_materials, log_likelihoods
 
 
@@ -71,18 +71,18 @@ def test_two_tracks_of_a_material_differ_and_the_same_numbers_give_the_same_trac
 @pytest.mark.parametrize(("sensor", "lowest_accuracy"), [(0, 0.98), (1, 0.9)])
 @pytest.mark.parametrize("noise_scale", [0.0, 1.0])
 def test_known_spectra_tell_most_materials(sensor: int, lowest_accuracy: float, noise_scale: float) -> None:
-    assert likelihood_accuracy(0, range(sensor, 160, 2), Rig(noise_scale=noise_scale)) >= lowest_accuracy
+    assert likelihood_accuracy(0, range(sensor, 160, 2), SlideRig(noise_scale=noise_scale)) >= lowest_accuracy
 
 
 def test_noise_makes_materials_harder_to_tell() -> None:
     trials = range(1, 80, 2)
-    loud = likelihood_accuracy(0, trials, Rig(noise_scale=30.0))
-    assert loud < likelihood_accuracy(0, trials, Rig()) - 0.2
+    loud = likelihood_accuracy(0, trials, SlideRig(noise_scale=30.0))
+    assert loud < likelihood_accuracy(0, trials, SlideRig()) - 0.2
 
 
 @pytest.mark.parametrize("sensor", [0, 1])
 def test_materials_that_are_identical_cannot_be_told_apart(sensor: int) -> None:
-    rig = Rig(materials=4, identical_materials=True)
+    rig = SlideRig(materials=4, identical_materials=True)
     assert likelihood_accuracy(0, range(sensor, 64, 2), rig) == 0.25  # Of equal likelihoods, the first wins.
     assert not np.ptp(log_likelihoods(0, sensor, rig))
     assert likelihood_materials(0, [sensor, sensor + 2], rig).tolist() == [1, 1]

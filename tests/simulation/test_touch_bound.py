@@ -9,15 +9,15 @@ import pytest
 
 from tacpipe.simulation import fingertip_sp, pinch, touch_bound
 from tacpipe.simulation.grasp import stamp_ns
-from tacpipe.simulation.grasp_scene import Rig, perform, read_sensors, sensors
+from tacpipe.simulation.grasp_scene import GraspRig, perform, read_sensors, sensors
 from tests.simulation.grasp_datasets import SEED, grasps, readings
 
-RIG = Rig()
+RIG = GraspRig()
 TRIALS = range(240)
 
 
 def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognormal_effort() -> None:
-    situation = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(1)
     possible = touch_bound.readings(
         situation, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
@@ -30,7 +30,7 @@ def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognorma
 
 
 def test_drift_and_noise_add_their_own_variances() -> None:
-    situation = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(2)
     possible = touch_bound.readings(
         situation, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0

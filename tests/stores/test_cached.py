@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import computing
-from tacpipe.engine.keys import Done, Task
+from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location, records
-from tacpipe.store.addresses import Address, parsed
+from tacpipe.store.addresses import BucketAddress, parsed
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.cached import CachedStore
 from tacpipe.store.remote import RemoteStore
@@ -281,7 +281,7 @@ def test_each_address_and_server_has_a_folder_of_its_own(monkeypatch: pytest.Mon
     def folder(address: str, endpoint: str = "") -> Path:
         monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
         parsed_address = parsed(address)
-        assert isinstance(parsed_address, Address)
+        assert isinstance(parsed_address, BucketAddress)
         return cached.folder(parsed_address)
 
     monkeypatch.setenv("TACPIPE_CACHE", str(tmp_path / "copies"))
@@ -632,7 +632,7 @@ def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_loo
     for _, record in computers.store.records():
         identity = record["identity"]
         if identity.get("stage") in tasks:
-            tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
+            tasks[identity["stage"]].append(WorkerTask(computers.address, identity["stage"], identity))
     computers.enter("second")
     results = list(computing.compute.compute_all(tasks["simulate.toy"]))
     assert len(results) == 12 and not any(task.is_new for task in results)
@@ -828,7 +828,7 @@ def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucke
 ) -> None:
     honest = computing.compute
 
-    def elsewhere(task: Task) -> Done:
+    def elsewhere(task: WorkerTask) -> Done:
         with monkeypatch.context() as patch:
             patch.setenv("TACPIPE_CACHE", str(computers.lab.folder / "worker"))
             return honest(replace(task, run=""))

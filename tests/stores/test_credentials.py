@@ -7,12 +7,12 @@ import pytest
 
 from tacpipe.errors import UsageError
 from tacpipe.store import addresses
-from tacpipe.store.addresses import Address
+from tacpipe.store.addresses import BucketAddress
 from tests.conftest import Lab
 from tests.stores import places
 from tests.stores.places import KEY, SECRET
 
-LAB = Address("s3", "lab/store")
+LAB = BucketAddress("s3", "lab/store")
 
 
 def settings(tmp_path: Path, credentials: str = "", config: str = "", **environment: str) -> dict[str, Any]:
@@ -105,6 +105,6 @@ def test_a_real_server_refuses_a_wrong_secret_and_the_sentence_shows_neither(
 
 def test_the_account_of_an_address_of_azure_is_a_setting_and_the_container_is_the_first_folder() -> None:
     address = addresses.parsed("az://account/container/touch/store")
-    assert isinstance(address, addresses.Address)
+    assert isinstance(address, addresses.BucketAddress)
     resolved = addresses.settings(address, {})
     assert (resolved.config["account_name"], resolved.url) == ("account", "az://container/touch/store")

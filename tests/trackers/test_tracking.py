@@ -76,7 +76,7 @@ def test_a_tracker_gets_params_then_every_epoch_then_the_figures_and_the_path(tm
 def test_epochs_whose_messages_did_not_come_are_given_at_the_end() -> None:
     tracker = Kept()
     tracked, line = Tracking({"kept": tracker}, "m-1", {}), {"train_loss": 0.5, "val_loss": 0.25}
-    tracked.begin(following.Network(3), [])
+    tracked.begin(following.TrainedNetwork(3), [])
     tracked.line({"epoch": 1, **line}, 0.5)
     lines = [{"epoch": epoch, **line} for epoch in (1, 2, 3)]
     tracked.finish(Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(lines)})

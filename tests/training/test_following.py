@@ -16,8 +16,8 @@ import torch
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress, termination
 from tacpipe.training import display, following
-from tacpipe.training.following import Line, Network
-from tacpipe.training.loop import Loss, Part, Trained, Windows, train
+from tacpipe.training.following import Line, TrainedNetwork
+from tacpipe.training.loop import Loss, Trained, WindowSet, WindowTraining, train
 from tests.training.test_loop import SCHEDULE, build, interrupted_after, loss, run, same
 
 
@@ -25,14 +25,14 @@ class Seen:
     """A follower that keeps what it was called with."""
 
     def __init__(self, act: Callable[[], None] = lambda: None) -> None:
-        self.networks: list[tuple[Network, list[Line]]] = []
+        self.networks: list[tuple[TrainedNetwork, list[Line]]] = []
         self.passed: list[float] = []
         self.losses: list[float] = []
         self.lines: list[tuple[Line, float]] = []
         self.ends: list[bool] = []
         self.act = act
 
-    def begin(self, network: Network, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         self.networks.append((network, list(history)))
 
     def batch(self, passed: float, mean: Callable[[], float]) -> None:
@@ -71,7 +71,7 @@ def test_a_follower_is_called_at_every_batch_and_every_epoch(tmp_path: Path) -> 
 def test_the_learning_rate_of_a_line_is_that_of_its_first_batch(tmp_path: Path) -> None:
     follower, schedule = Seen(), dataclasses.replace(SCHEDULE, cycle=True, patience=9)
     with following.in_workspace(tmp_path, follower):
-        train(build, Windows(Part(32, loss), Part(40, loss), schedule.batch), schedule, tmp_path)
+        train(build, WindowTraining(WindowSet(32, loss), WindowSet(40, loss), schedule.batch), schedule, tmp_path)
 
     assert [rate for _, rate in follower.lines] == [schedule.rate(epoch / 6) for epoch in range(6)]
 
@@ -119,7 +119,7 @@ def test_an_interrupt_is_stated_with_the_epoch_that_is_resumed(
 def test_the_lines_of_several_networks_are_in_one_file_with_their_labels(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    work = Windows(Part(32, loss), Part(40, loss), SCHEDULE.batch)
+    work = WindowTraining(WindowSet(32, loss), WindowSet(40, loss), SCHEDULE.batch)
     with display.on_stderr("train", tmp_path) as displays, following.in_workspace(tmp_path, *displays):
         trainings = [
             train(build, work, SCHEDULE, tmp_path / name, number=number, count=2, labels={"target": name})
@@ -160,7 +160,7 @@ def test_a_file_that_cannot_be_written_is_reported_once_and_ends_no_training(
     (tmp_path / "full").mkdir()
     with monkeypatch.context() as patch, following.in_workspace(tmp_path / "full"):
         patch.setattr(os, "write", full)
-        with following.network(Network(2), []) as followers:
+        with following.network(TrainedNetwork(2), []) as followers:
             for epoch in (1, 2):
                 followers.line({"epoch": epoch}, 0.1)
     assert capsys.readouterr().err.count("No space left") == 1

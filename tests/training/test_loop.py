@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.training import loop
-from tacpipe.training.loop import Loss, Part, Schedule, Trained, Windows, train
+from tacpipe.training.loop import Loss, Schedule, Trained, WindowSet, WindowTraining, train
 
 SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
 INPUTS = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
@@ -26,7 +26,9 @@ def loss(model: nn.Module, indices: Tensor) -> Tensor:
 
 
 def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE) -> Trained:
-    return train(build, Windows(Part(32, training_loss), Part(40, loss), schedule.batch), schedule, folder)
+    return train(
+        build, WindowTraining(WindowSet(32, training_loss), WindowSet(40, loss), schedule.batch), schedule, folder
+    )
 
 
 def interrupted_after(calls: int) -> Loss:
@@ -107,7 +109,9 @@ def test_training_stops_when_validation_no_longer_improves_and_keeps_the_best(tm
         return torch.tensor(next(validation))
 
     schedule = dataclasses.replace(SCHEDULE, epochs=50, batch=100)
-    trained = train(build, Windows(Part(32, loss), Part(40, scripted), schedule.batch), schedule, tmp_path)
+    trained = train(
+        build, WindowTraining(WindowSet(32, loss), WindowSet(40, scripted), schedule.batch), schedule, tmp_path
+    )
     assert [line["best"] for line in trained.history] == [True, True, False, False, False]
     assert all(torch.equal(trained.weights[name], states[1][name]) for name in states[1])
 
@@ -117,7 +121,9 @@ def test_the_loss_of_an_epoch_is_the_mean_over_windows_and_not_over_batches(tmp_
         return loss(model, indices) * 0 + len(indices)
 
     schedule = dataclasses.replace(SCHEDULE, epochs=1, batch=20)
-    trained = train(build, Windows(Part(32, by_size), Part(32, by_size), schedule.batch), schedule, tmp_path)
+    trained = train(
+        build, WindowTraining(WindowSet(32, by_size), WindowSet(32, by_size), schedule.batch), schedule, tmp_path
+    )
     assert trained.history[0]["val_loss"] == trained.history[0]["train_loss"] == (20 * 20 + 12 * 12) / 32
 
 
@@ -215,13 +221,13 @@ def test_weights_that_need_no_gradient_stay_as_they_were(tmp_path: Path) -> None
 
     torch.manual_seed(SCHEDULE.seed)
     before = {name: value.clone() for name, value in frozen().state_dict().items()}
-    after = train(frozen, Windows(Part(32, loss), Part(40, loss), 8), SCHEDULE, tmp_path).last
+    after = train(frozen, WindowTraining(WindowSet(32, loss), WindowSet(40, loss), 8), SCHEDULE, tmp_path).last
     assert torch.equal(after["2.weight"], before["2.weight"])
     assert not torch.equal(after["0.weight"], before["0.weight"])
 
 
 def test_parts_without_windows_and_schedules_without_steps_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="The validation recordings hold no window"):
-        train(build, Windows(Part(3, loss), Part(0, loss), 8), SCHEDULE, tmp_path)
+        train(build, WindowTraining(WindowSet(3, loss), WindowSet(0, loss), 8), SCHEDULE, tmp_path)
     with pytest.raises(TacpipeError, match="epochs is 0"):
         dataclasses.replace(SCHEDULE, epochs=0)

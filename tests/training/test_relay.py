@@ -6,17 +6,17 @@ import json
 from pathlib import Path
 
 from tacpipe.training import following
-from tacpipe.training.following import Network
+from tacpipe.training.following import TrainedNetwork
 from tests.training.test_following import Seen, followed
 
-NETWORK = Network(4, number=2, count=3, labels={"member": 1})
+NETWORK = TrainedNetwork(4, number=2, count=3, labels={"member": 1})
 
 
 def line(epoch: int) -> following.Message:
     return {"line": {"epoch": epoch, "val_loss": 0.5}, "learning_rate": 0.25}
 
 
-def begin(*epochs: int, network: Network = NETWORK) -> following.Message:
+def begin(*epochs: int, network: TrainedNetwork = NETWORK) -> following.Message:
     messages: list[following.Message] = []
     following.Sender(messages.append).begin(network, [{"epoch": epoch} for epoch in epochs])
     return json.loads(json.dumps(messages[0]))  # type: ignore[no-any-return]
@@ -81,7 +81,7 @@ def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
 def test_the_next_network_is_begun_once_the_one_before_has_ended() -> None:
     follower = Seen()
     receiver = following.Receiver([follower])
-    next_network = Network(4, number=3, count=3, labels={"member": 2})
+    next_network = TrainedNetwork(4, number=3, count=3, labels={"member": 2})
     for message in (begin(), line(1), {"end": True}, begin(network=next_network), line(1), {"end": True}):
         receiver.take(message)
 

@@ -19,7 +19,7 @@ from tests.fake_recordings import FakeShard
 from tests.viewer import hand
 
 
-def drawn() -> contents.Contents:
+def drawn() -> contents.DrawnContents:
     return contents.of(hand.recording())  # type: ignore[arg-type]
 
 

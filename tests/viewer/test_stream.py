@@ -71,7 +71,7 @@ def static(batches: list[pa.RecordBatch], component: str) -> Any:
 
 def write_and_read(
     folder: Path, **extra_streams: pa.Table
-) -> tuple[contents.Contents, dict[str, list[pa.RecordBatch]]]:
+) -> tuple[contents.DrawnContents, dict[str, list[pa.RecordBatch]]]:
     drawn = contents.of(hand.recording(**extra_streams))  # type: ignore[arg-type]
     (file,) = session.write([drawn], folder, "data/hand")
     return drawn, read(file)

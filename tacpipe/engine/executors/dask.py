@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.engine import execution, processor, provenance
 from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks
-from tacpipe.engine.keys import Done, Task
+from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
 from tacpipe.io.hashing import digest
@@ -129,7 +129,9 @@ class Dask:
         self.client, self._expected = client, expected
         self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
 
-    def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
+    def run(
+        self, compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], preload: Sequence[str]
+    ) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
 
         Raises `TacpipeError` where there is no worker, where one is unlike this process or cannot reach the store, where
@@ -160,7 +162,7 @@ class Dask:
                     self.client.cancel(futures)  # type: ignore[no-untyped-call]
 
     @contextlib.contextmanager
-    def _followed(self, tasks: Sequence[Task]) -> Iterator[str]:
+    def _followed(self, tasks: Sequence[WorkerTask]) -> Iterator[str]:
         """Follow the training of a task in a worker; yield the topic of its messages, empty without followers.
 
         Followers are called in a thread of their own: the client's own thread must not wait for a tracker's server.
@@ -309,7 +311,7 @@ def _is_here(address: str) -> bool:
         return False
 
 
-def _absolute(task: Task) -> Task:
+def _absolute(task: WorkerTask) -> WorkerTask:
     """Return the task with paths that hold in another process's folder."""
     if task.files is None:
         return task
@@ -331,7 +333,7 @@ _leases: dict[str, str] = {}  # Leases of this worker, by the lease of the run t
 
 
 def _work(
-    versions: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task], topic: str
+    versions: Mapping[str, Any], compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], topic: str
 ) -> list[Done] | Exception:
     """Return ``compute`` of each task, or the error that prevented it; trainings are followed by a topic's readers."""
     from distributed import get_worker
@@ -348,7 +350,7 @@ def _work(
         return compute_chunk(compute, [replace(task, run=lease) for task in tasks])
 
 
-def _check(name: str, versions: Mapping[str, Any], task: Task) -> None:
+def _check(name: str, versions: Mapping[str, Any], task: WorkerTask) -> None:
     differences = unlike(versions, local_versions(task.name))
     if differences:
         raise UsageError(
@@ -372,7 +374,7 @@ def _at_work(run: str) -> bool:
     return os.path.exists(run)  # noqa: PTH110
 
 
-def _lease(task: Task) -> str:
+def _lease(task: WorkerTask) -> str:
     """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run is at work.
 
     Two computers do not write to one lease: on a network file system one would overwrite what the other announces. In a

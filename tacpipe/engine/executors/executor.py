@@ -22,7 +22,7 @@ class Executor(Protocol):
     """
 
     def run(self, compute: Callable[[Any], Any], tasks: Sequence[Any], preload: Sequence[str]) -> Iterator[Any]:
-        """Yield ``compute(task)`` of every task (`tacpipe.engine.keys.Task`), in any order.
+        """Yield ``compute(task)`` of every task (`tacpipe.engine.keys.WorkerTask`), in any order.
 
         ``preload`` are modules that a worker will need. Raises `TacpipeError` where tasks cannot be computed there; what
         was finished is in the store by then. Where the iterator is closed, nothing that waits is begun. What a result
@@ -31,7 +31,7 @@ class Executor(Protocol):
         ...  # a protocol has no body
 
 
-class Chosen:
+class ChosenExecutor:
     """The executor that a command names, used within a block; it is opened for the first work."""
 
     def __init__(self, executor: str, jobs: int) -> None:
@@ -42,7 +42,7 @@ class Chosen:
         self._stack = ExitStack()
         self._open: Executor | None = None
 
-    def __enter__(self) -> Chosen:
+    def __enter__(self) -> ChosenExecutor:
         return self
 
     def __exit__(self, *raised: Any) -> bool | None:

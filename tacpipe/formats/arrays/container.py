@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
 from tacpipe.formats.arrays import episodes, zarr
-from tacpipe.formats.arrays.episodes import Episode, Part
+from tacpipe.formats.arrays.episodes import Episode, StreamArrays
 from tacpipe.formats.arrays.tree import (
     MAX_TEXT,
     Tree,
@@ -26,7 +26,7 @@ from tacpipe.formats.arrays.tree import (
     plain_attributes,
 )
 from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream
+from tacpipe.formats.containers.container import Batched, EpisodeContents, Share, SourceStream
 from tacpipe.formats.table import column_names
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
@@ -37,7 +37,7 @@ BLOCK_BYTES = 1 << 25  # bytes read at once; a larger chunk of the file is read 
 OBJECT_BYTES = 200  # assumed size of a text in memory
 MASK = "mask"  # the group of robomimic's lists
 MAX_DEPTH = 4  # levels of JSON in attributes
-RowsOf = Callable[[Tree, Episode, Part], "pa.Table | Batched"]
+RowsOf = Callable[[Tree, Episode, StreamArrays], "pa.Table | Batched"]
 
 
 @dataclass(frozen=True)
@@ -58,17 +58,17 @@ class ArrayContainer:
         with self.open_tree() as tree:
             return all(episode.name_is_stated for episode in episodes.find_episodes(tree))
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         """Return the streams of a recording with their first rows."""
         with self.open_tree() as tree:
             return _read_contents(tree, episodes.find_episode(tree, episode), None, _first_rows)
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams of a recording, all or those of some sources; of long ones the rows stay in the file."""
         with self.open_tree() as tree:
             return _read_contents(tree, episodes.find_episode(tree, episode), sources, self._rows)
 
-    def _rows(self, tree: Tree, episode: Episode, part: Part) -> pa.Table | Batched:
+    def _rows(self, tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table | Batched:
         """Return the rows of a stream, block by block from the file where they are more than one block."""
         start, count = episode.start, episodes.row_count(episode, part)
         step = _block_rows(tree, episode, part)
@@ -128,7 +128,7 @@ def open_zarr(path: Path) -> ArrayContainer:
     return ArrayContainer(path, lambda: zarr.open_zarr(path))
 
 
-def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None, rows: RowsOf) -> Contents:
+def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None, rows: RowsOf) -> EpisodeContents:
     streams_and_scalars = episodes.group_into_parts(tree, episode)
     skipped = dict(streams_and_scalars.skipped)
     attributes, long = _read_attributes(tree, episode)
@@ -162,7 +162,7 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
         )
         for part, time in chosen
     ]
-    return Contents(streams, attributes, skipped, tree.notes)
+    return EpisodeContents(streams, attributes, skipped, tree.notes)
 
 
 def _masks(tree: Tree, episode: Episode) -> dict[str, Attribute]:
@@ -177,7 +177,7 @@ def _decode_texts(values: AnyArray) -> set[str]:
     return {value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values.tolist()}
 
 
-def _stream_names(parts_read: Sequence[Part]) -> dict[str, str]:
+def _stream_names(parts_read: Sequence[StreamArrays]) -> dict[str, str]:
     """Return a name for each stream by its source: the last part of it where no other has the same."""
     last = [part.source.rpartition("/")[2] for part in parts_read]
     root = "steps" if "steps" not in last else episodes.ROOT
@@ -189,13 +189,13 @@ def _stream_names(parts_read: Sequence[Part]) -> dict[str, str]:
     return {source: names[name] for source, name in called.items()}
 
 
-def _first_rows(tree: Tree, episode: Episode, part: Part) -> pa.Table:
+def _first_rows(tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table:
     return _rows_table(
         tree, episode, part, episode.start, episode.start + min(episodes.row_count(episode, part), LOOK_ROWS)
     )
 
 
-def _block_rows(tree: Tree, episode: Episode, part: Part) -> int:
+def _block_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
     """Return how many rows of a stream are read at once: whole chunks, since a file gives no less."""
     row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all_arrays)
     if part.frames and episodes.row_count(episode, part):
@@ -205,7 +205,7 @@ def _block_rows(tree: Tree, episode: Episode, part: Part) -> int:
     return -(-rows // chunk_rows) * chunk_rows if chunk_rows else rows
 
 
-def _rows_table(tree: Tree, episode: Episode, part: Part, start: int, stop: int) -> pa.Table:
+def _rows_table(tree: Tree, episode: Episode, part: StreamArrays, start: int, stop: int) -> pa.Table:
     fields: list[pa.Field] = []
     values: list[pa.Array] = []
     is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))

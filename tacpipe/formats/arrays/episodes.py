@@ -13,7 +13,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import Array, Tree, is_frames, reason_left_out, walk
+from tacpipe.formats.arrays.tree import ArrayDescription, Tree, is_frames, reason_left_out, walk
 from tacpipe.formats.containers.container import Time, TimeUnit
 from tacpipe.io import memory
 from tacpipe.printable import plain
@@ -127,7 +127,7 @@ def _labels_of_episode(labels: Any, name: str) -> Mapping[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def _read_ends(tree: Tree, array: Array) -> AnyArray:
+def _read_ends(tree: Tree, array: ArrayDescription) -> AnyArray:
     if array.problem:
         raise TacpipeError(f"{tree.path}: {array.path} {array.problem}.")
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
@@ -161,16 +161,16 @@ ROOT = "/"  # the source of arrays that lie in the recording's own group
 
 
 @dataclass(frozen=True)
-class Part:
+class StreamArrays:
     """The arrays of one stream: ``source`` names it within the recording, ``time`` is the array of its stamps."""
 
     source: str
-    arrays: Sequence[Array]
-    time: Array | None
+    arrays: Sequence[ArrayDescription]
+    time: ArrayDescription | None
     frames: bool = False  # True where its one array holds encoded pictures
 
     @property
-    def all_arrays(self) -> Sequence[Array]:
+    def all_arrays(self) -> Sequence[ArrayDescription]:
         """The arrays with that of the stamps."""
         return [*([] if self.time is None else [self.time]), *self.arrays]
 
@@ -187,22 +187,22 @@ class Part:
 class StreamParts:
     """The streams of a recording, arrays of one value, and what is left out with the reason."""
 
-    parts: Sequence[Part]
-    scalars: Sequence[Array] = ()
+    parts: Sequence[StreamArrays]
+    scalars: Sequence[ArrayDescription] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
 
 
 def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
     """Return the streams of a recording, in the order of the file."""
-    parts: list[Part] = []
-    scalars: list[Array] = []
+    parts: list[StreamArrays] = []
+    scalars: list[ArrayDescription] = []
     skipped: dict[str, str] = {}
-    stamps: list[Array] = []  # stamps in groups above, for arrays of their length without own stamps
+    stamps: list[ArrayDescription] = []  # stamps in groups above, for arrays of their length without own stamps
     for group, arrays in walk(tree, episode.group):
         inside = episode.inside(group)
         if inside.rpartition("/")[2] == NEXT:
             skipped[inside] = "repeats obs, one step later"
-        columns_of_group: list[Array] = []
+        columns_of_group: list[ArrayDescription] = []
         for array in arrays:
             reason = _reason_left_out(array, episode)
             if NEXT in inside.split("/"):
@@ -218,7 +218,7 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
     return StreamParts(parts, scalars, skipped)
 
 
-def _reason_left_out(array: Array, episode: Episode) -> str:
+def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
     """Return why an array is left out; empty where it is not."""
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
@@ -229,20 +229,22 @@ def _reason_left_out(array: Array, episode: Episode) -> str:
     )
 
 
-def _is_column(array: Array, neighbours: Sequence[Array], episode: Episode) -> bool:
+def _is_column(array: ArrayDescription, neighbours: Sequence[ArrayDescription], episode: Episode) -> bool:
     """Return whether an array has a value a row rather than one of the recording."""
     lengths = {neighbour.shape[0] for neighbour in neighbours if neighbour.shape}
     return bool(array.shape) and (array.shape != (1,) or lengths == {1} or episode.stop is not None)
 
 
-def _divide_by_length(arrays: Sequence[Array], group: str, episode: Episode, above: Sequence[Array]) -> Iterator[Part]:
+def _divide_by_length(
+    arrays: Sequence[ArrayDescription], group: str, episode: Episode, above: Sequence[ArrayDescription]
+) -> Iterator[StreamArrays]:
     """Yield the streams of one group's arrays, named by the group where it holds one, else by the first array of each."""
     single_streams = [
         array
         for array in arrays
         if array.dtype.kind == "V" or (is_frames(array) and "quantity" not in array.attributes)
     ]
-    by_length: dict[int, list[Array]] = {}
+    by_length: dict[int, list[ArrayDescription]] = {}
     for array in arrays:
         if array not in single_streams:
             by_length.setdefault(array.shape[0], []).append(array)
@@ -252,15 +254,15 @@ def _divide_by_length(arrays: Sequence[Array], group: str, episode: Episode, abo
         columns = [array for array in same if array is not time]
         if columns:
             named_by_array = is_divided or (group == ROOT and len(columns) == 1)
-            yield Part(episode.inside(columns[0].path) if named_by_array else group, columns, time)
+            yield StreamArrays(episode.inside(columns[0].path) if named_by_array else group, columns, time)
     for array in single_streams:
         time = _clock_array(
             by_length.get(array.shape[0], []), [clock for clock in above if clock.shape[0] == array.shape[0]]
         )
-        yield Part(episode.inside(array.path), [array], time, is_frames(array))
+        yield StreamArrays(episode.inside(array.path), [array], time, is_frames(array))
 
 
-def _clock_array(same: Sequence[Array], above: Sequence[Array]) -> Array | None:
+def _clock_array(same: Sequence[ArrayDescription], above: Sequence[ArrayDescription]) -> ArrayDescription | None:
     """Return the array that holds the stamps of arrays of one length: among them, else in a group above."""
     clocks = [array for array in same if _is_time(array)]
     clock = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
@@ -268,7 +270,7 @@ def _clock_array(same: Sequence[Array], above: Sequence[Array]) -> Array | None:
     return clock or next((array for array in reversed(above) if length is None or array.shape[0] == length), None)
 
 
-def _is_time(array: Array) -> bool:
+def _is_time(array: ArrayDescription) -> bool:
     narrow = len(array.shape) == 1 or array.shape[1:] == (1,)
     return (
         narrow
@@ -287,7 +289,7 @@ SINCE_1970: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e
 MIN_UNIX_S = 1e8  # seconds since 1970: what is less counts from the start of a recording
 
 
-def time_of_part(tree: Tree, episode: Episode, part: Part) -> Time:
+def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
     """Return where the stamps of a stream come from; an empty `Time` where the file states neither stamps nor a rate."""
     if part.clock:
         unit = _stamp_unit(part, size := _last_stamp(tree, episode, part))
@@ -299,7 +301,7 @@ def time_of_part(tree: Tree, episode: Episode, part: Part) -> Time:
     return Time() if rate is None else Time(rate_hz=rate)
 
 
-def row_count(episode: Episode, part: Part) -> int:
+def row_count(episode: Episode, part: StreamArrays) -> int:
     """Return how many rows of a stream belong to a recording."""
     length = part.arrays[0].shape[0]
     return max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
@@ -315,7 +317,7 @@ def parent_groups(group: str) -> list[str]:
     return ["/".join(names[:count]) for count in range(len(names) + 1)]
 
 
-def _last_stamp(tree: Tree, episode: Episode, part: Part) -> float:
+def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
     """Return the last stamp of a stream as its file holds it, without sign; 0 where there is none."""
     array = part.time or part.arrays[0]
     last = episode.start + row_count(episode, part)
@@ -324,7 +326,7 @@ def _last_stamp(tree: Tree, episode: Episode, part: Part) -> float:
     return abs(float(values[0])) if len(values) and np.isfinite(values[0]) else 0.0
 
 
-def _stamp_unit(part: Part, size: float) -> TimeUnit | None:
+def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
     """Return the unit of stamps, as an attribute, the name or their size shows it; None where nothing does."""
     attributes = part.time.attributes if part.time is not None else {}
     declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
@@ -333,7 +335,7 @@ def _stamp_unit(part: Part, size: float) -> TimeUnit | None:
     return unit or (next(unit for limit, unit in SINCE_1970 if size < limit) if size >= MIN_UNIX_S else None)
 
 
-def declared_rate_hz(tree: Tree, episode: Episode, part: Part | None) -> float | None:
+def declared_rate_hz(tree: Tree, episode: Episode, part: StreamArrays | None) -> float | None:
     """Return the rate that attributes of a stream's arrays, its group or one above state, or that all recordings have."""
     arrays = part.arrays if part is not None else ()
     groups = [*reversed(parent_groups(arrays[0].group))] if arrays else []

@@ -18,7 +18,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import Array, with_time_first
+from tacpipe.formats.arrays.tree import ArrayDescription, with_time_first
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
@@ -43,7 +43,7 @@ class Hdf5Tree:
 
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
         self.path, self._file, self._available = path, file, bytes_left
-        self._members: dict[str, tuple[list[Array], list[str]]] = {}  # members by listed group
+        self._members: dict[str, tuple[list[ArrayDescription], list[str]]] = {}  # members by listed group
         self._attributes_by_group: dict[str, dict[str, Any]] = {}  # attributes of groups
 
     @property
@@ -53,7 +53,7 @@ class Hdf5Tree:
             return []
         return [f"{self.path} is cut short after {self._available:,} bytes, and the rest is missing. Copy it again."]
 
-    def members(self, group: str) -> tuple[list[Array], list[str]]:
+    def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """Return the arrays in a group and the paths of the groups in it."""
         if group in self._members:
             return self._members[group]
@@ -68,7 +68,7 @@ class Hdf5Tree:
                     if self._available is None:
                         raise
                     member = path  # a path beyond the cut is listed and refused when it is opened
-                if isinstance(member, Array):
+                if isinstance(member, ArrayDescription):
                     arrays.append(member)
                 elif member:
                     below.append(member)
@@ -88,7 +88,7 @@ class Hdf5Tree:
                 self._attributes_by_group[group] = _read_attributes(self._file[group or "/"], self.path)
             return self._attributes_by_group[group]
 
-    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+    def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
         limit_bytes = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
@@ -105,10 +105,10 @@ class Hdf5Tree:
             values = (dataset.asstr(errors="replace") if text else dataset)[rows]
             return np.moveaxis(np.asarray(values), array.time_axis, 0) if array.shape else np.asarray(values)
 
-    def files(self, array: Array, start: int, stop: int) -> None:
+    def files(self, array: ArrayDescription, start: int, stop: int) -> None:
         """Return None: all arrays lie in one file."""
 
-    def encoding_metadata(self, array: Array) -> None:
+    def encoding_metadata(self, array: ArrayDescription) -> None:
         """Return nothing, as the file states it."""
 
     @contextlib.contextmanager
@@ -230,15 +230,15 @@ def _expect_there(dataset: h5py.Dataset, available: int) -> None:
         raise OSError("its values lie behind the end")
 
 
-def _member(group: h5py.Group, name: str, path: str, file: Path) -> Array | str:
+def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescription | str:
     """Return an array, the path of a group, or an empty text for what is neither."""
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
-        return Array(
+        return ArrayDescription(
             path, (), np.dtype("V"), problem=f"lies in another file ({excerpt(link.filename)}), which is not read"
         )
     if isinstance(link, h5py.SoftLink) and name not in group:
-        return Array(path, (), np.dtype("V"), problem="is a link to what is not there")
+        return ArrayDescription(path, (), np.dtype("V"), problem="is a link to what is not there")
     member = group[name]
     if isinstance(member, h5py.Group):
         return path
@@ -257,7 +257,7 @@ def _member(group: h5py.Group, name: str, path: str, file: Path) -> Array | str:
         stored = memory.readable_size(member.id.get_storage_size())
         problem = f"declares {memory.readable_size(member.nbytes)} of values and holds {stored}"
     chunk_rows = member.chunks[0] if member.chunks else 0
-    return Array(path, member.shape or (), member.dtype, _read_attributes(member, file), chunk_rows, problem)
+    return ArrayDescription(path, member.shape or (), member.dtype, _read_attributes(member, file), chunk_rows, problem)
 
 
 def _filters(dataset: h5py.Dataset) -> Iterator[int]:

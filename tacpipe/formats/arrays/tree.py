@@ -29,7 +29,7 @@ COLOURS = (1, 3, 4)  # channels of a picture
 
 
 @dataclass(frozen=True)
-class Array:
+class ArrayDescription:
     """The description of one array; ``dtype`` is that of numpy, object where elements have no fixed length."""
 
     path: str  # path within the file, as "data/demo_0/actions"
@@ -67,7 +67,7 @@ class Tree(Protocol):
     def notes(self) -> Sequence[str]:
         """Sentences about the missing part of a truncated file."""
 
-    def members(self, group: str) -> tuple[list[Array], list[str]]:
+    def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """The arrays in a group, and the paths of the groups in it."""
 
     def is_group(self, path: str) -> bool:
@@ -79,17 +79,17 @@ class Tree(Protocol):
     def attributes(self, group: str) -> Mapping[str, Any]:
         """The attributes of a group."""
 
-    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+    def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """The rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
 
-    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+    def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
         """The files that hold rows of an array, by path within the store; None where all lies in one file."""
 
-    def encoding_metadata(self, array: Array) -> Any:
+    def encoding_metadata(self, array: ArrayDescription) -> Any:
         """How the rows of an array are encoded, as JSON, without how many there are."""
 
 
-def with_time_first(arrays: Sequence[Array]) -> list[Array]:
+def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription]:
     """Return the arrays of a group with the dimension of time first: the one that is as long as the group's 1-D arrays.
 
     Where no dimension is, time is the first unless it is a small part of the longest.
@@ -122,7 +122,7 @@ def with_time_first(arrays: Sequence[Array]) -> list[Array]:
     return turned
 
 
-def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
+def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescription]]]:
     """Yield each group below a group, itself first, with the arrays in it; one of several paths has a problem instead."""
     first_paths: dict[Any, str] = {}
     pending = [group]
@@ -131,14 +131,14 @@ def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
         first = first_paths.setdefault(tree.identity(path), path)
         if first != path:
             problem = f"is the group {plain(first) or '/'}, which is read there"
-            yield path.rpartition("/")[0], [Array(path, (), np.dtype("V"), problem=problem)]
+            yield path.rpartition("/")[0], [ArrayDescription(path, (), np.dtype("V"), problem=problem)]
             continue
         arrays, below = tree.members(path)
         yield path, arrays
         pending += reversed(below)
 
 
-def is_frames(array: Array) -> bool:
+def is_frames(array: ArrayDescription) -> bool:
     """Return whether an array may hold an encoded picture a row: bytes without fixed length, or padded with zeros."""
     if array.dtype.kind == "O":
         return (
@@ -147,7 +147,7 @@ def is_frames(array: Array) -> bool:
     return array.dtype == np.uint8 and len(array.shape) == 2 and _named_as_image(array.path)
 
 
-def is_image(array: Array) -> bool:
+def is_image(array: ArrayDescription) -> bool:
     """Return whether an array holds a decoded picture a row.
 
     >>> is_image(Array("obs/agentview_image", (9, 84, 84, 3), np.dtype("uint8")))
@@ -162,7 +162,7 @@ def is_image(array: Array) -> bool:
     return coloured or _named_as_image(array.path)
 
 
-def reason_left_out(array: Array) -> str:
+def reason_left_out(array: ArrayDescription) -> str:
     """Return why an array is not read as columns, as in "NAME …"; empty where it is.
 
     >>> reason_left_out(Array("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
@@ -183,7 +183,7 @@ def reason_left_out(array: Array) -> str:
     return ""
 
 
-def is_text(array: Array) -> bool:
+def is_text(array: ArrayDescription) -> bool:
     """Return whether an array holds text."""
     about = array.dtype.metadata
     return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
@@ -226,17 +226,17 @@ def picture_encoding(content: bytes) -> str:
     return next((name for start, name in MAGIC.items() if content.startswith(start)), "")
 
 
-def is_encoded(tree: Tree, array: Array, row: int) -> bool:
+def is_encoded(tree: Tree, array: ArrayDescription, row: int) -> bool:
     """Return whether a row of an array is an encoded picture, by its first bytes."""
     return bool(picture_encoding(_rows_as_bytes(tree.read(array, row, row + 1))[0]))
 
 
-def encoded_size(tree: Tree, array: Array, row: int) -> int:
+def encoded_size(tree: Tree, array: ArrayDescription, row: int) -> int:
     """Return how many bytes a row of an array of pictures has."""
     return len(_rows_as_bytes(tree.read(array, row, row + 1))[0])
 
 
-def picture_column(array: Array, values: AnyArray) -> tuple[pa.Field, pa.Array]:
+def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field, pa.Array]:
     """Return field and values of the column of pictures: bytes as they were written, without the zeros behind them."""
     pictures = picture_array(array, values)
     kind = next(filter(None, (picture_encoding(picture.as_py()) for picture in pictures)), "")
@@ -244,7 +244,7 @@ def picture_column(array: Array, values: AnyArray) -> tuple[pa.Field, pa.Array]:
     return pa.field(PICTURE, pa.binary(), metadata=about), pictures
 
 
-def picture_array(array: Array, values: AnyArray) -> pa.Array:
+def picture_array(array: ArrayDescription, values: AnyArray) -> pa.Array:
     """Return rows of bytes, without the zeros behind those that are padded."""
     rows = _rows_as_bytes(values)
     if array.dtype.kind != "O":
@@ -261,7 +261,7 @@ BLOCK_BYTES = 1 << 20  # bytes transposed at once
 
 
 def columns_of_array(
-    tree: Tree, array: Array, start: int, stop: int, meanings: list[ColumnMeaning] | None = None
+    tree: Tree, array: ArrayDescription, start: int, stop: int, meanings: list[ColumnMeaning] | None = None
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
     """Yield field and values of each column of an array, the rows from ``start`` up to ``stop``.
 
@@ -276,7 +276,7 @@ def columns_of_array(
     yield from _value_columns(array.name, flat, array.shape[1:], array, array.path, meanings)
 
 
-def read_transposed(tree: Tree, array: Array, start: int, stop: int) -> AnyArray:
+def read_transposed(tree: Tree, array: ArrayDescription, start: int, stop: int) -> AnyArray:
     """Return the rows of an array as (value, row): in blocks that a processor's cache holds, of whole chunks."""
     width = int(np.prod(array.shape[1:], dtype=np.int64))
     if width == 1 or array.dtype.hasobject:
@@ -292,7 +292,7 @@ def read_transposed(tree: Tree, array: Array, start: int, stop: int) -> AnyArray
     return block
 
 
-def _compound_columns(before: str, values: AnyArray, array: Array) -> Iterator[tuple[pa.Field, pa.Array]]:
+def _compound_columns(before: str, values: AnyArray, array: ArrayDescription) -> Iterator[tuple[pa.Field, pa.Array]]:
     for name in values.dtype.names or ():
         inner = values[name]
         if inner.dtype.names is not None:
@@ -305,7 +305,12 @@ def _compound_columns(before: str, values: AnyArray, array: Array) -> Iterator[t
 
 
 def _value_columns(
-    name: str, flat: AnyArray, shape: tuple[int, ...], array: Array, path: str, meanings: list[ColumnMeaning] | None
+    name: str,
+    flat: AnyArray,
+    shape: tuple[int, ...],
+    array: ArrayDescription,
+    path: str,
+    meanings: list[ColumnMeaning] | None,
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
     """Yield the columns of values (value, row) that have this shape in a row."""
     width = len(flat)
@@ -347,7 +352,7 @@ def _taxel_and_axis(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) 
     return {"taxel": str(int(np.ravel_multi_index(at[:-1], shape[:-1])) + 1), "axis": AXES[at[-1]]}
 
 
-def _native_values(values: AnyArray, array: Array) -> AnyArray:
+def _native_values(values: AnyArray, array: ArrayDescription) -> AnyArray:
     """Return values as one of the types that a column has."""
     if is_frames(array) and values.dtype.kind == "O":
         return values
@@ -358,7 +363,7 @@ def _native_values(values: AnyArray, array: Array) -> AnyArray:
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
-def _column_array(values: Any, array: Array) -> pa.Array:
+def _column_array(values: Any, array: ArrayDescription) -> pa.Array:
     if values.dtype.kind == "O" and is_frames(array):
         return picture_array(array, values)
     if values.dtype.kind in "SUOT":

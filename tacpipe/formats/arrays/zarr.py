@@ -27,7 +27,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import Array
+from tacpipe.formats.arrays.tree import ArrayDescription
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
@@ -59,7 +59,7 @@ class ZarrTree:
     notes: Sequence[str] = ()
     _nodes: dict[str, tuple[dict[str, Any], dict[str, Any]] | None] = field(default_factory=dict)  # metadata by path
 
-    def members(self, group: str) -> tuple[list[Array], list[str]]:
+    def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
         arrays, below = [], []
         for name in self._below(group):
@@ -85,7 +85,7 @@ class ZarrTree:
         node = self._node(group)
         return node[1] if node is not None else {}
 
-    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+    def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
         zarr = _library()
         stop = min(stop, array.shape[0]) if array.shape else 1
@@ -119,7 +119,7 @@ class ZarrTree:
                 f"{plain(str(error), 200)}. Copy the store again."
             ) from error
 
-    def chunks(self, array: Array, start: int, stop: int) -> list[str]:
+    def chunks(self, array: ArrayDescription, start: int, stop: int) -> list[str]:
         """Return the names, within the store, of the files that hold rows of an array."""
         node = self._node(array.path)
         assert node is not None
@@ -136,13 +136,13 @@ class ZarrTree:
             )
         return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
 
-    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+    def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
         """Return the files that hold rows of an array; None of a zip file."""
         if self.names is not None:
             return None
         return {name: self.path / name for name in self.chunks(array, start, stop) if self._has(name)}
 
-    def encoding_metadata(self, array: Array) -> Any:
+    def encoding_metadata(self, array: ArrayDescription) -> Any:
         """Return the metadata of an array but for its shape, which grows with each recording that is added."""
         node = self._node(array.path)
         return {key: value for key, value in node[0].items() if key != "shape"} if node is not None else None
@@ -283,11 +283,11 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error
 
 
-def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
+def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> ArrayDescription:
     problem = ""
     shape = about.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
-        return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
+        return ArrayDescription(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
     try:
         kind = _parse_dtype(about)
     except (TypeError, ValueError, LookupError, AttributeError):
@@ -309,7 +309,7 @@ def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, A
     elif kind.hasobject and kind.metadata is None:
         problem = "holds Python objects"
     reason = f"{problem}, which is not read" if problem else ""
-    return Array(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
+    return ArrayDescription(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
 
 
 def _parse_dtype(about: Mapping[str, Any]) -> np.dtype[Any]:

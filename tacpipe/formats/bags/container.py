@@ -21,10 +21,10 @@ import pyarrow as pa
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import source_files
 from tacpipe.formats.bags import mcap_file, ros, ros_files
-from tacpipe.formats.bags.ros_files import Channel, Damage, Message, Metadata, Record
+from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Record, TopicConnection
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
 from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
+from tacpipe.formats.containers.container import Batched, EpisodeContents, SourceStream, Time
 from tacpipe.io import files as file_system
 from tacpipe.io import regular, yaml_text
 from tacpipe.io.spill import Spill, unpack
@@ -121,22 +121,22 @@ class Bag:
         """Return nothing: a bag is one recording."""
         return ()
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         """Return the streams of the first messages."""
         return self._read(None, LOOK_MESSAGES)
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams of these topics, or of all."""
         return self._read(sources, None)
 
-    def _read(self, sources: Collection[str] | None, max_messages: int | None) -> Contents:
+    def _read(self, sources: Collection[str] | None, max_messages: int | None) -> EpisodeContents:
         with contextlib.ExitStack() as stack:
             files, messages_compressed, notes = _bag_files(self.path, stack)
             reading = _BagReading(self.path, sources, messages_compressed)
             for number, file in enumerate(files):
                 reading.add_records(_read_records(file), number, max_messages)
         contents = reading.contents()
-        return Contents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
+        return EpisodeContents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
 
 def open_bag(path: Path) -> Bag:
@@ -188,7 +188,7 @@ def _read_compressed(path: Path) -> Iterator[Record]:
         try:
             yield from mcap_file.read_stream(path, content)
         except zstandard.ZstdError as error:
-            yield Damage(f"{path} cannot be unpacked ({plain(str(error), 80)}): what came after is missing.")
+            yield BagDamage(f"{path} cannot be unpacked ({plain(str(error), 80)}): what came after is missing.")
 
 
 def _file_ending(path: Path) -> str:
@@ -240,25 +240,25 @@ class _BagReading:
     notes: list[str] = field(default_factory=list)
     spill: Spill = field(default_factory=Spill)  # decoded messages
     undescribed: int = 0  # messages of channels that no record describes
-    _described: dict[tuple[int, int], Channel] = field(default_factory=dict)  # file and number to channel
+    _described: dict[tuple[int, int], TopicConnection] = field(default_factory=dict)  # file and number to channel
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
     def add_records(self, records: Iterator[Record], file: int, max_messages: int | None) -> None:
         """Add the records of one file of the bag, with at most ``max_messages`` messages."""
         for record in records:
-            if isinstance(record, Message):
+            if isinstance(record, BagMessage):
                 self._message(record, file)
                 if max_messages is not None and (max_messages := max_messages - 1) <= 0:
                     self.ended_early = True
                     return
-            elif isinstance(record, Channel):
+            elif isinstance(record, TopicConnection):
                 self._channel(record, file)
             elif isinstance(record, Metadata):
                 self._metadata(record)
-            elif isinstance(record, Damage):
+            elif isinstance(record, BagDamage):
                 self.notes.append(record.text)
 
-    def _channel(self, channel: Channel, file: int) -> None:
+    def _channel(self, channel: TopicConnection, file: int) -> None:
         topic = channel.topic
         before = self._described.setdefault((file, channel.number), channel)
         if before is not channel:  # chunks repeat the channels of their messages
@@ -287,7 +287,7 @@ class _BagReading:
         except TopicError as error:
             self._skip(topic, str(error))
 
-    def _message(self, message: Message, file: int) -> None:
+    def _message(self, message: BagMessage, file: int) -> None:
         topic = self.topics.get(self._channels.get((file, message.channel), ""))
         if topic is None:
             self.undescribed += (file, message.channel) not in self._described
@@ -315,7 +315,7 @@ class _BagReading:
         self.skipped[topic] = reason
         self.topics.pop(topic, None)
 
-    def contents(self) -> Contents:
+    def contents(self) -> EpisodeContents:
         """Return the streams, attributes, skipped topics and notes."""
         streams_with_origin: list[tuple[ExportedStream | None, SourceStream]] = []
         for topic, reading in list(self.topics.items()):
@@ -357,7 +357,7 @@ class _BagReading:
         ]
         names = container.identifiers([stream.name for stream in streams])
         streams = [replace(stream, name=names[stream.name]) for stream in streams]
-        return Contents(streams, self.attributes, self.skipped, self.notes)
+        return EpisodeContents(streams, self.attributes, self.skipped, self.notes)
 
 
 def _decompress_message(content: bytes) -> bytes:
@@ -369,7 +369,7 @@ def _decompress_message(content: bytes) -> bytes:
         raise TopicError("a compressed message is damaged") from error
 
 
-def _decoder_for_channel(channel: Channel) -> MessageDecoder:
+def _decoder_for_channel(channel: TopicConnection) -> MessageDecoder:
     """Return the decoder for the messages of a channel. Raises `TopicError` for an unsupported encoding."""
     text = channel.schema.decode(errors="replace")
     if channel.encoding in ("ros1", "cdr"):

@@ -13,13 +13,13 @@ from typing import BinaryIO
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags.ros_files import (
     CUT_OFF,
+    BagDamage,
+    BagMessage,
     BrokenRecordError,
-    Channel,
-    Damage,
     LostChunk,
-    Message,
     Metadata,
     Record,
+    TopicConnection,
     format_time,
 )
 from tacpipe.io import memory, regular
@@ -45,20 +45,20 @@ def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
     """Yield the records of ``file``, the bytes of an MCAP file from the first on. Raises as `read_records` does."""
     if file.read(len(MAGIC)) != MAGIC:
         raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
-    reader = _Reader(path)
+    reader = _RecordConverter(path)
     try:
         yield from _read_data(file, reader)
     except BrokenRecordError as error:
         until = f"; {reader.count:,} messages up to {format_time(reader.last_ns)} were read" if reader.count else ""
-        yield Damage(f"{path}: {error}{until}.")
+        yield BagDamage(f"{path}: {error}{until}.")
         return
     declared_count = _declared_message_count(file)
     lost = 0 if declared_count is None else declared_count - reader.count
     if lost > 0:
-        yield Damage(f"{path} states that it has {declared_count:,} messages, and {lost:,} of them are missing.")
+        yield BagDamage(f"{path} states that it has {declared_count:,} messages, and {lost:,} of them are missing.")
 
 
-def _read_data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
+def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
     """Yield the records before the summary at the end of a file."""
     lost: LostChunk | None = None
     while True:
@@ -71,7 +71,7 @@ def _read_data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
             return
         if kind == ATTACHMENT:
             name = _attachment_name(beginning := file.read(min(length, 4096)))
-            yield Damage(f"{reader.path}: the attachment {name} is not read.")
+            yield BagDamage(f"{reader.path}: the attachment {name} is not read.")
             _skip_bytes(file, length - len(beginning))
         elif kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA) or (kind == MESSAGE_INDEX and lost is not None):
             content = _read_content(file, length)
@@ -131,7 +131,7 @@ def _skip_bytes(file: BinaryIO, length: int) -> None:
         raise BrokenRecordError(CUT_OFF)
 
 
-class _Reader:
+class _RecordConverter:
     """Convert records to the types of `storages`; keeps schemas, which channels name by number."""
 
     def __init__(self, path: Path) -> None:
@@ -157,7 +157,7 @@ class _Reader:
             elif kind == CHANNEL:
                 channel = mcap_records.Channel.read(stream)
                 name, encoding, data = self._schemas.get(channel.schema_id, ("", "", b""))
-                yield Channel(
+                yield TopicConnection(
                     channel.id, channel.topic, name, channel.message_encoding, encoding, data, channel.metadata
                 )
             elif kind == METADATA:
@@ -192,13 +192,13 @@ class _Reader:
                 yield from self.record(kind, view[at : at + length])
         return None
 
-    def _message(self, view: memoryview, at: int, length: int) -> Message:
+    def _message(self, view: memoryview, at: int, length: int) -> BagMessage:
         if length < _MESSAGE.size:
             raise BrokenRecordError("a message record is too short")
         number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
         self.count += 1
         self.last_ns = log_ns
-        return Message(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
+        return BagMessage(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
 
 
 def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from tacpipe.formats.bags.wire import TEXT, Leaf, Path, Shape
+from tacpipe.formats.bags.wire import TEXT, Leaf, MessageShape, Path
 
 MAX_COLUMNS = 4096  # longer arrays of bytes are one column of bytes
 _XYZ = ("x", "y", "z")
@@ -21,7 +21,7 @@ _FRAMES = (("header", "frame_id"), ("frame_id",))
 
 
 @dataclass(frozen=True)
-class Column:
+class PartColumn:
     """One column of a part: a leaf, or one number of its array."""
 
     name: str
@@ -31,11 +31,11 @@ class Column:
 
 
 @dataclass
-class Part:
+class MessagePart:
     """Columns that were measured at one moment; most messages are one part, those with many sensors one each."""
 
     suffix: str = ""  # end of the stream's name
-    columns: list[Column] = field(default_factory=list)
+    columns: list[PartColumn] = field(default_factory=list)
     stamp: Leaf | None = None
     frame: Leaf | None = None
 
@@ -44,7 +44,7 @@ class Part:
 class Meaning:
     """The function that divides messages of a type into parts, and the leaves whose values name others."""
 
-    parts: Callable[[Shape], list[Part]]
+    parts: Callable[[MessageShape], list[MessagePart]]
     is_key: Callable[[Leaf], bool] = lambda leaf: False  # messages with different keys are decoded apart
 
 
@@ -120,14 +120,14 @@ def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
     return None
 
 
-def single_part(shape: Shape) -> list[Part]:
+def single_part(shape: MessageShape) -> list[MessagePart]:
     """Return all values of a message as one part, with the meaning that the types inside give them."""
     return [part_from_leaves(shape.leaves)]
 
 
-def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> Part:
+def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> MessagePart:
     """Return these values as a part; the first ``start`` names of their paths are left out of the columns' names."""
-    result = Part(suffix)
+    result = MessagePart(suffix)
     places = {
         (name, leaf.path[:depth])
         for leaf in leaves
@@ -142,25 +142,25 @@ def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -
         elif path in _FRAMES:
             result.frame = leaf
         elif path == ("header", "seq"):
-            result.columns.append(Column("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
+            result.columns.append(PartColumn("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
         elif meaning := enclosing_meaning(leaf):
             name, quantity, unit, component, depth = meaning
             before = _join_path(leaf.path[start:depth]) + "_" if name in repeated_names and depth > start else ""
-            result.columns.append(Column(before + name, leaf, about=_metadata(quantity, unit, component=component)))
+            result.columns.append(PartColumn(before + name, leaf, about=_metadata(quantity, unit, component=component)))
         else:
             result.columns += columns_from_leaf(leaf, _join_path(path) or "data")
     return result
 
 
-def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] = ()) -> list[Column]:
+def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] = ()) -> list[PartColumn]:
     """Return the columns of a value: one per number of an array; long arrays of bytes are one column of bytes."""
     if leaf.kind == "stamp":
-        return [Column(f"{name}_ns", leaf, about=about or (("unit", "ns"), ("quantity", "time")))]
+        return [PartColumn(f"{name}_ns", leaf, about=about or (("unit", "ns"), ("quantity", "time")))]
     if leaf.count is None or leaf.kind == TEXT or is_bytes(leaf):
-        return [Column(name, leaf, about=about)]
+        return [PartColumn(name, leaf, about=about)]
     if "covariance" in name:
         about = about or (("quantity", "covariance"),)
-    return [Column(f"{name}_{position}", leaf, position, about) for position in range(leaf.count)]
+    return [PartColumn(f"{name}_{position}", leaf, position, about) for position in range(leaf.count)]
 
 
 def is_bytes(leaf: Leaf) -> bool:
@@ -204,7 +204,7 @@ class _Joints:
     def __init__(self) -> None:
         self._orders: dict[frozenset[str], list[str]] = {}
 
-    def __call__(self, shape: Shape) -> list[Part]:
+    def __call__(self, shape: MessageShape) -> list[MessagePart]:
         names = [shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "name"]
         order = self._orders.setdefault(frozenset(names), names)
         first = order is next(iter(self._orders.values()))
@@ -223,14 +223,14 @@ class _Joints:
         return [result]
 
 
-def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
+def _joint(leaf: Leaf, index: int, number: int, joint: str) -> PartColumn:
     name, quantity, unit = _JOINT[str(leaf.path[0])]
     if _SLIDES.search(joint):  # its unit would be m; a message does not state which joints slide
         name, unit = f"joint{{}}_{leaf.path[0]}", ""
-    return Column(name.format(number), leaf, index, _metadata(quantity, unit, joint=joint))
+    return PartColumn(name.format(number), leaf, index, _metadata(quantity, unit, joint=joint))
 
 
-def _multi_array_parts(shape: Shape) -> list[Part]:
+def _multi_array_parts(shape: MessageShape) -> list[MessagePart]:
     """Return an array of std_msgs with one column per number, placed in the dimensions that the layout names."""
     layout = {leaf.path[1:]: leaf for leaf in shape.leaves if leaf.path[0] == "layout"}
     dimensions = [
@@ -238,7 +238,7 @@ def _multi_array_parts(shape: Shape) -> list[Part]:
     ]
     names = [name or f"dimension{number}" for number, (name, _) in enumerate(dimensions, 1)]
     sizes = [size for _, size in dimensions]
-    result = Part()
+    result = MessagePart()
     for leaf in shape.leaves:
         if leaf.path[0] != "layout":
             result.columns += columns_from_leaf(leaf, "_".join(map(str, leaf.path)))
@@ -251,7 +251,7 @@ def _multi_array_parts(shape: Shape) -> list[Part]:
     return [result]
 
 
-def _transform_parts(shape: Shape) -> list[Part]:
+def _transform_parts(shape: MessageShape) -> list[MessagePart]:
     """Return the transforms of a message, one part per pair of frames."""
     places = sorted({leaf.path[1] for leaf in shape.leaves}, key=int)
     parts = []
@@ -262,12 +262,12 @@ def _transform_parts(shape: Shape) -> list[Part]:
     return parts
 
 
-def _single_transform(shape: Shape) -> list[Part]:
+def _single_transform(shape: MessageShape) -> list[MessagePart]:
     child = next(shape.text(leaf) for leaf in shape.leaves if leaf.path == ("child_frame_id",))
     return [part_from_leaves([leaf for leaf in shape.leaves if leaf.path != ("child_frame_id",)], 0, child)]
 
 
-def _tactile_parts(shape: Shape) -> list[Part]:
+def _tactile_parts(shape: MessageShape) -> list[MessagePart]:
     """Return a tactile_msgs/TactileState with one column per taxel of each sensor that the message names."""
     names = {leaf.path[1]: shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "sensors" and leaf.kind == TEXT}
     result = part_from_leaves([leaf for leaf in shape.leaves if leaf.path[0] == "header"])
@@ -279,11 +279,11 @@ def _tactile_parts(shape: Shape) -> list[Part]:
         digits = max(2, len(str(leaf.count)))
         for index in range(leaf.count or 0):
             about = _metadata("tactile", "", sensor=sensor, taxel=str(index + 1))
-            result.columns.append(Column(f"{before}_taxel{index + 1:0{digits}d}", leaf, index, about))
+            result.columns.append(PartColumn(f"{before}_taxel{index + 1:0{digits}d}", leaf, index, about))
     return [result]
 
 
-def _xela_parts(shape: Shape) -> list[Part]:
+def _xela_parts(shape: MessageShape) -> list[MessagePart]:
     """Return a xela_server_ros2/SensStream, one part per sensor; taxels have counts and, if calibrated, forces.
 
     ``time`` is the server's Unix time in seconds; there is no header.
@@ -291,7 +291,7 @@ def _xela_parts(shape: Shape) -> list[Part]:
     parts = []
     for place in sorted({leaf.path[1] for leaf in shape.leaves}, key=int):
         leaves = {leaf.path[2:]: leaf for leaf in shape.leaves if leaf.path[1] == place}
-        sensor_part = Part(f"sensor{int(place) + 1}")
+        sensor_part = MessagePart(f"sensor{int(place) + 1}")
         for path, leaf in leaves.items():
             if path[0] in ("taxels", "forces") and leaf.path[-1] in _XYZ:
                 taxel, axis = int(path[1]) + 1, str(path[-1])
@@ -299,11 +299,11 @@ def _xela_parts(shape: Shape) -> list[Part]:
                     ("tactile", "count", axis) if path[0] == "taxels" else ("force", "N", f"force_{axis}_n")
                 )
                 about = _metadata(quantity, unit, taxel=str(taxel), axis=axis)
-                sensor_part.columns.append(Column(f"taxel{taxel:02d}_{end}", leaf, about=about))
+                sensor_part.columns.append(PartColumn(f"taxel{taxel:02d}_{end}", leaf, about=about))
             elif path == ("message",):
-                sensor_part.columns.append(Column("seq", leaf, about=_metadata("sequence", "1")))
+                sensor_part.columns.append(PartColumn("seq", leaf, about=_metadata("sequence", "1")))
             elif path == ("time",):
-                sensor_part.columns.append(Column("server_time_s", leaf, about=_metadata("time", "s")))
+                sensor_part.columns.append(PartColumn("server_time_s", leaf, about=_metadata("time", "s")))
             else:
                 sensor_part.columns += columns_from_leaf(leaf, _join_path(path))
         parts.append(sensor_part)

@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.formats.bags import meanings, wire
-from tacpipe.formats.bags.meanings import Column
+from tacpipe.formats.bags.meanings import PartColumn
 from tacpipe.formats.bags.topics import FRAME, HEADER, Block, TopicError
-from tacpipe.formats.bags.wire import ROS1, TEXT, Encoding, Leaf, Matrix, Shape, Types
+from tacpipe.formats.bags.wire import ROS1, TEXT, Encoding, Leaf, Matrix, MessageShape, Types
 from tacpipe.printable import plain
 
 MAX_SHAPES = 256  # shapes kept per topic
@@ -77,7 +77,7 @@ class RosDecoder:
     types: Types
     cdr: bool
     _meaning: meanings.Meaning | None = None
-    _shapes: dict[bytes, list[Shape]] = field(default_factory=dict)  # keyed by the first bytes: the byte order
+    _shapes: dict[bytes, list[MessageShape]] = field(default_factory=dict)  # keyed by the first bytes: the byte order
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages, grouped by shape; raises `TopicError` where they are not of the type."""
@@ -110,7 +110,9 @@ class RosDecoder:
         except wire.WireError as error:
             raise TopicError(str(error)) from error
 
-    def _take(self, shape: Shape, row: int, meaning: meanings.Meaning, single: dict[Any, _SingleMessages]) -> None:
+    def _take(
+        self, shape: MessageShape, row: int, meaning: meanings.Meaning, single: dict[Any, _SingleMessages]
+    ) -> None:
         """Add a message that no other shares its shape with to those with the same leaves."""
         keys = tuple(
             shape.first[leaf.offset : leaf.offset + leaf.size] for leaf in shape.leaves if meaning.is_key(leaf)
@@ -135,13 +137,13 @@ class RosDecoder:
 class _SingleMessages:
     """Messages with the same leaves but texts of different lengths, decoded value by value."""
 
-    parts: list[meanings.Part]
+    parts: list[meanings.MessagePart]
     leaves: dict[Leaf, int]  # positions
     rows: list[int] = field(default_factory=list)
     values: list[list[list[Any]]] = field(default_factory=list)  # (part, column, message)
 
     @classmethod
-    def from_shape(cls, shape: Shape, meaning: meanings.Meaning) -> _SingleMessages:
+    def from_shape(cls, shape: MessageShape, meaning: meanings.Meaning) -> _SingleMessages:
         """Return an empty collection for messages with the leaves of a shape."""
         parts = [part for part in meaning.parts(shape) if part.columns]
         for part in parts:
@@ -149,7 +151,7 @@ class _SingleMessages:
         leaves = {leaf: position for position, leaf in enumerate(shape.leaves)}
         return cls(parts, leaves, [], [[[] for _ in part.columns] for part in parts])
 
-    def add(self, shape: Shape, row: int) -> None:
+    def add(self, shape: MessageShape, row: int) -> None:
         """Add the values of a message."""
         self.rows.append(row)
         for part, values in zip(self.parts, self.values, strict=True):
@@ -169,13 +171,13 @@ class _SingleMessages:
             yield Block(part.suffix, np.array(self.rows), columns, about)
 
 
-def _header_columns(part: meanings.Part) -> list[Column]:
+def _header_columns(part: meanings.MessagePart) -> list[PartColumn]:
     """Return the columns of a part's header."""
     header_leaves = [(HEADER, part.stamp), (FRAME, part.frame)]
-    return [Column(name, leaf) for name, leaf in header_leaves if leaf is not None]
+    return [PartColumn(name, leaf) for name, leaf in header_leaves if leaf is not None]
 
 
-def _column_type(column: Column) -> pa.DataType:
+def _column_type(column: PartColumn) -> pa.DataType:
     leaf = column.leaf
     if leaf.kind in (TEXT, "stamp"):
         return pa.string() if leaf.kind == TEXT else pa.int64()
@@ -191,8 +193,8 @@ def _free_name(name: str, columns: Mapping[str, Any]) -> str:
 
 
 def _split_by_keys(
-    shape: Shape, matrix: Matrix, meaning: meanings.Meaning
-) -> Iterator[tuple[np.ndarray[Any, np.dtype[np.int64]], Shape]]:
+    shape: MessageShape, matrix: Matrix, meaning: meanings.Meaning
+) -> Iterator[tuple[np.ndarray[Any, np.dtype[np.int64]], MessageShape]]:
     """Yield rows (row,) with equal keys, and a shape whose first message has these keys."""
     keys = [leaf for leaf in shape.leaves if meaning.is_key(leaf)]
     remaining = np.arange(len(matrix))
@@ -208,7 +210,7 @@ def _split_by_keys(
 
 
 def _decode_matrix(
-    shape: Shape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
+    shape: MessageShape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[Block]:
     cache: dict[int, Any] = {}  # numbers by the offset of their leaf: an array is viewed once for all of its columns
     for part in meaning.parts(shape):
@@ -226,7 +228,7 @@ def _decode_matrix(
             yield Block(part.suffix, rows, columns, about)
 
 
-def _column_array(shape: Shape, column: Column, matrix: Matrix, cache: dict[int, Any]) -> pa.Array:
+def _column_array(shape: MessageShape, column: PartColumn, matrix: Matrix, cache: dict[int, Any]) -> pa.Array:
     leaf = column.leaf
     if leaf.kind == TEXT:
         return _text_array(leaf, matrix)

@@ -34,7 +34,7 @@ class BrokenRecordError(Exception):
 
 
 @dataclass(frozen=True)
-class Channel:
+class TopicConnection:
     """A source of messages of one topic with their type and encoding; a topic may have several channels."""
 
     number: int  # identifies the channel in messages
@@ -46,7 +46,7 @@ class Channel:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-class Message(NamedTuple):  # there are millions, and a dataclass takes three times as long to make
+class BagMessage(NamedTuple):  # there are millions, and a dataclass takes three times as long to make
     """A message as it was written."""
 
     channel: int
@@ -64,7 +64,7 @@ class Metadata:
 
 
 @dataclass(frozen=True)
-class Damage:
+class BagDamage:
     """A sentence about the file with the reason why reading ended early, or with the part that was not read."""
 
     text: str
@@ -79,11 +79,11 @@ class LostChunk:
     last_ns: int = 0
     count: int = 0  # 0: the file does not state it
 
-    def damage(self, path: Path) -> Damage:
+    def damage(self, path: Path) -> BagDamage:
         """Return the note about it."""
         interval = f" from {format_time(self.first_ns)} to {format_time(self.last_ns)}" if self.last_ns else ""
         count = f"its {self.count:,} messages" if self.count else "its messages, an unknown number,"
-        return Damage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
+        return BagDamage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
 
 
 def format_time(time_ns: int) -> str:
@@ -97,7 +97,7 @@ def format_time(time_ns: int) -> str:
     return str(np.datetime_as_string(np.datetime64(time_ns, "ns"), unit="ms"))
 
 
-Record: TypeAlias = Channel | Message | Metadata | Damage
+Record: TypeAlias = TopicConnection | BagMessage | Metadata | BagDamage
 
 _ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the second where a message of SQLite quotes damaged text
 SQLITE_MAGIC = b"SQLite format 3\0"
@@ -120,11 +120,13 @@ def read_sqlite_records(path: Path) -> Iterator[Record]:
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
             ):
                 if not (isinstance(number, int) and isinstance(log_ns, int) and isinstance(content, bytes)):
-                    yield Damage(f"{path} is damaged (a message has no time or no bytes): what came after is missing.")
+                    yield BagDamage(
+                        f"{path} is damaged (a message has no time or no bytes): what came after is missing."
+                    )
                     return
-                yield Message(number, log_ns, log_ns, content)
+                yield BagMessage(number, log_ns, log_ns, content)
         except _ERRORS as error:
-            yield Damage(f"{path} is damaged ({plain(str(error), 120)}): what came after is missing.")
+            yield BagDamage(f"{path} is damaged ({plain(str(error), 120)}): what came after is missing.")
 
 
 @contextlib.contextmanager
@@ -164,7 +166,7 @@ def _read_channels(connection: sqlite3.Connection) -> Iterator[Record]:
         definitions = {str(name): (str(kind), str(text).encode()) for name, kind, text in connection.execute(query)}
     for number, topic, name, encoding in connection.execute("SELECT id, name, type, serialization_format FROM topics"):
         kind, text = definitions.get(str(name), ("ros2msg", b""))
-        yield Channel(number, str(topic), ros.normalize_type_name(str(name)), str(encoding), kind, text)
+        yield TopicConnection(number, str(topic), ros.normalize_type_name(str(name)), str(encoding), kind, text)
     if "schema" in tables:
         for (distribution,) in connection.execute("SELECT ros_distro FROM schema"):
             yield Metadata("rosbag2", {"ros_distro": str(distribution or "")})
@@ -189,7 +191,7 @@ def read_bag_records(path: Path) -> Iterator[Record]:
         try:
             yield from _read_records(path, file, path.stat().st_size)
         except BrokenRecordError as error:
-            yield Damage(f"{path}: {error}.")
+            yield BagDamage(f"{path}: {error}.")
 
 
 def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool = False) -> Iterator[Record]:
@@ -232,7 +234,7 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
             yield _channel(number, header, _header_fields(content))
             continue
         log_ns = _time_ns(header.get("time", bytes(8)))
-        yield Message(number, log_ns, log_ns, content)
+        yield BagMessage(number, log_ns, log_ns, content)
     if lost is not None:
         yield lost.damage(path)
 
@@ -251,10 +253,10 @@ def _time_ns(content: bytes) -> int:
     return int(second) * 10**9 + int(nanosecond)
 
 
-def _channel(number: int, header: dict[str, bytes], about: dict[str, bytes]) -> Channel:
+def _channel(number: int, header: dict[str, bytes], about: dict[str, bytes]) -> TopicConnection:
     topic = header.get("topic", about.get("topic", b"")).decode(errors="replace")
     name = ros.normalize_type_name(about.get("type", b"").decode(errors="replace"))
-    return Channel(number, topic, name, "ros1", "ros1msg", about.get("message_definition", b""))
+    return TopicConnection(number, topic, name, "ros1", "ros1msg", about.get("message_definition", b""))
 
 
 def _field_number(header: dict[str, bytes], name: str) -> int:

@@ -80,7 +80,7 @@ def cdr_encoding(message: bytes) -> Encoding:
 
 
 @dataclass
-class Shape:
+class MessageShape:
     """The leaves of messages of one size whose length words agree."""
 
     encoding: Encoding
@@ -132,8 +132,8 @@ def _numbers_at(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) ->
 
 
 def group_by_shape(
-    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, earlier_shapes: list[Shape]
-) -> Iterator[tuple[Shape, npt.NDArray[np.int64], Matrix]]:
+    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, earlier_shapes: list[MessageShape]
+) -> Iterator[tuple[MessageShape, npt.NDArray[np.int64], Matrix]]:
     """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
 
     New shapes are added to ``earlier_shapes``. Raises `WireError` where a message is not of its type.
@@ -166,7 +166,7 @@ def group_by_shape(
                 rows, matrix = rows[~same], matrix[~same]
 
 
-def _matching_rows(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
+def _matching_rows(shape: MessageShape, matrix: Matrix) -> npt.NDArray[np.bool_]:
     first = np.frombuffer(shape.first, np.uint8)
     same = np.ones(len(matrix), bool)
     for offset in shape.lengths:
@@ -174,9 +174,9 @@ def _matching_rows(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
     return same
 
 
-def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) -> Shape:
+def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) -> MessageShape:
     """Return the shape of a message. Raises `WireError` where its bytes do not fit its type."""
-    shape = Shape(encoding, len(message), first=message)
+    shape = MessageShape(encoding, len(message), first=message)
     try:
         end = _Walk(message, types, shape).message(name, (), (), encoding.start)
     except (struct.error, KeyError, RecursionError) as error:
@@ -193,7 +193,7 @@ def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) ->
 class _Walk:
     content: bytes
     types: Types
-    shape: Shape
+    shape: MessageShape
     messages: int = 0  # messages walked, including those without fields
 
     def message(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:

@@ -12,5 +12,5 @@ The layout file of ``ingest table`` is applied to that: a stream of a layout nam
 
 1. a module with ``opened(path) -> Container``, which imports its library inside functions;
 2. an entry in `tacpipe.formats.containers.container.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
-3. a stage, whose functions `tacpipe.formats.table.contained.Command` makes, with an entry point ``tacpipe.formats``.
+3. a stage, made by `tacpipe.formats.table.contained.ContainerCommand`, with an entry point ``tacpipe.formats``.
 """

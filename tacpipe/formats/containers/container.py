@@ -95,7 +95,7 @@ class SourceStream:
 
 
 @dataclass(frozen=True)
-class Contents:
+class EpisodeContents:
     """The streams and attributes of one episode of a container."""
 
     streams: Sequence[SourceStream]
@@ -121,7 +121,7 @@ class Sharing(Protocol):
 
 
 @runtime_checkable
-class Naming(Protocol):
+class NamedContainer(Protocol):
     """A container that may hold recordings which have had their names before, in a dataset that it was exported from."""
 
     @property
@@ -139,10 +139,10 @@ class Container(Protocol):
     def episodes(self) -> Sequence[str]:
         """Return the names of the recordings inside, nothing where the whole is one recording."""
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         """Return what is there without reading all of it: tables have the right fields, and no or the first rows."""
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams of these sources, or all, in one pass; a source that is not there is left out."""
 
 

@@ -22,9 +22,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats import source_files
 from tacpipe.formats.arrays.tree import PICTURE as PICTURE
 from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream, Time
+from tacpipe.formats.containers.container import Batched, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
-from tacpipe.formats.lerobot.description import Description, Episode, Feature
+from tacpipe.formats.lerobot.description import EpisodeDescription, FeatureDescription, LeRobotDescription
 from tacpipe.formats.table.column_names import NO_MEANING, meaning_from_name, meanings
 from tacpipe.io import files as file_system
 from tacpipe.io import parquet, regular
@@ -52,11 +52,11 @@ class LeRobotContainer:
         """Return the names of the episodes, by index."""
         return list(self._episodes)
 
-    def look(self, episode: str | None) -> Contents:
+    def look(self, episode: str | None) -> EpisodeContents:
         """Return the streams of an episode, without rows."""
         return self._contents(self._find_episode(episode), None, rows=False)
 
-    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+    def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams of an episode, all or those of some features."""
         return self._contents(self._find_episode(episode), sources, rows=True)
 
@@ -78,16 +78,16 @@ class LeRobotContainer:
         return Share(files or {description.INFO: self.path / description.INFO}, values)
 
     @functools.cached_property
-    def _about(self) -> Description:
+    def _about(self) -> LeRobotDescription:
         return description.read_description(self.path)
 
     @functools.cached_property
-    def _episodes(self) -> dict[str, Episode]:
+    def _episodes(self) -> dict[str, EpisodeDescription]:
         episodes = self._about.episodes()
         source_files.by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
         return source_files.by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
 
-    def _notes(self, episode: Episode) -> list[str]:
+    def _notes(self, episode: EpisodeDescription) -> list[str]:
         """Return, with the first episode, whether there are as many as the dataset states."""
         declared_count = self._about.info.get("total_episodes")
         first = next(iter(self._episodes.values()))
@@ -97,24 +97,24 @@ class LeRobotContainer:
             f"{self.path} describes {len(self._episodes)} episodes, and {description.INFO} states {declared_count}."
         ]
 
-    def _find_episode(self, name: str | None) -> Episode:
+    def _find_episode(self, name: str | None) -> EpisodeDescription:
         if name not in self._episodes:
             raise TacpipeError(f"{self.path} holds no episode {plain(str(name))}.")
         return self._episodes[name]
 
-    def _native(self, episode: Episode) -> dict[str, Path]:
+    def _native(self, episode: EpisodeDescription) -> dict[str, Path]:
         """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
         folder, file = (regular.inside(self.path, f"{NATIVE}/{episode.name}{end}") for end in ("", ".parquet"))
         paths = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
         return {"": file} if file.is_file() and not paths else paths
 
-    def _contents(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> Contents:
+    def _contents(self, episode: EpisodeDescription, sources: Collection[str] | None, *, rows: bool) -> EpisodeContents:
         native = self._native(episode)
         if native:
             streams = [
                 self._exported_stream(name, path) for name, path in native.items() if _is_selected(name, sources)
             ]
-            return Contents(streams, episode.original or {}, notes=self._notes(episode))
+            return EpisodeContents(streams, episode.original or {}, notes=self._notes(episode))
         attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
         attributes |= episode.original or {}
         if episode.tasks:
@@ -124,7 +124,7 @@ class LeRobotContainer:
         skipped = {key: f"is a video, {path}, which is not read" for key, path in episode.videos.items()}
         attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
         streams = self._streams(episode, sources, rows=rows)
-        return Contents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
+        return EpisodeContents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
 
     def _exported_stream(self, name: str, path: Path) -> SourceStream:
         """Return a stream as it was before the export, to the bit; the rows of a long one are decoded as they are read."""
@@ -139,8 +139,10 @@ class LeRobotContainer:
         rows = Batched(stored.schema, stored.num_rows, read) if content is None else content
         return SourceStream(name, name, Time(column="t_ns", unit="ns"), rows, stored.num_rows)
 
-    def _streams(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> list[SourceStream]:
-        by_source: dict[str, list[Feature]] = {}
+    def _streams(
+        self, episode: EpisodeDescription, sources: Collection[str] | None, *, rows: bool
+    ) -> list[SourceStream]:
+        by_source: dict[str, list[FeatureDescription]] = {}
         for feature in self._about.features.values():
             if feature.key not in (*COUNTING_FEATURES, EXACT) and feature.dtype != "video":
                 first = feature.key.partition(".")[0]
@@ -166,7 +168,7 @@ class LeRobotContainer:
             streams.append(SourceStream(source, names[_stream_stem(source)], time, table, episode.length))
         return streams
 
-    def _frames(self, episode: Episode, keys: Sequence[str]) -> pa.Table:
+    def _frames(self, episode: EpisodeDescription, keys: Sequence[str]) -> pa.Table:
         """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
         path = regular.inside(self.path, episode.file)
         with description.parquet_errors(path), regular.opened(path) as source:
@@ -191,7 +193,7 @@ class LeRobotContainer:
         return frames
 
     def _columns(
-        self, episode: Episode, feature: Feature, values: pa.ChunkedArray
+        self, episode: EpisodeDescription, feature: FeatureDescription, values: pa.ChunkedArray
     ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
         if feature.dtype == "image":
             return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _picture_bytes(values))]
@@ -210,7 +212,7 @@ class LeRobotContainer:
         return columns
 
     def _flat(
-        self, episode: Episode, feature: Feature, values: pa.ChunkedArray
+        self, episode: EpisodeDescription, feature: FeatureDescription, values: pa.ChunkedArray
     ) -> Sequence[pa.Array | pa.ChunkedArray]:
         """Return the columns of a feature, which may be lists within lists."""
         kind = values.type

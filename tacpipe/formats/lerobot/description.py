@@ -40,7 +40,7 @@ _PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces stay as they
 
 
 @dataclass(frozen=True)
-class Feature:
+class FeatureDescription:
     """The description of one column of the frames in info.json."""
 
     key: str
@@ -60,7 +60,7 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeDescription:
     """One episode: what it is called, the file with its frames, tasks, and what else is stated of it.
 
     ``original`` are the attributes of the recording that it was exported from, None where it was not.
@@ -77,22 +77,22 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Description:
+class LeRobotDescription:
     """The description of a LeRobot dataset in its folder meta."""
 
     root: Path
     version: str
     fps: float
     robot: str
-    features: Mapping[str, Feature]
+    features: Mapping[str, FeatureDescription]
     info: Mapping[str, Any]
 
-    def episodes(self) -> list[Episode]:
+    def episodes(self) -> list[EpisodeDescription]:
         """Return all episodes, by index. Raises `TacpipeError`, naming the file, for what cannot be read."""
         episodes = self._episodes_from_parquet() if self.version == "v3.0" else self._episodes_from_lines()
         return sorted(episodes, key=lambda episode: episode.index)
 
-    def _episodes_from_lines(self) -> Iterator[Episode]:
+    def _episodes_from_lines(self) -> Iterator[EpisodeDescription]:
         path = self.root / "meta/episodes.jsonl"
         size = self.info.get("chunks_size") or 1000
         if not isinstance(size, int) or size < 1:
@@ -107,7 +107,7 @@ class Description:
             extra_values = {
                 key: value for key, value in entry.items() if key not in ("episode_index", "length", "tasks")
             }
-            yield Episode(
+            yield EpisodeDescription(
                 _episode_name(index, extra_values),
                 index,
                 self._place("data_path", DATA_PATHS["v2"], values),
@@ -117,7 +117,7 @@ class Description:
                 _plain_attributes(extra_values),
             )
 
-    def _episodes_from_parquet(self) -> Iterator[Episode]:
+    def _episodes_from_parquet(self) -> Iterator[EpisodeDescription]:
         folders = file_system.walk(self.root / "meta/episodes")
         paths = sorted(Path(place, name) for place, _, names in folders for name in names if name.endswith(".parquet"))
         if not paths:
@@ -130,7 +130,7 @@ class Description:
             for row in _read_table(path, names).to_pylist():
                 yield self._episode_from_row(path, row)
 
-    def _episode_from_row(self, path: Path, row: Mapping[str, Any]) -> Episode:
+    def _episode_from_row(self, path: Path, row: Mapping[str, Any]) -> EpisodeDescription:
         try:
             index, length = int(row["episode_index"]), int(row["length"])
             values = {"chunk_index": int(row["data/chunk_index"]), "file_index": int(row["data/file_index"])}
@@ -152,7 +152,7 @@ class Description:
         file = self._place("data_path", DATA_PATHS["v3"], values)
         tasks = tuple(map(str, row.get("tasks") or ()))
         original = _original_attributes(path, row.get(ATTRIBUTES))
-        return Episode(
+        return EpisodeDescription(
             _episode_name(index, extra_values),
             index,
             file,
@@ -180,7 +180,7 @@ class Description:
         return path
 
 
-def read_description(root: Path) -> Description:
+def read_description(root: Path) -> LeRobotDescription:
     """Return what a dataset states of itself. Raises `TacpipeError`, naming file and entry, for what is not as it should."""
     path = root / INFO
     info = _read_json(root, INFO)
@@ -200,7 +200,7 @@ def read_description(root: Path) -> Description:
     parsed_features = {
         str(key): _parse_feature(path, str(key), value, about.get(key)) for key, value in features.items()
     }
-    return Description(root, version, float(fps), str(info.get("robot_type") or ""), parsed_features, info)
+    return LeRobotDescription(root, version, float(fps), str(info.get("robot_type") or ""), parsed_features, info)
 
 
 @contextlib.contextmanager
@@ -219,11 +219,11 @@ def parquet_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _parse_feature(path: Path, key: str, value: Any, about: Any) -> Feature:
+def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescription:
     shape = value.get("shape") if isinstance(value, dict) else None
     if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
         raise TacpipeError(f"{path}: the feature {plain(key)} is {excerpt(value)}; it must have dtype and shape.")
-    feature = Feature(key, str(value.get("dtype")), tuple(shape))
+    feature = FeatureDescription(key, str(value.get("dtype")), tuple(shape))
     about = about if isinstance(about, dict) else {}
 
     def texts_per_value(texts: Any) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ class Params(StreamSelection):
 
 
 @dataclass(frozen=True)
-class Command:
+class ContainerCommand:
     """The functions of a stage that ingests a format of containers.
 
     ::
@@ -81,7 +81,7 @@ class Command:
         """Return one recording."""
         return read_recording(self.parsed(params), self.kind, files, values)
 
-    def _find_recordings(self, layout: layouts.Layout, source: Path) -> list[recordings.Source]:
+    def _find_recordings(self, layout: layouts.Layout, source: Path) -> list[recordings.RecordingFiles]:
         from tacpipe.formats.table import recordings
 
         if layout.found_by_format:
@@ -90,7 +90,10 @@ class Command:
 
 
 def discover_sources(
-    layout: layouts.Layout, source: Path, recordings: Sequence[recordings.Source], kind: layouts.Format | None = None
+    layout: layouts.Layout,
+    source: Path,
+    recordings: Sequence[recordings.RecordingFiles],
+    kind: layouts.Format | None = None,
 ) -> dict[str, Source]:
     """Return recordings as a stage's ``discover`` does: their files, labels, and which one of a file each is.
 
@@ -122,7 +125,7 @@ class _ContainerShares:
         self._layout, self._kind = layout, kind
         self._opened: dict[Path, object] = {}
 
-    def files_and_values(self, recording: recordings.Source) -> tuple[dict[str, Path], dict[str, object]]:
+    def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], dict[str, object]]:
         files: dict[str, Path] = {}
         values: dict[str, object] = {}
         by_place: dict[Path, list[str]] = {}
@@ -159,7 +162,7 @@ class _ContainerShares:
 def preview_text(
     layout: layouts.Layout,
     source: Path,
-    listed_sources: Sequence[recordings.Source],
+    listed_sources: Sequence[recordings.RecordingFiles],
     kind: layouts.Format | None = None,
 ) -> str:
     """Return what would be read of a source, and what would not, in words."""

@@ -13,7 +13,7 @@ from tacpipe.formats import source_files
 from tacpipe.formats.table import label_table, pattern
 from tacpipe.formats.table.label_table import plain_value, read_rows, read_text
 from tacpipe.formats.table.layout import TREES, LabelSource, Layout
-from tacpipe.formats.table.recordings import Source
+from tacpipe.formats.table.recordings import RecordingFiles
 from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
@@ -21,7 +21,7 @@ from tacpipe.printable import excerpt, listed, plain
 RECORDING = "recording"  # the placeholder of a recording's name
 
 
-def find_labels(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, dict[str, Attribute]]:
+def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles]) -> dict[str, dict[str, Attribute]]:
     """Return the labels of each recording: of the layout, of its files' names, then of each source of labels.
 
     Values are read as numbers, true and false where they are written so. Raises `TacpipeError`, naming file and row, for
@@ -45,7 +45,7 @@ def find_labels(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict
     return labels_by_name
 
 
-def _placeholder_values(source: Source) -> Iterator[tuple[str, str]]:
+def _placeholder_values(source: RecordingFiles) -> Iterator[tuple[str, str]]:
     """Yield the placeholders of a recording's files with their text; one that is the recording's name is no label."""
     for name, value in source.values.items():
         if (name, value) != (RECORDING, source.name):
@@ -84,7 +84,7 @@ def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attri
     return rows
 
 
-def _alternative_names(layout: Layout, source: Source) -> list[str]:
+def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
     """Return other names of a recording in a table: the folders and files that its placeholders are part of.
 
     ``run_07/skin.csv`` of the pattern ``run_{trial}/skin.csv`` is run_07 too, whose trial is 07.
@@ -98,7 +98,7 @@ def _alternative_names(layout: Layout, source: Source) -> list[str]:
 
 
 def _find_row(
-    rows: Mapping[str, dict[str, Attribute]], source: Source, called: list[str], path: Path
+    rows: Mapping[str, dict[str, Attribute]], source: RecordingFiles, called: list[str], path: Path
 ) -> dict[str, Attribute]:
     candidates = (source.episode, source.name, *source.values.values(), *called)
     names = list(dict.fromkeys(name for name in candidates if name is not None))
@@ -111,7 +111,7 @@ def _find_row(
     )
 
 
-def _read_label_file(folder: Path, labels: LabelSource, source: Source) -> dict[str, Attribute]:
+def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) -> dict[str, Attribute]:
     path = folder / pattern.fill_pattern(labels.file, {**source.values, "recording": source.episode or source.name})
     if path.suffix.lower() in (".csv", ".tsv"):
         return _read_single_row(path)

@@ -18,7 +18,7 @@ from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats import source_files
 from tacpipe.formats.containers.container import (
-    Contents,
+    EpisodeContents,
     SourceStream,
     Time,
     find_containers,
@@ -28,7 +28,7 @@ from tacpipe.formats.containers.container import (
 from tacpipe.formats.table import labels, pattern, recordings
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout, why_unreadable
-from tacpipe.formats.table.recordings import CONTAINER, Source
+from tacpipe.formats.table.recordings import CONTAINER, RecordingFiles
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 
@@ -159,7 +159,7 @@ def _measured_fields(schema: pa.Schema) -> list[pa.Field]:
     return [field for field in schema if field.name != TIME and not pa.types.is_string(field.type)]
 
 
-def describe_sources(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
+def describe_sources(layout: Layout, folder: Path, sources: Sequence[RecordingFiles], kind: str | None = None) -> str:
     """Return what would be read as lines: all recordings and labels, and the streams of the first that can be read.
 
     ``kind`` is the format of containers whose streams are read as they declare them where the layout has none.
@@ -178,7 +178,7 @@ def describe_sources(layout: Layout, folder: Path, sources: Sequence[Source], ki
     raise TacpipeError("\n".join([*lines, "\nNo recording can be read."]))
 
 
-def _describe_recording(layout: Layout, source: Source, kind: str | None) -> list[str]:
+def _describe_recording(layout: Layout, source: RecordingFiles, kind: str | None) -> list[str]:
     """Return the streams, attributes and notes of a recording as lines."""
     lines = [f"\n{source.name}, the first:"]
     if layout.streams:
@@ -268,7 +268,7 @@ def _why_unread(kind: str, path: Path, containers: Sequence[Path]) -> str:
     return "" if inside else why_unreadable(path.name, "", kind)
 
 
-def _layout_text(contents: Contents, command: str, path: Path, remarks: Sequence[str] = ()) -> str:
+def _layout_text(contents: EpisodeContents, command: str, path: Path, remarks: Sequence[str] = ()) -> str:
     """Return the text of the layout that states what a container declares; ``command`` is the one that reads it.
 
     ``remarks`` are sentences about other files, which become comments.

@@ -14,8 +14,8 @@ from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
 from tacpipe.formats import source_files
 from tacpipe.formats.containers.container import (
-    Contents,
-    Naming,
+    EpisodeContents,
+    NamedContainer,
     container_names,
     find_containers,
     is_container,
@@ -34,7 +34,7 @@ CONTAINER = "container"  # key of the file that holds all streams of a source
 
 
 @dataclass(frozen=True)
-class Source:
+class RecordingFiles:
     """The files of one recording: a path a stream, what the placeholders are, and its name where a file holds many."""
 
     name: str
@@ -43,7 +43,7 @@ class Source:
     episode: str | None = None  # value of the column ``recording``, or episode of a container
 
 
-def find_recordings(layout: Layout, folder: Path) -> list[Source]:
+def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
     """Return the recordings below ``folder``, sorted by name.
 
     Raises `UsageError` where none is found, where one lacks a stream that is not optional, where two files of one stream
@@ -96,7 +96,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[Source]:
     return sorted(sources, key=lambda placeholder: placeholder.name)
 
 
-def find_contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
+def find_contained(layout: Layout, kind: Format, source: Path) -> list[RecordingFiles]:
     """Return the recordings in the containers of a format at or below ``source``, sorted by name.
 
     They are named after their file, and after the episode where it holds several. Raises `UsageError` where there is no
@@ -116,7 +116,7 @@ def find_contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
             name = recording_names.valid(pattern.fill_pattern(layout.name, values) if layout.name else plain_name)
             if not name:
                 raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
-            sources.append(Source(name, files, {}, episode))
+            sources.append(RecordingFiles(name, files, {}, episode))
     recording_names.refuse_shared((stream.name, next(iter(stream.files.values()))) for stream in sources)
     return sorted(sources, key=lambda stream: stream.name)
 
@@ -128,7 +128,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     """
     try:
         container = open_container(kind, path)
-        return container.episodes() or [None], isinstance(container, Naming) and container.names_itself
+        return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
             raise
@@ -168,7 +168,7 @@ def _refuse_idle(layout: Layout, matched: Mapping[str, object], candidates: list
             )
 
 
-def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[Source]:
+def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[RecordingFiles]:
     """Return the recording of these files, or those that they hold."""
     shared_streams = [
         stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
@@ -179,7 +179,7 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
         if (names_in_file := _names_in_file(files[stream.name], stream)) is not None
     }
     if not names_by_stream:
-        return [Source(_recording_name(layout, values, files), files, values)]
+        return [RecordingFiles(_recording_name(layout, values, files), files, values)]
     first = next(iter(names_by_stream.values()))
     for stream, names in names_by_stream.items():
         if names != first:
@@ -189,7 +189,7 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
                 f"in one of them alone."
             )
     return [
-        Source(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
+        RecordingFiles(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
         for name in sorted(first)
     ]
 
@@ -347,7 +347,9 @@ def _skipped_notes(path: Path, skipped: Mapping[str, str]) -> list[str]:
     return [f"{path}: {plain(source)} is left out: {problem}." for source, problem in skipped.items()]
 
 
-def _missing_stream_error(path: Path, stream: StreamLayout, contents: Contents, look: Contents) -> TacpipeError:
+def _missing_stream_error(
+    path: Path, stream: StreamLayout, contents: EpisodeContents, look: EpisodeContents
+) -> TacpipeError:
     """Return the error for a stream of a layout that its container does not have."""
     reason = contents.skipped.get(stream.source) or look.skipped.get(stream.source)
     if reason:

@@ -60,7 +60,7 @@ ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
 
 
 @dataclass(frozen=True)
-class Line:
+class Curve:
     """Values over x, with the bounds of each where they are given; NaN breaks the line."""
 
     name: str
@@ -73,7 +73,7 @@ class Line:
 
 
 def lines(
-    curves: Sequence[Line],
+    curves: Sequence[Curve],
     x: str,
     y: str,
     *,
@@ -225,7 +225,7 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
     return x[at], y[at]
 
 
-def _rows(curve: Line, number: int) -> list[Spec]:
+def _rows(curve: Curve, number: int) -> list[Spec]:
     x, y = (np.asarray(part, np.float64) for part in (curve.x, curve.y))
     bounds = [None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high)]
     if bounds[0] is None:

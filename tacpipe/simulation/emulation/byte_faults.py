@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import Times
 from tacpipe.errors import UsageError
 from tacpipe.plugins import params
-from tacpipe.sensors.framing import Chunks, Run
+from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Frames, Sensor
 from tacpipe.sensors.text_framer import LineFramer
 
@@ -45,7 +45,7 @@ def _chunks(sensor: Sensor, piece: bytes) -> list[bytes]:
     return [piece[start : start + CAN_BYTES] for start in range(0, len(piece), CAN_BYTES)]
 
 
-def of_run(run: Run) -> list[bytes]:
+def of_run(run: FrameRun) -> list[bytes]:
     """Return the frames of a run one by one."""
     return [bytes(frame) for frame in run.frames]
 
@@ -140,7 +140,7 @@ def parse(text: str) -> Faults:
     return faults
 
 
-class Item(NamedTuple):
+class SentItem(NamedTuple):
     """An item that is sent at a moment: a frame, harmed or not, noise, or the device that is unplugged or comes back."""
 
     due_ns: int
@@ -162,12 +162,12 @@ class Harm:
         self._noise, self._cut, self._flip, self._burst, self._stall, self._unplug = happenings
         self._stalls: list[tuple[int, int]] = []  # start and end of the last stalls
         self._away: list[tuple[int, int]] = []
-        self._later: list[Item] = []  # items delayed beyond the present frames
+        self._later: list[SentItem] = []  # items delayed beyond the present frames
         self._quiet = faults == Faults(wrap_s=faults.wrap_s)
 
-    def apply(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[Item]:
+    def apply(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[SentItem]:
         """Return what goes out instead of ``frames``, in order; ``first`` is the number of the first one's sample."""
-        items = [Item(due, data, first + row) for row, (data, due) in enumerate(zip(frames, due_ns, strict=True))]
+        items = [SentItem(due, data, first + row) for row, (data, due) in enumerate(zip(frames, due_ns, strict=True))]
         if self._quiet or not items:
             return items
         until_ns = items[-1].due_ns + 1
@@ -181,7 +181,7 @@ class Harm:
         self._later = [item for item in items if item.due_ns >= until_ns]
         return items[: len(items) - len(self._later)]
 
-    def _change(self, items: list[Item], until_ns: int) -> None:
+    def _change(self, items: list[SentItem], until_ns: int) -> None:
         for at_ns in self._flip.until(until_ns):
             row = _row(items, at_ns)
             changed = bytearray(items[row].data)
@@ -198,7 +198,7 @@ class Harm:
             start = int(self._rng.integers(len(items[row].data)))
             self._replace_bytes(items, row, start, int(self._rng.integers(2, LONGEST_BURST + 1)))
 
-    def _replace_bytes(self, items: list[Item], row: int, start: int, count: int) -> None:
+    def _replace_bytes(self, items: list[SentItem], row: int, start: int, count: int) -> None:
         """Replace ``count`` bytes from ``start`` of a frame by random ones, into the frames behind it where they reach."""
         while count > 0 and row < len(items):
             data = items[row].data
@@ -208,12 +208,12 @@ class Harm:
                 items[row] = items[row]._replace(data=data[:start] + random + data[start + size :], cause=BURST)
             row, start, count = row + 1, 0, 0 if self.packets else count - size
 
-    def _mark_undetectable(self, items: list[Item], frames: Sequence[bytes]) -> None:
+    def _mark_undetectable(self, items: list[SentItem], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
                 items[row] = item._replace(invisible=passes(self.sensor, frames, row, item.data))
 
-    def _lose(self, items: list[Item]) -> list[Item]:
+    def _lose(self, items: list[SentItem]) -> list[SentItem]:
         if not self.faults.drop:
             return items
         lost = self._rng.random(len(items)) < self.faults.drop
@@ -222,7 +222,7 @@ class Harm:
             for item, is_lost in zip(items, lost, strict=True)
         ]
 
-    def _move(self, items: list[Item]) -> list[Item]:
+    def _move(self, items: list[SentItem]) -> list[SentItem]:
         """Return packets of which some come twice, and some behind the next."""
         faults, moved = self.faults, list(items)
         for row in np.flatnonzero(self._rng.random(len(items) - 1) < faults.reorder) if faults.reorder else ():
@@ -232,22 +232,22 @@ class Harm:
         if not faults.duplicate:
             return moved
         duplicated = self._rng.random(len(moved)) < faults.duplicate
-        doubled: list[Item] = []
+        doubled: list[SentItem] = []
         for item, is_duplicate in zip(moved, duplicated, strict=True):
             doubled.append(item)
             if is_duplicate and item.data:
                 doubled.append(item._replace(due_ns=item.due_ns + SEPARATION_NS, cause=DUPLICATE))
         return doubled
 
-    def _add_noise(self, items: list[Item], until_ns: int) -> list[Item]:
+    def _add_noise(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         noise = []
         for at_ns in self._noise.until(until_ns):
             count = int(self._rng.integers(1, LONGEST_NOISE + 1))
             before = items[_row(items, at_ns)].due_ns - SEPARATION_NS
-            noise.append(Item(before, self._rng.integers(0, 256, count, dtype=np.uint8).tobytes(), -1, NOISE))
+            noise.append(SentItem(before, self._rng.integers(0, 256, count, dtype=np.uint8).tobytes(), -1, NOISE))
         return sorted([*items, *noise], key=lambda item: item.due_ns) if noise else items
 
-    def _stay_away(self, items: list[Item], until_ns: int) -> list[Item]:
+    def _stay_away(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         away_ns = round(self.faults.unplug_s * 1e9)
         back_ns = self._away[-1][1] if self._away else -1
         signs = []
@@ -255,7 +255,7 @@ class Harm:
             if at_ns >= back_ns:
                 back_ns = at_ns + away_ns
                 self._away = [*self._away[-1:], (at_ns, back_ns)]
-                signs += [Item(at_ns, b"", -1, UNPLUG), Item(back_ns, b"", -1, REPLUG)]
+                signs += [SentItem(at_ns, b"", -1, UNPLUG), SentItem(back_ns, b"", -1, REPLUG)]
         if not self._away:
             return items
         remaining = [
@@ -266,7 +266,7 @@ class Harm:
         ]
         return sorted([*remaining, *signs], key=lambda item: item.due_ns)
 
-    def _hold_up(self, items: list[Item], until_ns: int) -> list[Item]:
+    def _hold_up(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         stall_ns = round(self.faults.stall_s * 1e9)
         self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.until(until_ns)]
         if not self._stalls:
@@ -280,7 +280,7 @@ class Harm:
         return delayed
 
 
-def _row(items: Sequence[Item], at_ns: int) -> int:
+def _row(items: Sequence[SentItem], at_ns: int) -> int:
     """Return the row of the frame that is due at ``at_ns`` or next."""
     low, high = 0, len(items) - 1
     while low < high:

@@ -32,7 +32,7 @@ def joined(identifier: int, data: bytes) -> bytes:
     return FRAME.pack(identifier, len(data), data)
 
 
-class Member:
+class BusMember:
     """All others on the virtual bus."""
 
     fault = byte_faults.SOUND
@@ -63,17 +63,17 @@ class VirtualCan:
         self.address = Address("can", f"virtual:{channel}")
         self._bus = can.Bus(interface="virtual", channel=channel, ignore_config=True)
         self._away = False
-        self.peers = [Member(self._bus, sensor)]
+        self.peers = [BusMember(self._bus, sensor)]
 
     def descriptors(self) -> list[int]:
         """Return nothing: a virtual bus has no descriptor."""
         return []
 
-    def ready(self, descriptor: int) -> list[tuple[Member, bytes]]:
+    def ready(self, descriptor: int) -> list[tuple[BusMember, bytes]]:
         """Return nothing."""
         return []
 
-    def look(self) -> list[tuple[Member, bytes]]:
+    def look(self) -> list[tuple[BusMember, bytes]]:
         """Return the CAN frames that others sent."""
         heard = []
         while (message := self._bus.recv(0)) is not None:

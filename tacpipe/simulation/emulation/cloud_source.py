@@ -11,7 +11,7 @@ from tacpipe.arrays import Bytes, Float32s, Int64s
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import depth_camera, grasp_scene
 from tacpipe.simulation.emulation.source import BLOCK_S, Timing
-from tacpipe.simulation.grasp_scene import Rig
+from tacpipe.simulation.grasp_scene import GraspRig
 
 EVERY = 16  # one of so many of the camera's 300,000 points is kept
 
@@ -44,6 +44,8 @@ class CloudSource:
         scene = grasp_scene.perform(self._seed, number)
         neighbour = grasp_scene.draw_thing(self._seed, number + 1)
         rng = np.random.default_rng([self._seed, 9, number])
-        cloud = depth_camera.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, Rig().noise_scale, rng).cloud
+        cloud = depth_camera.view(
+            scene.placed, neighbour.shape, scene.up, scene.camera_m, GraspRig().noise_scale, rng
+        ).cloud
         assert cloud.colours is not None
         return cloud.points_m[::EVERY].astype(np.float32), cloud.colours[::EVERY]

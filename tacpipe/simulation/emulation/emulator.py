@@ -22,22 +22,22 @@ import numpy as np
 
 from tacpipe.errors import DeviceError
 from tacpipe.plugins import params
-from tacpipe.recording.rig import Rig, Stream
+from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation import faults as clocks
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, no_steps
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.pacing import Pace
-from tacpipe.simulation.emulation.source import Sampled, Source, Timing
-from tacpipe.simulation.emulation.transmission import Plan, Transmission
+from tacpipe.simulation.emulation.pacing import FramePace
+from tacpipe.simulation.emulation.source import Sampled, SampleSource, Timing
+from tacpipe.simulation.emulation.transmission import Transmission, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
 PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder")  # links that keep frames apart
 
 
-def endpoint(stream: Stream, folder: Path) -> Endpoint:
+def endpoint(stream: RigStream, folder: Path) -> Endpoint:
     """Return the device's end of a stream's link, served from now on; ``folder`` is for pseudo-terminals and files.
 
     Raises `DeviceError` for a link that cannot be emulated.
@@ -76,7 +76,7 @@ def endpoint(stream: Stream, folder: Path) -> Endpoint:
     )
 
 
-def _udp(stream: Stream) -> Endpoint:
+def _udp(stream: RigStream) -> Endpoint:
     from tacpipe.simulation.emulation.udp import HOST, Udp, free_port
 
     host, _, _ = stream.address.place.partition("?")[0].rpartition(":")
@@ -181,19 +181,19 @@ class Emulator:
         """Bring it back, under the same address."""
         self._commands.append((name, True))
 
-    def _transmission(self, stream: Stream, its_pace: Pace, endpoint: Endpoint) -> Transmission:
+    def _transmission(self, stream: RigStream, its_pace: FramePace, endpoint: Endpoint) -> Transmission:
         packets = stream.address.scheme in PACKETS
         rate_hz = stream.sensor.rate_hz or UNPACED_HZ
 
-        def planned(rate: float, start_ns: int) -> Plan:
+        def planned(rate: float, start_ns: int) -> TransmissionPlan:
             source = self.source(stream.name, its_pace, rate, start_ns)
             seed = [*self._seed(stream.name), start_ns]
-            return Plan(source, its_pace, self.faults, seed, packets=packets)
+            return TransmissionPlan(source, its_pace, self.faults, seed, packets=packets)
 
         ledger, patient = self.ledger[stream.name], self.patient
         return Transmission(endpoint, stream.sensor, ledger, planned, rate_hz, self.epoch_ns, patient=patient)
 
-    def source(self, name: str, its_pace: Pace, rate_hz: float, start_ns: int = 0) -> Sampled:
+    def source(self, name: str, its_pace: FramePace, rate_hz: float, start_ns: int = 0) -> Sampled:
         """Return the source of a stream."""
         seed, sensor = self._seed(name), self.rig_file.streams[name].sensor
         steps = (
@@ -209,7 +209,7 @@ class Emulator:
             from tacpipe.simulation.emulation.cloud_source import CloudSource
 
             return CloudSource(sensor, timing, seed)
-        return Source(sensor, self.world, timing, seed, (its_pace.finger or int(last)) - 1)
+        return SampleSource(sensor, self.world, timing, seed, (its_pace.finger or int(last)) - 1)
 
     def _seed(self, name: str) -> list[int]:
         return [self.seed, zlib.crc32(name.encode())]
@@ -262,17 +262,17 @@ def stream_of_clouds(sensor: Sensor) -> bool:
     return [field.name for field in sensor.fields()][:3] == ["x_m", "y_m", "z_m"]
 
 
-def pace(rig: Rig, name: str) -> Pace:
+def pace(rig: Rig, name: str) -> FramePace:
     """Return the pace of a stream: what the rig file states under ``emulate``, of the stream over that of the rig."""
     source = f"stream {name}, emulate"
-    stream_pace: Pace = params.filled(Pace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
+    stream_pace: FramePace = params.filled(FramePace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
     return stream_pace
 
 
-def clock(its_pace: Pace, seed: list[int]) -> clocks.Clock:
+def clock(its_pace: FramePace, seed: list[int]) -> clocks.DeviceClock:
     """Return a device's clock: as its pace states, or as far off as those of the simulated rig may be."""
-    rng, usual = np.random.default_rng([*seed, 8]), pick_and_move.Rig()
+    rng, usual = np.random.default_rng([*seed, 8]), pick_and_move.PickRig()
     offset, skew = rng.uniform(-1, 1, 2)
     offset_ms = its_pace.offset_ms if its_pace.offset_ms is not None else offset * usual.clock_offset_ms
     skew_ppm = its_pace.skew_ppm if its_pace.skew_ppm is not None else skew * usual.clock_skew_ppm
-    return clocks.Clock(round(offset_ms * 1e6), float(skew_ppm * 1e-6))
+    return clocks.DeviceClock(round(offset_ms * 1e6), float(skew_ppm * 1e-6))

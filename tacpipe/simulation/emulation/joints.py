@@ -23,7 +23,7 @@ ROUNDS, DAMPING = 40, 1e-3
 
 
 @dataclass(frozen=True)
-class Course:
+class JointCourse:
     """Angles of the joints at waypoints: ``t_ns`` (waypoint,), ``angle_rad`` (waypoint, joint)."""
 
     t_ns: Times
@@ -39,10 +39,10 @@ class Course:
         return _interpolated(t_ns, self.t_ns, speed)
 
 
-def course(t_ns: Times, position_m: Floats, yaw_rad: Floats) -> Course:
+def course(t_ns: Times, position_m: Floats, yaw_rad: Floats) -> JointCourse:
     """Return the course of the joints that has the hand at ``position_m`` (time, axis), pointing down, turned by the yaw."""
     rows = np.unique(np.append(np.arange(0, len(t_ns), WAYPOINT_ROWS), len(t_ns) - 1))
-    return Course(t_ns[rows], solved(position_m[rows], yaw_rad[rows]))
+    return JointCourse(t_ns[rows], solved(position_m[rows], yaw_rad[rows]))
 
 
 def solved(position_m: Floats, yaw_rad: Floats) -> Floats:

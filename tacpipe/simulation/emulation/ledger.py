@@ -15,7 +15,7 @@ from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import CAUSES, Item, one_by_one
+from tacpipe.simulation.emulation.byte_faults import CAUSES, SentItem, one_by_one
 from tacpipe.simulation.emulation.source import Sampled
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ CODES = {cause: code for code, cause in enumerate(CAUSES)}
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """A frame that was sent, or should have been sent."""
 
     due_ns: int  # time on this computer's monotonic clock
@@ -89,7 +89,7 @@ class Ledger:
     def __len__(self) -> int:
         return len(self._source)  # the column that is written last: a ledger may be read while it grows
 
-    def add(self, item: Item, due_ns: int, sent_ns: int, size: int, cause: str) -> None:
+    def add(self, item: SentItem, due_ns: int, sent_ns: int, size: int, cause: str) -> None:
         """Enter an item with what became of it: ``size`` bytes went out at ``sent_ns``."""
         if cause not in UNHARMED and size:
             self.harmed[len(self)] = item.data[:size]
@@ -106,16 +106,16 @@ class Ledger:
         self.events.append((t_ns, event, detail))
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LedgerEntry]:
         """All entries, one by one."""
         return [self.entry(row) for row in range(len(self))]
 
-    def entry(self, row: int) -> Entry:
+    def entry(self, row: int) -> LedgerEntry:
         """Return one entry."""
         cause = CAUSES[self._cause[row]]
         size, invisible = self._size[row], bool(self._invisible[row])
         sent_ns, number = self._sent_ns[row], self._number[row]
-        return Entry(self._due_ns[row], sent_ns, number, size, cause, invisible, self._source[row])
+        return LedgerEntry(self._due_ns[row], sent_ns, number, size, cause, invisible, self._source[row])
 
     def column(self, name: str) -> AnyArray:
         """Return a column (entry,): ``due_ns``, ``sent_ns``, ``number``, ``size``, ``cause`` (code), ..."""

@@ -14,7 +14,7 @@ from tacpipe.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Pace:
+class FramePace:
     """How a stream's frames come; in a rig file the keys of ``emulate``, for the whole rig or one stream."""
 
     jitter_ms: float = 0.2  # mean delay of a frame, exponentially distributed
@@ -33,7 +33,7 @@ class Pace:
             raise UsageError(f"emulate: finger is {self.finger}; the gripper has finger 1 and finger 2.")
 
 
-def due_ns(taken_ns: Times, pace: Pace, after_ns: int, rng: np.random.Generator) -> Times:
+def due_ns(taken_ns: Times, pace: FramePace, after_ns: int, rng: np.random.Generator) -> Times:
     """Return when frames of samples taken at ``taken_ns`` (frame,) go out: none before ``after_ns``, and in order."""
     late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(taken_ns))).astype(np.int64)
     due = np.maximum(np.maximum.accumulate(taken_ns + late_ns), after_ns)

@@ -65,7 +65,7 @@ FRICTION = 0.5  # friction that a slip sensor states
 
 
 @dataclass(frozen=True)
-class View:
+class SensorView:
     """A sensor's view of the world: when it looks, and on which finger it sits."""
 
     world: World
@@ -73,7 +73,7 @@ class View:
     finger: int = 0
 
 
-def look(quantity: str, view: View, fields: Sequence[pa.Field]) -> Floats:
+def look(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return what fields of one quantity show (time, field), SI; zeros for one that the world does not know."""
     function = (
         QUANTITIES.get(quantity)
@@ -99,7 +99,7 @@ def _vector(values: Floats, fields: Sequence[pa.Field], names: Sequence[str], ax
     return values[:, [names.index(name) if (name := axis_of(field)) in names else axis for field in fields]]
 
 
-def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _tactile(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return the force on taxels (time, field): fields that share all layout but the axis are one taxel."""
     places = [_place(field) for field in fields]
     pads = list(dict.fromkeys(pad for pad, _ in places))
@@ -123,25 +123,25 @@ def _place(field: pa.Field) -> tuple[str, str]:
     return " ".join(layout.values()), taxel
 
 
-def _normal(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _normal(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return np.column_stack(
         [view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])] * len(fields)
     )
 
 
-def _force(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _force(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return what the hand's load cell measures: the contact's force with its sign turned; alone, the finger's pressure."""
     load = -view.world.contact(view.t_ns, lambda scene: scene.contact.force_n)
     normal = view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])
     return _vector(np.column_stack([load, normal]), fields, schema.AXES, 3)
 
 
-def _torque(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _torque(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     about_y = view.world.contact(view.t_ns, lambda scene: scene.contact.torque_nm)
     return _vector(np.column_stack([0 * about_y, about_y, 0 * about_y]), fields, schema.AXES, 1)
 
 
-def _vibration(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _vibration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return a ringing at slip's speed, m/s: fields of one quantity are readings one after another."""
     speed = np.linalg.norm(view.world.contact(view.t_ns, lambda scene: scene.contact.velocity_m_s), axis=1)
     phase = np.arange(len(fields)) * 2.4 + (view.t_ns % 1_000_000_007)[:, None] * 1e-7
@@ -149,17 +149,17 @@ def _vibration(view: View, fields: Sequence[pa.Field]) -> Floats:
     return ringing
 
 
-def _position(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _position(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return _vector(view.world.arm(view.t_ns)[:, 1:4], fields, schema.AXES, 2)
 
 
-def _orientation(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _orientation(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     names = [axis_of(field) or field.name.rpartition("_")[2] for field in fields]
     arm = view.world.arm(view.t_ns)[:, 4:]
     return arm[:, [schema.COMPONENTS.index(name) if name in schema.COMPONENTS else 3 for name in names]]
 
 
-def _width(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _width(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return np.repeat(view.world.arm(view.t_ns)[:, :1], len(fields), axis=1)
 
 
@@ -169,18 +169,18 @@ def _difference(look_at: Callable[[Times], Floats], t_ns: Times) -> Floats:
     return (look_at(after) - look_at(before)) / ((after - before) / 1e9)[:, None]
 
 
-def _velocity(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     velocity = _difference(lambda t_ns: view.world.arm(t_ns)[:, 1:4], view.t_ns)
     return _vector(velocity, fields, schema.AXES, 2)
 
 
-def _acceleration(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _acceleration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return what an accelerometer on the hand shows: at rest, gravity upwards."""
     at = view.world.contact(view.t_ns, lambda scene: scene.path.hand_acceleration_m_s2)
     return _vector(at + np.array([0.0, 0.0, GRAVITY_M_S2]), fields, schema.AXES, 2)
 
 
-def _angular_velocity(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _angular_velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     def yaw(t_ns: Times) -> Floats:
         return view.world.contact(t_ns, lambda scene: scene.path.yaw_rad)[:, None]
 
@@ -193,29 +193,29 @@ def _joints(values: Floats, fields: Sequence[pa.Field]) -> Floats:
     return values[:, np.arange(len(fields)) % values.shape[1]]
 
 
-def _joint_torque(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _joint_torque(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return _joints(view.world.joint_torques(view.t_ns), fields)
 
 
-def _distance(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _distance(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     up_m = view.world.contact(view.t_ns, lambda scene: scene.contact.displacement_m[:, 1])
     return np.column_stack([np.maximum(CLEARANCE_M - up_m, 0.0)] * len(fields))
 
 
-def _temperature(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _temperature(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     warmed = WARM_C - WARMING_C * np.exp(-view.t_ns / WARMING_NS)
     return warmed[:, None] + 0.1 * np.arange(len(fields))
 
 
-def _time(view: View, fields: Sequence[pa.Field]) -> Floats:
+def _time(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return np.column_stack([view.t_ns / 1e9] * len(fields))
 
 
-def _constant(value: float) -> Callable[[View, Sequence[pa.Field]], Floats]:
+def _constant(value: float) -> Callable[[SensorView, Sequence[pa.Field]], Floats]:
     return lambda view, fields: np.full((len(view.t_ns), len(fields)), value)
 
 
-QUANTITIES: dict[str, Callable[[View, Sequence[pa.Field]], Floats]] = {
+QUANTITIES: dict[str, Callable[[SensorView, Sequence[pa.Field]], Floats]] = {
     "tactile": _tactile,
     "magnetic_flux_density": _tactile,
     "displacement": _tactile,

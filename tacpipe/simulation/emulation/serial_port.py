@@ -58,7 +58,7 @@ TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
 MOST_READ = 4096
 
 
-class Port:
+class HostPort:
     """The one host that has the port open."""
 
     def __init__(self, endpoint: Pty) -> None:
@@ -82,7 +82,7 @@ class Pty:
     def __init__(self, sensor: Sensor, link: Path) -> None:
         self.sensor, self.link = sensor, link
         self.address = Address("serial", str(link))
-        self.peers: list[Port] = []
+        self.peers: list[HostPort] = []
         self._master = -1
         self._baud = 0  # speed that the host has set
         self.garbling = False
@@ -104,7 +104,7 @@ class Pty:
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
-        self._port = Port(self)
+        self._port = HostPort(self)
 
     def unplug(self) -> None:
         """Close the terminal, which the host sees as an unplugged port."""
@@ -122,7 +122,7 @@ class Pty:
         """Return the terminal while a host has it open; before, it would never rest."""
         return [self._master] if self.peers else []
 
-    def ready(self, descriptor: int) -> list[tuple[Port, bytes]]:
+    def ready(self, descriptor: int) -> list[tuple[HostPort, bytes]]:
         """Return what the host wrote."""
         try:
             data = os.read(self._master, MOST_READ)
@@ -135,7 +135,7 @@ class Pty:
             data = garbled(data, self._baud, self.sensor.baud)
         return [(self._port, heard) for heard in self.understood(data)]
 
-    def look(self) -> list[tuple[Port, bytes]]:
+    def look(self) -> list[tuple[HostPort, bytes]]:
         """Find out whether a host has the port open."""
         if self._master < 0 or self.peers:
             return []

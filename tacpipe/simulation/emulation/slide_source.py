@@ -15,7 +15,7 @@ from tacpipe.sensors.biotac import BioTac
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults
 from tacpipe.simulation.emulation.source import BLOCK_S, Timing
-from tacpipe.simulation.slide import SENSORS, Rig, simulate_trial
+from tacpipe.simulation.slide import SENSORS, SlideRig, simulate_trial
 
 KEPT = 3  # trials that are kept in case they are asked for once more
 
@@ -23,14 +23,14 @@ KEPT = 3  # trials that are kept in case they are asked for once more
 class SlideSource:
     """The samples of one BioTac, from its start on."""
 
-    def __init__(self, sensor: Sensor, timing: Timing, seed: int, rig: Rig | None = None) -> None:
+    def __init__(self, sensor: Sensor, timing: Timing, seed: int, rig: SlideRig | None = None) -> None:
         """Take a BioTac; raises `UsageError` for any other sensor."""
         if not isinstance(sensor, BioTac):
             raise UsageError("emulate: slides is for the sensor biotac; leave it out for others.")
         self.sensor: Sensor = sensor
         self.timing, self._fingers = timing, sensor.fingers
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))
-        self._seed, self._rig = seed, rig or Rig(arm_every=0)
+        self._seed, self._rig = seed, rig or SlideRig(arm_every=0)
         self._fields = [field.name for field in BioTac().fields()]
         self._ends = [0]  # end of each trial in samples from the start
         self._trial = functools.lru_cache(KEPT)(self._generate)

@@ -19,7 +19,7 @@ from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, pick_and_move, taxels
 from tacpipe.simulation.emulation import quantities
 from tacpipe.simulation.emulation.byte_faults import no_steps
-from tacpipe.simulation.emulation.quantities import View
+from tacpipe.simulation.emulation.quantities import SensorView
 from tacpipe.simulation.emulation.world import World
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Timing:
 
     rate_hz: float
     start_ns: int = 0  # time of the first sample in the world
-    clock: faults.Clock = field(default_factory=faults.Clock)  # its oscillator paces its samples too
+    clock: faults.DeviceClock = field(default_factory=faults.DeviceClock)  # its oscillator paces its samples too
     steps: Callable[[Times], Times] = no_steps  # returns the total of clock steps so far, ns (time,)
     wrap_s: float | None = None  # counters go round so long after the start; None: they begin anywhere
 
@@ -71,7 +71,7 @@ class Sampled(Protocol):
         """Return the numbers of a block's frames, counted from 0 through the stream (frame,)."""
 
 
-class Source:
+class SampleSource:
     """The samples of one sensor, from its start on."""
 
     def __init__(
@@ -103,7 +103,7 @@ class Source:
         numbers = self.numbers(block)
         taken_ns = self.timing.taken_ns(numbers)
         rng = np.random.default_rng([*self._seed, 1, block])
-        view = View(self.world, taken_ns, self.finger)
+        view = SensorView(self.world, taken_ns, self.finger)
         columns: Columns = {}
         for group in self._groups:
             columns |= self._filled(group, view, block, rng)
@@ -115,7 +115,7 @@ class Source:
         device_ns = faults.device_stamps(taken_ns, self.timing.clock) + self.timing.steps(taken_ns)
         return Samples(_blocks(self._widths, columns), counts[0], device_ns, counts[1])
 
-    def _filled(self, group: Sequence[int], view: View, block: int, rng: np.random.Generator) -> Columns:
+    def _filled(self, group: Sequence[int], view: SensorView, block: int, rng: np.random.Generator) -> Columns:
         """Return the columns of the fields of one quantity."""
         fields = [self.fields[number] for number in group]
         quantity = quantities.metadata_of(fields[0], "quantity") or ""
@@ -137,13 +137,13 @@ class Source:
         values = quantities.look(quantity, view, fields)
         return dict(zip(group, quantities.sent(quantity, values, fields, rng), strict=True))
 
-    def _uskin(self, view: View, block: int, rng: np.random.Generator) -> Counts:
+    def _uskin(self, view: SensorView, block: int, rng: np.random.Generator) -> Counts:
         """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""
         skin = view.world.skins[view.finger]
         noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
         counts = skin.base_count + taxels.signal(skin, view.world.touch(view.finger, view.t_ns)) + noise
         digits = taxels.digitised(counts + self._drifted(block))
-        return faults.hold(digits, pick_and_move.Rig().hold_probability, rng)[0]
+        return faults.hold(digits, pick_and_move.PickRig().hold_probability, rng)[0]
 
     def _drifted(self, block: int) -> Floats:
         """Return the drift of a uSkin in a block (time, taxel, axis), a random walk from where the last block left it."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults, pacing
-from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, Item, one_by_one
+from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, SentItem, one_by_one
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.pacing import Pace
+from tacpipe.simulation.emulation.pacing import FramePace
 from tacpipe.simulation.emulation.source import Sampled
 
 AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
@@ -23,10 +23,10 @@ MOST_MESSAGES = 1000  # messages of the host that the ledger keeps
 PAUSE_NS = 2_000_000  # pause between two tries of a patient device
 
 
-class Plan:
+class TransmissionPlan:
     """The items of a stream, in order, a block of its source at a time: what goes out, when, and what was harmed."""
 
-    def __init__(self, source: Sampled, pace: Pace, faults: Faults, seed: Sequence[int], *, packets: bool) -> None:
+    def __init__(self, source: Sampled, pace: FramePace, faults: Faults, seed: Sequence[int], *, packets: bool) -> None:
         self.source, self.pace = source, pace
         self._harm = Harm(faults, source.sensor, seed, packets=packets)
         self._rng = np.random.default_rng([*seed, 7])
@@ -37,7 +37,7 @@ class Plan:
         """Begin with the block that holds the first sample after ``t_ns``."""
         self._block = max(self._block, self.source.timing.first_after(t_ns) // self.source.rows)
 
-    def next_items(self) -> list[Item]:
+    def next_items(self) -> list[SentItem]:
         """Return the items of the next block."""
         source = self.source
         numbers = source.numbers(self._block)
@@ -56,14 +56,16 @@ class Transmission:
         endpoint: Endpoint,
         sensor: Sensor,
         ledger: Ledger,
-        planned: Callable[[float, int], Plan],  # returns due times, ns from the rig's start, of a rate and a start
+        planned: Callable[
+            [float, int], TransmissionPlan
+        ],  # returns due times, ns from the rig's start, of a rate and a start
         rate_hz: float,
         epoch_ns: int,
         *,
         patient: bool = False,  # bytes wait, and are not lost, where a host has no room
     ) -> None:
         self._patient = patient
-        self._late: deque[tuple[Item | None, bytes]] = (
+        self._late: deque[tuple[SentItem | None, bytes]] = (
             deque()
         )  # items, or replies, and what of them is still to be sent
         self._awaited: Peer | None = None  # the host that they are for
@@ -72,8 +74,8 @@ class Transmission:
         self._planned, self._epoch_ns = planned, epoch_ns
         self._rate_hz = rate_hz
         self._lock = threading.Lock()
-        self._items: deque[Item] = deque()
-        self._latest: Item | None = None  # the last frame that was due, for hosts that ask
+        self._items: deque[SentItem] = deque()
+        self._latest: SentItem | None = None  # the last frame that was due, for hosts that ask
         self._on_request = bool(sensor.request())
         self._begin(rate_hz, 0)
 
@@ -104,7 +106,7 @@ class Transmission:
 
     def run(self, now_ns: int) -> bool:
         """Send what is due at ``now_ns`` on the monotonic clock; return whether the device was unplugged or came back."""
-        since_ns, items, due = now_ns - self._epoch_ns, self._items, list[Item]()
+        since_ns, items, due = now_ns - self._epoch_ns, self._items, list[SentItem]()
         plugged = False
         if self._late:
             self._push(now_ns)
@@ -132,7 +134,7 @@ class Transmission:
     def _receivers(self) -> list[Peer]:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
 
-    def _send(self, items: Sequence[Item], now_ns: int) -> None:
+    def _send(self, items: Sequence[SentItem], now_ns: int) -> None:
         if not items:
             return
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
@@ -178,7 +180,7 @@ class Transmission:
                 self._enter([item], [len(item.data)], peer.fault, now_ns)
         self._again_ns = now_ns + PAUSE_NS
 
-    def _enter(self, items: Iterable[Item], sizes: Sequence[int], fault: str, now_ns: int) -> None:
+    def _enter(self, items: Iterable[SentItem], sizes: Sequence[int], fault: str, now_ns: int) -> None:
         for item, size in zip(items, sizes, strict=True):
             cause = item.cause
             if size < len(item.data):

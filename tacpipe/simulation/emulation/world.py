@@ -32,8 +32,8 @@ CYCLES = 4  # number of cycles that are kept: streams run ahead of each other by
 class Cycle:
     """A trial with its way back, and the angles of the arm's joints meanwhile."""
 
-    scene: pick_and_move.Scene
-    joints: joints.Course
+    scene: pick_and_move.PickScene
+    joints: joints.JointCourse
 
     def torques(self, t_ns: Times) -> Floats:
         """Return what the load in the hand asks of the joints (time, joint), N m."""
@@ -49,9 +49,9 @@ class Cycle:
 class World:
     """One physical simulation, which all sensors of a rig look at; times are nanoseconds from its start."""
 
-    def __init__(self, seed: int = 0, rig: pick_and_move.Rig | None = None) -> None:
+    def __init__(self, seed: int = 0, rig: pick_and_move.PickRig | None = None) -> None:
         self._seed = seed
-        self._rig = replace(rig or pick_and_move.Rig(), duration_s=TRIAL_S)
+        self._rig = replace(rig or pick_and_move.PickRig(), duration_s=TRIAL_S)
         self._cycle = functools.lru_cache(CYCLES)(self._generate)
         self.skins = pick_and_move.perform(seed, 0, self._rig).skins
 
@@ -74,7 +74,7 @@ class World:
         ]
         return np.concatenate(parts)
 
-    def contact(self, t_ns: Times, value: Callable[[pick_and_move.Scene], Any]) -> Floats:
+    def contact(self, t_ns: Times, value: Callable[[pick_and_move.PickScene], Any]) -> Floats:
         """Return at ``t_ns`` (time,) a value of the scene that is given at 1 kHz: (time,) or (time, axis)."""
         return self.at(
             t_ns, lambda cycle, local_ns: pick_and_move.interpolation(cycle.scene, local_ns)(value(cycle.scene))
@@ -101,7 +101,7 @@ class World:
         return self.at(t_ns, lambda cycle, local_ns: cycle.torques(local_ns))
 
 
-def with_return(scene: pick_and_move.Scene) -> pick_and_move.Scene:
+def with_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
     """Return a scene that is longer by the way back: its last row is as its first."""
     rows = round(RETURN_S * trajectory.RATE_HZ)
     since_s = np.arange(1, rows + 1) / trajectory.RATE_HZ

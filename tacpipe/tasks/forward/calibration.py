@@ -18,7 +18,7 @@ from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
-from tacpipe.tasks.forward.uncertainty import FILE, Errors, Uncertainty, fewer
+from tacpipe.tasks.forward.uncertainty import FILE, Uncertainty, WindowErrors, fewer
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -72,7 +72,7 @@ def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
         )
 
 
-def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Errors:
+def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> WindowErrors:
     """Return the model's errors on at most ``limit`` windows of each recording, evenly spread."""
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
@@ -95,4 +95,4 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Errors
     if not parts:
         beginning = f"The {len(recordings.recordings)} recordings hold"
         raise tracks.no_window(beginning, recordings, forecaster.context, forecaster.horizon)
-    return Errors(*map(np.concatenate, zip(*parts, strict=True)))
+    return WindowErrors(*map(np.concatenate, zip(*parts, strict=True)))

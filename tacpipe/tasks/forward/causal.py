@@ -13,7 +13,7 @@ import torch
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Times
 from tacpipe.codecs.codec import INCREMENTS
-from tacpipe.models.windows import ARM, POSE, Windows
+from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.signals import kinematics
 from tacpipe.signals.resampling import linear, slerp
 from tacpipe.signals.rotations import quaternions_of_vectors
@@ -173,20 +173,20 @@ class Rolling:
         quantiles: Float32s = self._forecaster.band(self._windows(plan), self._past[None], ahead[None])[0]
         return quantiles
 
-    def _windows(self, plan: AnyFloats) -> Windows:
+    def _windows(self, plan: AnyFloats) -> ForecastWindows:
         """Return the rows that are read, and the arm's planned ones, as one window."""
         parts = (self._latent, np.concatenate([self._arm, plan.astype(np.float32)]), self._finger)
-        return Windows(*(torch.from_numpy(part[:, None].copy()) for part in parts))
+        return ForecastWindows(*(torch.from_numpy(part[:, None].copy()) for part in parts))
 
 
-class Plan(NamedTuple):
+class PosePlan(NamedTuple):
     """Planned poses of the hand: times, and positions in m with quaternions x, y, z, w."""
 
     t_ns: Times  # (point,), ascending
     poses: Floats  # (point, 7); a quaternion that is not finite: the hand does not turn
 
 
-def rows(plan: Plan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
+def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
     """Return the arm's rows (step, 13) at the times ``ahead_ns`` (step,), which follow ``t_ns``.
 
     ``now`` (13,) is the arm at ``t_ns``. A plan that begins later is reached from there in a straight line; after its end

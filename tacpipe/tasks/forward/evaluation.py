@@ -25,7 +25,7 @@ from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL, look_ahead_notes, unit_of_model
 from tacpipe.tasks.forward.metrics import Trial
-from tacpipe.tasks.forward.predictors import Forecast, forecasts, predicted
+from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, predicted
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.slips import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
@@ -45,7 +45,7 @@ STEP = 10  # ahead, that is drawn; the last one where the model predicts fewer
 
 
 @dataclass
-class Bands:
+class QuantileSums:
     """Sums of each predictor's quantiles by recording, and forecasts to draw; empty where a model has no quantiles."""
 
     forecaster: Forecaster
@@ -134,7 +134,7 @@ _COLUMNS = pa.schema(
 )
 
 
-def band(forecaster: Forecaster, track: Track, forecast: Forecast, part: slice) -> Float32s:
+def band(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: slice) -> Float32s:
     """Return the model's quantiles (window, step, channel, level) of some of a forecast's windows.
 
     The model must have quantiles.
@@ -144,7 +144,7 @@ def band(forecaster: Forecaster, track: Track, forecast: Forecast, part: slice) 
 
 
 def _predicted(
-    forecaster: Forecaster, uncertainty: Uncertainty, track: Track, forecast: Forecast, part: slice
+    forecaster: Forecaster, uncertainty: Uncertainty, track: Track, forecast: WindowForecast, part: slice
 ) -> Iterator[tuple[str, AnyFloats]]:
     """Yield the quantiles (window, step, channel, level) of each predictor."""
     yield MODEL, band(forecaster, track, forecast, part)
@@ -199,7 +199,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     check_codec(model, recordings.files)
     seen_digests, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, outputs = [], {}
-    loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
+    loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), QuantileSums(forecaster)
     slipping = SlipAlarms.of(forecaster)
     by_situation, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:

@@ -19,8 +19,8 @@ from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forecasts import Shrunk
-from tacpipe.models.linear import Baselines
-from tacpipe.models.windows import ARM, POSE, Windows, motion
+from tacpipe.models.linear import FittedBaselines
+from tacpipe.models.windows import ARM, POSE, ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
@@ -31,7 +31,7 @@ from tacpipe.tasks.forward.params import ForwardConfig, Params
 from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
 from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
-from tacpipe.tasks.opened import Chain
+from tacpipe.tasks.opened import OpenedChain
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -71,9 +71,9 @@ class Forecaster:
     params: Params
     config: ForwardConfig  # the stored configuration
     codec: codecs.Codec
-    baselines: Baselines | None
+    baselines: FittedBaselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
-    chain: Chain | None = None  # the stages that it was trained behind; None: unknown
+    chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
     uncertainty: Uncertainty | None = None  # present if `tacpipe calibrate` made the model
 
     @property
@@ -174,7 +174,7 @@ class Forecaster:
         return None if level is None else float(level)
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
+    def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
         """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
@@ -197,7 +197,7 @@ class Forecaster:
             codec_files = (
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
             )
-            baselines = None if baseline_arrays is None else Baselines.from_tensors(baseline_arrays)
+            baselines = None if baseline_arrays is None else FittedBaselines.from_tensors(baseline_arrays)
             sizes = len(codec.channels), params.horizon
             uncertainty = Uncertainty.load(files[QUANTILES], *sizes) if QUANTILES in files else None
             forecaster = cls(model.eval(), params, config, codec, baselines, codec_files, chain, uncertainty)
@@ -221,7 +221,7 @@ class Forecaster:
         self._of_arrays(*self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :]))
         if self.baselines is not None:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
-            moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
+            moved = motion(ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
             predicted = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
             if any(values.shape != (1, self.horizon, touch.shape[2]) for values in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
@@ -247,16 +247,16 @@ class Forecaster:
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         ahead = self._of_arrays(touch, arm, finger)
-        read = Windows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
+        read = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
         quantiles = self.band(read, touch[:, -self.context :], ahead)[..., at]
         return quantiles[0] if single else quantiles
 
-    def signs(self, windows: Windows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+    def signs(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return what states how uncertain the forecast ``ahead`` (window, step, channel) is: `uncertainty.window_signs`
         of windows and their levels ``past`` (window, context, channel), both above rest."""
         return window_signs(windows, past, ahead, self.channel_scale, self.actions)
 
-    def band(self, windows: Windows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+    def band(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return all quantiles (window, step, channel, level) of the forecast ``ahead``; `signs` describes what is given.
 
         The model must have quantiles.
@@ -268,7 +268,7 @@ class Forecaster:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
-        read = Windows(
+        read = ForecastWindows(
             *(torch.from_numpy(np.ascontiguousarray(array.swapaxes(0, 1))) for array in (latent, arm, finger))
         )
         return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
@@ -293,7 +293,7 @@ class Forecaster:
             )
 
     @torch.no_grad()
-    def features(self, windows: Windows) -> AnyFloats:
+    def features(self, windows: ForecastWindows) -> AnyFloats:
         """Return the features to come (window, horizon, feature), in the codec's unit."""
         predicted: Tensor = self.model(acted(windows, self.actions))
         features: AnyFloats = predicted.transpose(0, 1).numpy()

@@ -43,7 +43,7 @@ _COLUMNS = pa.schema(
 
 
 @dataclass
-class Errors:
+class ForecastErrorSums:
     """Sums of one predictor's errors over the windows of a recording, each (step, feature) or (step, channel)."""
 
     latent_squared: AnyFloats | None
@@ -52,7 +52,7 @@ class Errors:
     count_absolute: AnyFloats
 
     @classmethod
-    def from_predictions(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> Errors:
+    def from_predictions(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> ForecastErrorSums:
         """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
         latent = feature = None
         if predicted.latent is not None and truth.latent is not None:
@@ -65,14 +65,14 @@ class Errors:
             regression.absolute_error_sums(predicted.count, truth.count),
         )
 
-    def __add__(self, further: Errors) -> Errors:
+    def __add__(self, further: ForecastErrorSums) -> ForecastErrorSums:
         """Return the errors over the windows of both."""
 
         def summed(name: str) -> Any:
             first, second = getattr(self, name), getattr(further, name)
             return None if first is None else first + second
 
-        return Errors(*(summed(name) for name in self.__dataclass_fields__))
+        return ForecastErrorSums(*(summed(name) for name in self.__dataclass_fields__))
 
 
 @dataclass
@@ -84,7 +84,7 @@ class Trial:
     object: str | None = None
     known: bool = True  # True if the model was trained on the same object, or no label names the object
     windows: int = 0
-    errors: dict[str, Errors] = field(default_factory=dict)
+    errors: dict[str, ForecastErrorSums] = field(default_factory=dict)
 
     def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: AnyFloats) -> None:
         """Count some more windows of the recording."""
@@ -94,7 +94,7 @@ class Trial:
 
     def add_errors(self, name: str, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> None:
         """Add the errors of one predictor on some windows, which are counted apart."""
-        errors = Errors.from_predictions(predicted, truth, feature_half)
+        errors = ForecastErrorSums.from_predictions(predicted, truth, feature_half)
         self.errors[name] = self.errors[name] + errors if name in self.errors else errors
 
 
@@ -199,7 +199,7 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFlo
     return to_parquet(pa.table(columns, schema=_COLUMNS))
 
 
-def _pooled(errors: Errors, groups: Masks, channel_scale: AnyFloats) -> Iterator[tuple[str, Any, Any, int]]:
+def _pooled(errors: ForecastErrorSums, groups: Masks, channel_scale: AnyFloats) -> Iterator[tuple[str, Any, Any, int]]:
     """Yield each group's name, its sums of squared and absolute errors (step,) and its number of channels."""
     for group, mask in groups.items():
         yield (

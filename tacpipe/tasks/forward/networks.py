@@ -16,8 +16,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.change import PlainForecast
 from tacpipe.models.forecasts import Ensemble
-from tacpipe.models.windows import ARM, POSE, Shape, Windows
-from tacpipe.tasks.forward.params import Forward
+from tacpipe.models.windows import ARM, POSE, ForecastShape, ForecastWindows
+from tacpipe.tasks.forward.params import ForwardModelParams
 from tacpipe.tasks.forward.rows import acted
 
 if TYPE_CHECKING:
@@ -27,14 +27,14 @@ METHODS = ("calibrate", "loss")  # methods of a network that scales itself
 TRIED = 2  # windows
 
 
-def shape(params: Forward, codec: codecs.Codec) -> Shape:
+def shape(params: ForwardModelParams, codec: codecs.Codec) -> ForecastShape:
     """Return what a network for the codec's features reads and predicts."""
     places = codec.layout if codec.kind == "raw" else ()
     changes = codec.representation == INCREMENTS
-    return Shape(len(codec.latents), params.context, params.horizon, tuple(places), changes)
+    return ForecastShape(len(codec.latents), params.context, params.horizon, tuple(places), changes)
 
 
-def build(params: Forward, codec: codecs.Codec) -> nn.Module:
+def build(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
     """Return the network that ``params`` build, of random weights, for the codec's features; several as an `Ensemble`.
 
     Raises `TacpipeError` where they build something else.
@@ -43,7 +43,7 @@ def build(params: Forward, codec: codecs.Codec) -> nn.Module:
     return members[0] if len(members) == 1 else Ensemble(members)
 
 
-def _member(params: Forward, codec: codecs.Codec) -> nn.Module:
+def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
     """Return one network that scales itself; a plain one is put between scales."""
     sizes = shape(params, codec)
     network = params.build(sizes)
@@ -65,9 +65,9 @@ def _member(params: Forward, codec: codecs.Codec) -> nn.Module:
 
 
 @torch.no_grad()
-def check(network: nn.Module, params: Forward, windows: Windows, features: int) -> None:
+def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindows, features: int) -> None:
     """Raise `TacpipeError` where a network returns something else than features to come for a few ``windows``."""
-    sample = Windows(*(part[:, :TRIED] for part in windows))
+    sample = ForecastWindows(*(part[:, :TRIED] for part in windows))
     training = network.training
     features_ahead = network.eval()(sample)
     network.train(training)
@@ -105,7 +105,7 @@ class Network:
         return self._recorded is not None
 
     @torch.no_grad()
-    def features(self, windows: Windows) -> AnyFloats:
+    def features(self, windows: ForecastWindows) -> AnyFloats:
         """Return the features to come (window, horizon, feature), as `Forecaster.features`; ``windows`` holds one."""
         if self._recorded is None:
             return self._forecaster.features(windows)
@@ -122,7 +122,7 @@ class _Parts(nn.Module):
         self.network, self.actions = forecaster.model, forecaster.actions
 
     def forward(self, touch: Tensor, arm: Tensor, finger: Tensor) -> Tensor:
-        predicted: Tensor = self.network(acted(Windows(touch, arm, finger), self.actions))
+        predicted: Tensor = self.network(acted(ForecastWindows(touch, arm, finger), self.actions))
         return predicted
 
 
@@ -144,7 +144,7 @@ def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
     return frozen
 
 
-def _tried(forecaster: Forecaster) -> list[Windows]:
+def _tried(forecaster: Forecaster) -> list[ForecastWindows]:
     """Return windows (one each) that walk, rest, jump and hold still."""
     rng = np.random.default_rng(0)
     context, rows = forecaster.context, forecaster.context + forecaster.horizon
@@ -158,5 +158,5 @@ def _tried(forecaster: Forecaster) -> list[Windows]:
         arm[..., 3:POSE] += forecaster.orientation
         arm[..., 3:POSE] /= np.linalg.norm(arm[..., 3:POSE], axis=-1, keepdims=True)
         finger = 0.04 + rng.normal(0, STEP * size, (context, 1)) * moved[:, 0]
-        examples.append(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in (touch, arm, finger))))
+        examples.append(ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in (touch, arm, finger))))
     return examples

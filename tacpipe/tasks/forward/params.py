@@ -20,7 +20,7 @@ from tacpipe.training.devices import Precision
 if TYPE_CHECKING:
     from torch import nn
 
-    from tacpipe.models.windows import Shape
+    from tacpipe.models.windows import ForecastShape
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -28,7 +28,7 @@ Dropout = Annotated[float, Range(0, below=1)]
 
 
 @dataclass(frozen=True)
-class Forward(ABC):
+class ForwardModelParams(ABC):
     """Size of a model of the task ``forward`` and of its windows, and how it is trained.
 
     Each architecture extends it, adds params of its own, and builds its network.
@@ -65,7 +65,9 @@ class Forward(ABC):
         "Data": ("windows", "stride", "arm"),
     }
 
-    def resolved(self, layout: Sequence[Mapping[str, str]], start: Forward | None, *, changes: bool) -> Forward:
+    def resolved(
+        self, layout: Sequence[Mapping[str, str]], start: ForwardModelParams | None, *, changes: bool
+    ) -> ForwardModelParams:
         """Return these params with the meaning of ``auto`` for channels that lie like ``layout``; latents have none.
 
         ``start`` are the params of the model to begin with, ``changes`` states that features are increments.
@@ -73,8 +75,8 @@ class Forward(ABC):
         return self
 
     @abstractmethod
-    def build(self, shape: Shape) -> nn.Module:
-        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.Shape`).
+    def build(self, shape: ForecastShape) -> nn.Module:
+        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.ForecastShape`).
 
         **A plain network** is called as ``network(past, plan)`` and returns (horizon, window, feature), float32.
 
@@ -88,7 +90,7 @@ class Forward(ABC):
 
         **A network that scales itself** has the methods ``calibrate(windows, ahead)``, which fits its scales on training
         windows, and ``loss(windows, ahead)``, which returns a scalar, and the attribute ``change_only``. It is called as
-        ``network(windows)`` with `tacpipe.models.windows.Windows` in the units of the recordings, and returns the
+        ``network(windows)`` with `tacpipe.models.windows.ForecastWindows` in the units of the recordings, and returns the
         features to come in theirs. `tacpipe.models.change.ChangeForecast` has all but ``forward``.
 
         Of either kind, a prediction depends on its own window alone (so no normalisation over the batch), and each step on
@@ -101,7 +103,7 @@ class Forward(ABC):
 
 
 @dataclass(frozen=True)
-class Change(Forward):
+class Change(ForwardModelParams):
     """A model that predicts the change since the last row; auto is taxelwise on raw channels and gru on latents."""
 
     # network; auto: taxelwise for raw channels, gru for latents and for channels that do not lie taxel by taxel
@@ -111,7 +113,9 @@ class Change(Forward):
     loss: Literal["auto", "absolute", "huber", "squared"] = "auto"
     PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3}}
 
-    def resolved(self, layout: Sequence[Mapping[str, str]], start: Forward | None, *, changes: bool) -> Forward:
+    def resolved(
+        self, layout: Sequence[Mapping[str, str]], start: ForwardModelParams | None, *, changes: bool
+    ) -> ForwardModelParams:
         """Return these params with the meaning of ``auto``: the architecture of ``start`` if that one predicts change."""
         from tacpipe.models import forecasts
 
@@ -123,7 +127,7 @@ class Change(Forward):
             self, architecture=architecture, loss=forecasts.resolved_loss(self.loss, changes=changes)
         )
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: ForecastShape) -> nn.Module:
         """Return the network; ``auto`` and the loss are resolved before."""
         from tacpipe.models import forecasts
 
@@ -141,7 +145,7 @@ class Change(Forward):
 
 
 @dataclass(frozen=True)
-class Recurrent(Forward):
+class Recurrent(ForwardModelParams):
     """The paper's model, which predicts levels; it has no dropout and minimises the squared error."""
 
     # network: recurrent is the paper's
@@ -160,14 +164,14 @@ class Recurrent(Forward):
         "quick": {"hidden": 32, "epochs": 3},
     }
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: ForecastShape) -> nn.Module:
         """Return the paper's network between its scalings."""
         from tacpipe.models.forecasts import RecurrentForecast
 
         return RecurrentForecast(shape.features, self.hidden)
 
 
-Params = Forward  # params of any architecture
+Params = ForwardModelParams  # params of any architecture
 
 
 class CodecDescription(TypedDict):

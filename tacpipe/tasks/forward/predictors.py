@@ -11,7 +11,7 @@ import torch
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
-from tacpipe.models.windows import Windows, motion
+from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
@@ -43,10 +43,10 @@ class Predicted:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class WindowForecast:
     """Some windows of a recording, and the predictions of the model alone."""
 
-    windows: Windows
+    windows: ForecastWindows
     past: Int64s  # (window, context), rows that are read
     future: Int64s  # (window, step), rows that are predicted
     features: AnyFloats  # (window, step, feature)
@@ -58,14 +58,14 @@ class Forecast:
         return self.past[:, -1]
 
 
-def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Forecast]:
+def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[WindowForecast]:
     """Yield the model's predictions for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
     for first in range(0, len(starts), CHUNK):
         yield _forecast(forecaster, track, starts[first : first + CHUNK])
 
 
-def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> Forecast:
+def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowForecast:
     """Return the model's predictions for some windows, those that begin at ``starts``, in order."""
     context, horizon = forecaster.context, forecaster.horizon
     past, future = (starts[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
@@ -76,7 +76,7 @@ def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> Forecast:
         torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
         features = forecaster.features(windows)
     count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
-    return Forecast(windows, past, future, features, count)
+    return WindowForecast(windows, past, future, features, count)
 
 
 def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
@@ -90,7 +90,7 @@ def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
 class _Predictions(Mapping[str, Prediction]):
     """The predictions of each predictor for some windows, computed at each access."""
 
-    def __init__(self, forecaster: Forecaster, track: Track, forecast: Forecast) -> None:
+    def __init__(self, forecaster: Forecaster, track: Track, forecast: WindowForecast) -> None:
         self._forecaster, self._track, self._forecast = forecaster, track, forecast
 
     def items(self) -> ItemsView[str, Prediction]:
@@ -134,7 +134,7 @@ class _Items(ItemsView[str, Prediction]):
         return self._each_prediction()
 
 
-def _of_model(forecaster: Forecaster, track: Track, forecast: Forecast) -> Iterator[tuple[str, Prediction]]:
+def _of_model(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
     """Yield the model's prediction, and persistence."""
     codec, horizon = forecaster.codec, forecaster.horizon
     last, last_feature = track.tactile[forecast.now], track.latent[forecast.now]
@@ -145,7 +145,7 @@ def _of_model(forecaster: Forecaster, track: Track, forecast: Forecast) -> Itera
         yield "model_anchored", Prediction(None, forecaster.anchored(forecast.count, last, last_feature))
 
 
-def _of_codec(forecaster: Forecaster, track: Track, forecast: Forecast) -> Iterator[tuple[str, Prediction]]:
+def _of_codec(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
     """Yield what the codec alone loses of the true features to come."""
     codec = forecaster.codec
     if codec.kind == "raw":

@@ -13,7 +13,7 @@ from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import windows as windows_of
-from tacpipe.models.windows import Windows
+from tacpipe.models.windows import ForecastWindows
 from tacpipe.tasks.forward.tracks import Levels, Track
 from tacpipe.training import loop
 
@@ -36,11 +36,11 @@ class Rows:
     plan_velocity: Tensor | None = None  # (time, 6), velocities of planned rows; None: those of ``arm``
 
     @property
-    def part(self) -> loop.Part:
+    def part(self) -> loop.WindowSet:
         """The windows and the loss for the training loop."""
-        return loop.Part(len(self.starts), self.loss)
+        return loop.WindowSet(len(self.starts), self.loss)
 
-    def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
+    def pick(self, starts: Tensor) -> tuple[ForecastWindows, Tensor]:
         """Return the windows that begin at ``starts`` (window,) and their future tactile signals (horizon, window,
         feature)."""
         steps = torch.arange(self.context + self.horizon, device=starts.device)
@@ -50,7 +50,7 @@ class Rows:
             arm[self.context :, :, windows_of.POSE :] = self.plan_velocity[rows[self.context :]]
         if self.mapped is not None:
             self.mapped.read(touch.nbytes + arm.nbytes)
-        return Windows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
+        return ForecastWindows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
         """Return the mean loss of the windows with these indices."""
@@ -127,7 +127,7 @@ def rows(
     return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped, plan_velocity)
 
 
-def acted(windows: Windows, actions: str) -> Windows:
+def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
     """Return the windows with the plan that a model trained on ``actions`` reads.
 
     ``shuffled`` permutes the plans among the windows by torch's generator: the negative control.

@@ -205,7 +205,7 @@ PARTS = 5  # parts of the recordings; each has the level that was set on the oth
 
 
 @dataclass(frozen=True)
-class Rows:
+class SlipRows:
     """The rows of one recording."""
 
     t_ns: Times  # (time,)
@@ -235,7 +235,7 @@ class SlipAlarms:
     layout: Layout
     floors: AnyFloats  # (skin,), of the model's training
     horizon: int
-    recordings: list[Rows] = field(default_factory=list)
+    recordings: list[SlipRows] = field(default_factory=list)
 
     @classmethod
     def of(cls, forecaster: Forecaster) -> Self:
@@ -245,7 +245,7 @@ class SlipAlarms:
 
     def begin(self, track: Track) -> None:
         """Add the rows of a recording, without predictions yet."""
-        self.recordings.append(Rows(track.t_ns, track.slips))
+        self.recordings.append(SlipRows(track.t_ns, track.slips))
 
     def add_one(self, name: str, now: Int64s, present: AnyFloats, counts: AnyFloats) -> None:
         """Add what one predictor gives, ``counts`` (window, step, channel), for windows whose last rows are ``now``.
@@ -299,7 +299,7 @@ class SlipAlarms:
             scores[name] = {**worth, "recall": round(worth["led"] / worth["events"], 9) if worth["events"] else None}
         return scores
 
-    def _worth(self, recording: Rows, name: str, level: float) -> Leads:
+    def _worth(self, recording: SlipRows, name: str, level: float) -> Leads:
         scores = recording.scores.get(name, np.full(len(recording.t_ns), np.nan))
         has_state = np.isfinite(scores) & math.isfinite(level)
         states = np.where(has_state, (scores > level).astype(np.int64), -1)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.forward.prediction import ForwardModel
-    from tacpipe.tasks.opened import Chain
+    from tacpipe.tasks.opened import OpenedChain
 
 
-class Forward(Task):
+class ForwardTask(Task):
     """Forecasts of tactile signals."""
 
     name = "forward"
@@ -54,7 +54,7 @@ class Forward(Task):
 
         return prediction.predict(model.files, recordings, request.steps, request.quantiles)
 
-    def load(self, files: Files, chain: Chain | None = None) -> ForwardModel:
+    def load(self, files: Files, chain: OpenedChain | None = None) -> ForwardModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
         from tacpipe.tasks.forward.prediction import ForwardModel
 

@@ -25,8 +25,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.forecasts import Shrunk, persistence_weights
-from tacpipe.models.linear import Baselines
-from tacpipe.models.windows import Windows, motion
+from tacpipe.models.linear import FittedBaselines
+from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import headline, networks, tracks
@@ -113,7 +113,7 @@ def train(
     build = partial(_built, params, codec, training_rows, start, device)
     schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)
     trained = loop.train(
-        build, loop.Windows(training_rows.part, validation_rows.part, params.batch), schedule, workspace
+        build, loop.WindowTraining(training_rows.part, validation_rows.part, params.batch), schedule, workspace
     )
     weights = trained.weights | _shrinkage(trained.weights, params, codec, validation_rows)
     best = min(trained.history, key=lambda line: line["val_loss"])
@@ -144,7 +144,7 @@ def train(
         config["look_ahead"] = look_ahead
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
-        linear = Baselines.fit(_linear(training_rows), _linear(validation_rows))
+        linear = FittedBaselines.fit(_linear(training_rows), _linear(validation_rows))
         config["baselines"] = linear.chosen
         files[BASELINES] = save_arrays(
             {name: np.ascontiguousarray(array) for name, array in linear.to_tensors().items()}
@@ -181,7 +181,7 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     windows, ahead = watched.pick(starts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(params.seed)  # plans may be shuffled
-        windows = Windows(*(part.cpu() for part in acted(windows, watched.actions)))
+        windows = ForecastWindows(*(part.cpu() for part in acted(windows, watched.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
     return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
 

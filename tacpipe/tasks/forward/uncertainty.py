@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics.quantiles import conformal_quantile, most_promised
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
-from tacpipe.models.windows import POSE, Windows, without_plan
+from tacpipe.models.windows import POSE, ForecastWindows, without_plan
 from tacpipe.tasks import calibrated
 
 SIGNS = 13  # features beside the predicted change at each step
@@ -101,8 +101,8 @@ class Uncertainty:
     def fit(
         cls,
         levels: AnyFloats,
-        training: Errors,
-        calibration: Errors,
+        training: WindowErrors,
+        calibration: WindowErrors,
         *,
         promised: bool = False,
         seed: int = 0,
@@ -150,7 +150,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
-class Errors:
+class WindowErrors:
     """Errors of a model on some windows of recordings, and what its forecasts and inputs show."""
 
     signs: Float32s  # (window, channel, feature)
@@ -160,7 +160,7 @@ class Errors:
 
 
 def window_signs(
-    windows: Windows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats, actions: str = "planned"
+    windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats, actions: str = "planned"
 ) -> Float32s:
     """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
 
@@ -171,7 +171,7 @@ def window_signs(
     return signs(past, ahead, arm, finger, scale)
 
 
-def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: Errors, promised: bool) -> AnyFloats:
+def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool) -> AnyFloats:
     """Return by how many units each quantile is moved outwards (level, step)."""
     levels, steps = errors.levels, errors.unit.shape[1]
     middle, channels = len(levels) // 2, errors.unit.shape[0]

@@ -17,20 +17,20 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.models.readout import Level, StatisticsClassifier, View
-from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape
 from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.tasks.material import estimators, networks
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.estimators import Fitted
+from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.losses import CHUNK, Network
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Estimator, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
-from tacpipe.tasks.material.slides import Layout, Slides, difference
-from tacpipe.tasks.opened import Chain
+from tacpipe.tasks.material.slides import SlideLayout, Slides, difference
+from tacpipe.tasks.opened import OpenedChain
 from tacpipe.training.scaling import Affine
 
 TASK = "material"
@@ -53,7 +53,7 @@ LEVEL_VIEWS: dict[str, View] = {
 
 Config = dict[str, Any]
 ReadoutModel = MinirocketClassifier | StatisticsClassifier
-Baseline = Level | ReadoutModel | Fitted
+Baseline = Level | ReadoutModel | FittedEstimator
 READOUTS: dict[str, type[ReadoutModel]] = {ROCKET: MinirocketClassifier, STATISTICS: StatisticsClassifier}
 
 
@@ -141,7 +141,7 @@ class SpectraReader:
 class EstimatorReader:
     """An estimator of one sensor."""
 
-    fitted: Fitted
+    fitted: FittedEstimator
     classes: tuple[int, ...]
     any_length: ClassVar[bool] = False  # its features have a fixed size
 
@@ -156,7 +156,7 @@ Reader = NetworkReader | ReadoutReader | SpectraReader | EstimatorReader
 class Classifier:
     """Readers of one or more sensors that predict the material of a slide; `model` adds what reads recordings."""
 
-    def __init__(self, files: Mapping[str, bytes], chain: Chain | None = None) -> None:
+    def __init__(self, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> None:
         self.chain = chain  # the stages that it was trained behind; None: unknown
         config = model_files.tree(files, CONFIG, NEEDED)
         self.config: Config = config  # config.json
@@ -165,7 +165,7 @@ class Classifier:
         self.classes: tuple[int, ...] = tuple(config["classes"])
         self.naming = Naming.from_json(config)
         self.quantities = tuple(config["quantities"])
-        self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
+        self.layouts = {name: SlideLayout.from_json(name, layout) for name, layout in config["sensors"].items()}
         if isinstance(self.params, Estimator):
             fitted = self._estimators(files[ESTIMATORS], ESTIMATORS, self.params)
             self.readers: dict[str, Reader] = {
@@ -181,7 +181,7 @@ class Classifier:
         )
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
+    def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
         """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
@@ -284,7 +284,7 @@ class Classifier:
             raise TacpipeError("A slide holds a value that is not finite; it must have a number in every frame.")
         return self.readers[layout.sensor].read(frames).scores
 
-    def layout(self, sensor: str) -> Layout:
+    def layout(self, sensor: str) -> SlideLayout:
         """Return the layout of a sensor's slides. Raises `TacpipeError` where the model does not know the sensor."""
         if sensor not in self.layouts:
             raise TacpipeError(
@@ -359,14 +359,14 @@ class Classifier:
         tensors = model_files.tensors(content, file)
         readers: dict[str, Reader] = {}
         for name in self.layouts:
-            shape = Shape(**self.config["shapes"][name])
+            shape = AutoencoderShape(**self.config["shapes"][name])
             weights = under(f"{name}.", tensors)
             network = model_files.filled(functools.partial(networks.build, self.params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
-    def _estimators(self, content: bytes, file: str, params: Estimator) -> dict[str, Fitted]:
+    def _estimators(self, content: bytes, file: str, params: Estimator) -> dict[str, FittedEstimator]:
         fitted = estimators.unpacked(content, file, params)
         return {name: fitted[name] for name in self.layouts}
 
@@ -374,7 +374,7 @@ class Classifier:
         """Return the baselines by name and sensor."""
         arrays = model_files.arrays(files[BASELINES], BASELINES, but=CHOSEN)
         kinds: dict[str, type[Level | ReadoutModel]] = {MEAN_LEVEL: Level}
-        shuffled: dict[str, Fitted] = {}
+        shuffled: dict[str, FittedEstimator] = {}
         if isinstance(self.params, Estimator):
             shuffled = self._estimators(files[SHUFFLED_ESTIMATORS], SHUFFLED_ESTIMATORS, self.params)
         else:

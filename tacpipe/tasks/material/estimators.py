@@ -31,7 +31,7 @@ LARGEST = 2**31  # bytes that a file may unpack to
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedEstimator:
     """A fitted estimator and what it reads of a slide."""
 
     estimator: Any
@@ -83,7 +83,7 @@ class Fitted:
         return features
 
 
-def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
+def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
     """Return fitted estimators by sensor as the bytes of a file. Raises `TacpipeError` for what cannot be read back."""
     with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import dumps, get_untrusted_types
@@ -103,7 +103,7 @@ def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
     return _canonical(content)
 
 
-def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
+def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEstimator]:
     """Return the estimators by sensor in the file ``name``.
 
     Raises `TacpipeError` where it is not such a file, and where it has types that the architecture does not trust.
@@ -121,7 +121,7 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
                 f"model again."
             )
         estimators = loads(content, trusted=untrusted_types)
-        return {sensor: Fitted(estimator, params.features) for sensor, estimator in estimators.items()}
+        return {sensor: FittedEstimator(estimator, params.features) for sensor, estimator in estimators.items()}
     except TacpipeError:
         raise
     except Exception as error:  # a damaged file raises errors of many types

@@ -27,7 +27,7 @@ EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of the batches for a subsampl
 
 
 @dataclass(frozen=True)
-class Pairs:
+class BatchPairs:
     """How the slides of all sensors are distributed over the batches of each epoch."""
 
     classes: Mapping[str, Tensor]  # sensor -> class of each slide, from 0; NONE for slides without label
@@ -175,7 +175,7 @@ class ScaledSlides:
 
 
 @dataclass
-class _Sums:
+class _EpochSums:
     """Sums over the batches of one epoch."""
 
     values: dict[str, Tensor | float] = field(default_factory=dict)
@@ -203,14 +203,14 @@ class JointWork:
         self,
         training: Mapping[str, ScaledSlides],
         validation: Mapping[str, ScaledSlides],
-        pairs: Pairs,
+        pairs: BatchPairs,
         weights: Weights,
         frozen_sensor: str = "",
         drop_last: bool = False,
     ) -> None:
         self.training, self.validation, self.pairs, self.weights = training, validation, pairs, weights
         self.frozen_sensor, self.drop_last = frozen_sensor, drop_last
-        self._sums = _Sums()
+        self._sums = _EpochSums()
 
     @property
     def joint(self) -> bool:
@@ -219,7 +219,7 @@ class JointWork:
 
     def batches(self, epoch: int) -> list[dict[str, Tensor]]:
         """Return the batches of an epoch: for each sensor the slide of every row."""
-        self._sums = _Sums()
+        self._sums = _EpochSums()
         return self.pairs.epoch()
 
     def loss(self, model: nn.Module, batch: Mapping[str, Tensor], epoch: int) -> tuple[Tensor, int]:

@@ -16,7 +16,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.readout import Level
-from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape
 from tacpipe.printable import listed
 from tacpipe.tasks import trained_on
 from tacpipe.tasks.material import networks, readouts
@@ -32,9 +32,9 @@ from tacpipe.tasks.material.classifier import (
     Config,
     NetworkReader,
 )
-from tacpipe.tasks.material.losses import NONE, JointWork, Pairs, ScaledSlides, permuted_classes
+from tacpipe.tasks.material.losses import NONE, BatchPairs, JointWork, ScaledSlides, permuted_classes
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.params import Network as NetworkParams
+from tacpipe.tasks.material.params import NetworkParams as NetworkParams
 from tacpipe.tasks.material.params import Params, aligning_architectures
 from tacpipe.tasks.material.slides import BySensor, Slides
 from tacpipe.training import devices, loop
@@ -83,7 +83,7 @@ def train(
     )
     if start:
         _same_space(start, mapped_to, config, training_slides)
-        shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
+        shapes[mapped_to] = AutoencoderShape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = trained_on.add_earlier(config["trained_on"], start.config["trained_on"])
     training, validation = (
@@ -121,7 +121,7 @@ def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
 
 def _described(
     classes: Sequence[int],
-    shapes: Mapping[str, Shape],
+    shapes: Mapping[str, AutoencoderShape],
     scalings: Mapping[str, Affine],
     held_out_materials: Mapping[str, set[int]],
     partners: Mapping[int, int] | None,
@@ -154,8 +154,8 @@ def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict
     return files
 
 
-def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> Pairs:
-    return Pairs(
+def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> BatchPairs:
+    return BatchPairs(
         {name: scaled.classes.cpu() for name, scaled in slides.items()},
         params.batch,
         pairing=params.pairing_method,
@@ -230,7 +230,9 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
     return reader
 
 
-def _built(params: NetworkParams, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
+def _built(
+    params: NetworkParams, shapes: Mapping[str, AutoencoderShape], start: Classifier | None, frozen: str
+) -> nn.ModuleDict:
     """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
     built = nn.ModuleDict({name: cast(nn.Module, networks.build(params, shape)) for name, shape in shapes.items()})
     if start:

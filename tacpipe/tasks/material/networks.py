@@ -8,15 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.recurrent_autoencoder import PlainClassifier, Shape
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape, PlainClassifier
 from tacpipe.tasks.material.losses import Network
-from tacpipe.tasks.material.params import Material
-from tacpipe.tasks.material.params import Network as NetworkParams
+from tacpipe.tasks.material.params import MaterialModelParams
+from tacpipe.tasks.material.params import NetworkParams as NetworkParams
 
 TRIED = 2  # slides
 
 
-def build(params: Material, shape: Shape) -> Network:
+def build(params: MaterialModelParams, shape: AutoencoderShape) -> Network:
     """Return the network that ``params`` build for a sensor, of random weights; a plain one wrapped, to be called as others.
 
     Raises `TacpipeError` where they build something else.

@@ -1,6 +1,6 @@
 """How a classifier of materials is built and trained: the params of `tacpipe train material`, one class an architecture.
 
-Classes of other packages extend `Estimator` or `Network`, whose methods state what a classifier reads and returns.
+Classes of other packages extend `Estimator` or `NetworkParams`, whose methods state what a classifier reads and returns.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tacpipe.arrays import Float32s
-    from tacpipe.models.recurrent_autoencoder import Shape
+    from tacpipe.models.recurrent_autoencoder import AutoencoderShape
     from tacpipe.tasks.material.losses import Weights
     from tacpipe.tasks.material.training import TrainingSlides
 
@@ -47,7 +47,7 @@ HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(min_items=1)], bet
 
 
 @dataclass(frozen=True)
-class Material(ABC):
+class MaterialModelParams(ABC):
     """Params that every classifier of materials has."""
 
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
@@ -90,12 +90,12 @@ class Material(ABC):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of a model that learned from ``slides``: ``config.json`` and what the classifier reads.
 
-        `Estimator` and `Network` implement it for the estimators and networks that an architecture builds.
+        `Estimator` and `NetworkParams` implement it for the estimators and networks that an architecture builds.
         """
 
 
 @dataclass(frozen=True)
-class Minirocket(Material):
+class Minirocket(MaterialModelParams):
     """Random convolutions and a linear readout, of each sensor alone: the best classifier that we know."""
 
     # classifier: minirocket, random convolutions and a linear readout
@@ -112,7 +112,7 @@ class Minirocket(Material):
 
 
 @dataclass(frozen=True)
-class Statistics(Material):
+class Statistics(MaterialModelParams):
     """Statistics of each channel and a linear readout, of each sensor alone: for sensors with few slides."""
 
     # statistics: statistics of each channel and a linear readout, for few slides
@@ -126,7 +126,7 @@ class Statistics(Material):
 
 
 @dataclass(frozen=True)
-class Spectra(Material):
+class Spectra(MaterialModelParams):
     """Spectra over spatial frequency, by which sensors learn materials from one another."""
 
     # spectra: power over spatial frequency
@@ -143,7 +143,7 @@ class Spectra(Material):
 
 
 @dataclass(frozen=True)
-class Estimator(Material, ABC):
+class Estimator(MaterialModelParams, ABC):
     """An estimator of scikit-learn over features of a slide, of each sensor alone; an architecture extends it."""
 
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
@@ -177,7 +177,7 @@ class Estimator(Material, ABC):
 
 
 @dataclass(frozen=True)
-class Network(Material, ABC):
+class NetworkParams(MaterialModelParams, ABC):
     """Params that networks for slides have in common; an architecture extends it."""
 
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
@@ -218,11 +218,11 @@ class Network(Material, ABC):
         """How slides of unlike sensors are paired."""
         return "random"
 
-    def shape(self, channels: int, header: str, classes: int) -> Shape:
+    def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
         """Return the sizes of a sensor's network."""
-        from tacpipe.models.recurrent_autoencoder import Shape
+        from tacpipe.models.recurrent_autoencoder import AutoencoderShape
 
-        return Shape(channels=channels, classes=classes, header=header, hidden=self.hidden)
+        return AutoencoderShape(channels=channels, classes=classes, header=header, hidden=self.hidden)
 
     def loss_weights(self, *, joint: bool) -> Weights:
         """Return the weights of the terms of the loss; ``joint`` states whether several sensors learn."""
@@ -231,8 +231,8 @@ class Network(Material, ABC):
         return Weights(alignment=0.0)
 
     @abstractmethod
-    def build(self, shape: Shape) -> nn.Module:
-        """Return a sensor's network, of random weights (`tacpipe.models.recurrent_autoencoder.Shape`).
+    def build(self, shape: AutoencoderShape) -> nn.Module:
+        """Return a sensor's network, of random weights (`tacpipe.models.recurrent_autoencoder.AutoencoderShape`).
 
         **A plain network** is called with slides (time, slide, ``shape.channels``), float32, scaled as ``scaling`` states,
         and returns scores (slide, ``shape.classes``), which the negative log-likelihood of their softmax is lowered of.
@@ -262,7 +262,7 @@ class Network(Material, ABC):
 
 
 @dataclass(frozen=True)
-class Raec(Network):
+class Raec(NetworkParams):
     """The paper's recurrent autoencoder with a classifier, learned jointly for unlike sensors or for each alone."""
 
     # raec: the paper's recurrent autoencoder
@@ -315,7 +315,7 @@ class Raec(Network):
         """How slides of unlike sensors are paired."""
         return self.pairing
 
-    def shape(self, channels: int, header: str, classes: int) -> Shape:
+    def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
         """Return the sizes of a sensor's network."""
         return dataclasses.replace(
             super().shape(channels, header, classes),
@@ -337,7 +337,7 @@ class Raec(Network):
             alignment_loss=self.alignment_loss,
         )
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: AutoencoderShape) -> nn.Module:
         """Return the paper's autoencoder with a classifier."""
         from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder
 
@@ -358,7 +358,7 @@ class Raec(Network):
 
 
 @dataclass(frozen=True)
-class XLSTM(Network):
+class XLSTM(NetworkParams):
     """The recurrent classifier without decoder that the paper compares with, of each sensor alone."""
 
     # x-lstm: the paper's classifier without decoder
@@ -367,21 +367,21 @@ class XLSTM(Network):
     dropout: Dropout = added(0.0)  # fraction of the last state left out of each training step; 0.2 in the paper's text
     PRESETS: ClassVar[Presets] = {"paper": _PAPER_TEXT, "quick": {"epochs": 30}}
 
-    def shape(self, channels: int, header: str, classes: int) -> Shape:
+    def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
         """Return the sizes of a sensor's network."""
         return dataclasses.replace(super().shape(channels, header, classes), dropout=self.dropout)
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: AutoencoderShape) -> nn.Module:
         """Return the paper's recurrent classifier."""
         from tacpipe.models.recurrent_autoencoder import RecurrentClassifier
 
         return RecurrentClassifier(shape)
 
 
-Params = Material  # params of any architecture
+Params = MaterialModelParams  # params of any architecture
 
 
 def aligning_architectures() -> list[str]:
     """Return the names of the architectures whose networks can be aligned to a frozen one."""
-    able = [kind for kind in architectures.kinds(Material) if kind.ALIGNS_SENSORS]
+    able = [kind for kind in architectures.kinds(MaterialModelParams) if kind.ALIGNS_SENSORS]
     return [name for kind in able for name in fields.choices(kind, architectures.TAG)]

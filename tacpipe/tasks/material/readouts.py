@@ -26,7 +26,7 @@ from tacpipe.tasks.material.classifier import (
     Config,
     ReadoutModel,
 )
-from tacpipe.tasks.material.estimators import Fitted
+from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.estimators import packed as packed_estimators
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra, Statistics
@@ -56,16 +56,16 @@ def estimators(
     params: Estimator, config: Config, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of estimators of scikit-learn, of each sensor alone."""
-    fitted: dict[str, Fitted] = {}
-    shuffled: dict[str, Fitted] = {}
+    fitted: dict[str, FittedEstimator] = {}
+    shuffled: dict[str, FittedEstimator] = {}
     levels: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
         frames, materials = _labelled(params, slides, validation_slides.get(name), place)
-        fitted[name] = Fitted.fit(params, frames, materials)
+        fitted[name] = FittedEstimator.fit(params, frames, materials)
         if params.baselines:
             permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             levels |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
-            shuffled[name] = Fitted.fit(params, frames, permutation)
+            shuffled[name] = FittedEstimator.fit(params, frames, permutation)
     files = {CONFIG: model_files.to_json(config), ESTIMATORS: packed_estimators(fitted, params)}
     if params.baselines:
         files |= {BASELINES: packed(levels), SHUFFLED_ESTIMATORS: packed_estimators(shuffled, params)}

@@ -27,7 +27,7 @@ NEAR = 0.02  # largest difference between the rates of a sensor's slides, as a f
 
 
 @dataclass(frozen=True)
-class Layout:
+class SlideLayout:
     """The layout of a sensor's slides: their channels, frames, frames per second and arrangement."""
 
     sensor: str
@@ -36,7 +36,7 @@ class Layout:
     rate_hz: float
     layout: str = "time"  # frames in the order of time; authors: as published, in another one
 
-    def alike(self, other: Layout) -> bool:
+    def alike(self, other: SlideLayout) -> bool:
         """Return whether slides of both can be read as one: the rate may differ a little, as stamps do, or be unknown."""
         difference_hz = abs(self.rate_hz - other.rate_hz)
         near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= NEAR * max(self.rate_hz, other.rate_hz)
@@ -48,7 +48,7 @@ class Layout:
         return {"channels": list(self.channels), **layout}
 
     @classmethod
-    def from_json(cls, sensor: str, stored: dict[str, Any]) -> Layout:
+    def from_json(cls, sensor: str, stored: dict[str, Any]) -> SlideLayout:
         """Return the layout that `to_json` wrote."""
         return cls(sensor, tuple(stored["channels"]), int(stored["frames"]), float(stored["rate_hz"]), stored["layout"])
 
@@ -57,7 +57,7 @@ class Layout:
 class Slides:
     """The slides of one sensor."""
 
-    layout: Layout
+    layout: SlideLayout
     names: tuple[str, ...]
     frames: Float32s  # (slide, time, channel), device counts
     materials: Int64s  # (slide,), numbers of classes; UNKNOWN where none is labelled
@@ -102,7 +102,7 @@ def read(
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
-    by_sensor: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
+    by_sensor: dict[str, list[tuple[Recording, SlideLayout, Float32s]]] = {}
     present_sensors: set[str] = set()
     for shard in recordings.recordings.values() if labelled else ():  # labels are checked before any frame is read
         if not only or shard.attributes.get("sensor") in only:
@@ -136,7 +136,7 @@ def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[st
     return [quantity for quantity in quantities if quantity not in present_quantities]
 
 
-def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
+def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[SlideLayout, Float32s]:
     """Return the layout of a slide and its frames (time, channel), device counts; raises as `read`."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
@@ -156,7 +156,9 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[La
             f"Exclude the recording or segment it again."
         )
     rate_hz = float(shard.attributes.get("rate_hz") or _nominal_hz(table))
-    return Layout(sensor, tuple(channels), len(values), rate_hz, str(shard.attributes.get("layout") or "time")), values
+    return SlideLayout(
+        sensor, tuple(channels), len(values), rate_hz, str(shard.attributes.get("layout") or "time")
+    ), values
 
 
 def _nominal_hz(table: pa.Table) -> float:
@@ -174,7 +176,7 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
     return values
 
 
-def _bundle(sensor_slides: Sequence[tuple[Recording, Layout, Float32s]], naming: Naming, labelled: bool) -> Slides:
+def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool) -> Slides:
     """Return the slides of one sensor, alike in layout."""
     first, layout, _ = sensor_slides[0]
     for shard, compared, _ in sensor_slides:
@@ -193,7 +195,7 @@ def _bundle(sensor_slides: Sequence[tuple[Recording, Layout, Float32s]], naming:
     )
 
 
-def difference(expected: Layout, layout: Layout) -> str:
+def difference(expected: SlideLayout, layout: SlideLayout) -> str:
     """Return in words how one layout differs from another.
 
     >>> difference(Layout("a", ("x",), 400, 100.0), Layout("a", ("x",), 75, 100.0))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
-    from tacpipe.tasks.opened import Chain
+    from tacpipe.tasks.opened import OpenedChain
 
 MATERIALS, SLIDES = 6, 240  # slides of each sensor on each material
 
@@ -82,7 +82,7 @@ REQUIREMENTS = Requirements(
 )
 
 
-class Material(Task):
+class MaterialTask(Task):
     """Recognition of materials."""
 
     name = "material"
@@ -116,7 +116,7 @@ class Material(Task):
 
         return predict(model.files, recordings, probabilities=request.probabilities)
 
-    def load(self, files: Files, chain: Chain | None = None) -> MaterialModel:
+    def load(self, files: Files, chain: OpenedChain | None = None) -> MaterialModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
         from tacpipe.tasks.material.model import MaterialModel
 

@@ -18,7 +18,7 @@ from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import (
     Estimator,
     Minirocket,
-    Network,
+    NetworkParams,
     Params,
     Spectra,
     Statistics,
@@ -58,7 +58,7 @@ class TrainingSlides:
         """Return the files of one fitted estimator of scikit-learn per sensor."""
         return readouts.estimators(params, self.config, self.training, self.validation)
 
-    def train_networks(self, params: Network) -> dict[str, bytes]:
+    def train_networks(self, params: NetworkParams) -> dict[str, bytes]:
         """Return the files of one network per sensor, trained by the shared loop."""
         return network_training.train(params, self.config, self.training, self.validation, self.workspace, self.init)
 

@@ -30,7 +30,7 @@ WRISTS = ("given", "estimated")
 
 
 @dataclass(frozen=True)
-class Inputs:
+class CloudInputs:
     """Options of the inputs: one of the letter's six modes, how many points are drawn, their scale and rotation."""
 
     mode: str
@@ -71,10 +71,12 @@ class Inputs:
         return 15 if self.posed else 6 if self.mode.endswith("cont") else 0
 
 
-class Sources:
+class CloudSources:
     """Clouds and grasps to draw from."""
 
-    def __init__(self, inputs: Inputs, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]) -> None:
+    def __init__(
+        self, inputs: CloudInputs, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
+    ) -> None:
         """Take clouds and grasps; raises `TacpipeError` where one has too few points, no colours or no wrist."""
         self.inputs, self.clouds, self.grasps = inputs, clouds, grasps
         for name, cloud, grasp in zip(names, clouds, grasps, strict=True):
@@ -125,7 +127,7 @@ class Sources:
         return points, numbers
 
 
-def _check(inputs: Inputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
+def _check(inputs: CloudInputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
     if len(cloud) < inputs.points:
         raise TacpipeError(
             f"{name} has a cloud of {len(cloud)} points, and {inputs.points} are to be drawn of each. Leave it out, or "
@@ -148,7 +150,7 @@ PLACES = 3  # about g1, about g2, the whole
 
 
 @dataclass(frozen=True)
-class Patches:
+class PatchOptions:
     """How large patches are, how many points are drawn of each, and whether colours and the grasp's place are read."""
 
     points: int
@@ -178,7 +180,7 @@ class PatchSources:
     """Clouds and grasps to draw patches from."""
 
     def __init__(
-        self, patches: Patches, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
+        self, patches: PatchOptions, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
     ) -> None:
         """Take clouds and grasps; raises `TacpipeError` where colours are to be read and a cloud has none."""
         self.patches = patches

@@ -19,10 +19,10 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.models.point_networks import Shape
+from tacpipe.models.point_networks import PointNetworkShape
 from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.inputs import Arrays, Inputs, Patches, PatchSources, Sources, require_colours
+from tacpipe.tasks.touch.inputs import Arrays, CloudInputs, CloudSources, PatchOptions, PatchSources, require_colours
 from tacpipe.training.scaling import Affine
 
 LOSSES = ("rmse", "balanced")
@@ -32,7 +32,7 @@ SEEDS = 2**62
 
 
 class Drawn(Protocol):
-    """A source of drawn points: `inputs.Sources` or `patches.PatchSources`."""
+    """A source of drawn points: `inputs.CloudSources` or `patches.PatchSources`."""
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
         """Return points and the grasps' numbers, drawn anew."""
@@ -211,7 +211,7 @@ def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network for params and targets. Raises `TacpipeError` where params build something else."""
     values = sum(biotac_sp.width(target) for target in targets)
     read = inputs(params) if isinstance(params, params_of.Pointnet) else patches(params)
-    built = params.build(Shape(read.channels, read.grasp_numbers, values))
+    built = params.build(PointNetworkShape(read.channels, read.grasp_numbers, values))
     if not isinstance(built, nn.Module):
         raise TacpipeError(
             f"The architecture {params.architecture} built {type(built).__name__}; it must build a torch.nn.Module."
@@ -226,14 +226,14 @@ def checked(params: NetworkParams) -> None:
             raise ValueError(f"{name} is {value}")
 
 
-def inputs(params: params_of.Pointnet) -> Inputs:
+def inputs(params: params_of.Pointnet) -> CloudInputs:
     """Return what a PointNet reads."""
-    return Inputs(params.inputs, params.points, params.normalisation, params.rotation_deg, params.wrist)
+    return CloudInputs(params.inputs, params.points, params.normalisation, params.rotation_deg, params.wrist)
 
 
-def patches(params: params_of.Patches) -> Patches:
+def patches(params: params_of.Patches) -> PatchOptions:
     """Return what a patch network reads."""
-    return Patches(params.points, params.radius_mm / 1000, coloured(params), params.place)
+    return PatchOptions(params.points, params.radius_mm / 1000, coloured(params), params.place)
 
 
 def coloured(params: params_of.Trees | NetworkParams) -> bool:
@@ -244,5 +244,5 @@ def coloured(params: params_of.Trees | NetworkParams) -> bool:
 def sources(params: NetworkParams, grasps: Grasps) -> Drawn:
     """Return where a network's points are drawn from. Raises `TacpipeError` where a grasp lacks what it reads."""
     if isinstance(params, params_of.Pointnet):
-        return Sources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
+        return CloudSources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
     return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)

@@ -15,7 +15,7 @@ from tacpipe.tasks.opened import opened
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.evaluation import readings_table, simulated
 from tacpipe.tasks.touch.headline import PREDICTIONS
-from tacpipe.tasks.touch.predictor import Predictor, Touch
+from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,12 +61,12 @@ class TouchModel(Predictor):
     def predict(self, recordings: Dataset | Recording, /, *, quantiles: Sequence[int] = ()) -> pa.Table: ...
 
     @overload
-    def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
+    def predict(self, cloud: Cloud, grasp: Grasp, /) -> PredictedReading: ...
 
     def predict(
         self, recordings: Dataset | Recording | Cloud, grasp: Grasp | None = None, /, *, quantiles: Sequence[int] = ()
-    ) -> pa.Table | Touch:
-        """Return predicted readings: of a dataset or one of its recordings as a table, of one cloud as `Touch`.
+    ) -> pa.Table | PredictedReading:
+        """Return predicted readings: of a dataset or one of its recordings as a table, of one cloud as `PredictedReading`.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
         a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.

@@ -27,7 +27,7 @@ from tacpipe.training.devices import Precision
 if TYPE_CHECKING:
     from torch import nn
 
-    from tacpipe.models.point_networks import Shape
+    from tacpipe.models.point_networks import PointNetworkShape
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
 Presets = Mapping[str, Mapping[str, object]]
@@ -38,7 +38,7 @@ Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], 
 
 
 @dataclass(frozen=True)
-class Touch(ABC):
+class TouchModelParams(ABC):
     """Params that every model of the task ``touch`` has."""
 
     ARCHITECTURES: ClassVar[str] = "touch"  # the task, as entry points name it
@@ -86,7 +86,7 @@ class Touch(ABC):
 
 
 @dataclass(frozen=True)
-class Trees(Touch):
+class Trees(TouchModelParams):
     """Forests over the geometry of a grasp: the best model that we know."""
 
     # tree-ensemble: the mean of a forest a target and one forest of all targets; trees: a forest a target
@@ -107,7 +107,7 @@ class Trees(Touch):
 
 
 @dataclass(frozen=True)
-class PointNetwork(Touch, ABC):
+class PointNetwork(TouchModelParams, ABC):
     """Params that networks that read points have in common."""
 
     # one network for all targets; else one each, as in the paper
@@ -134,8 +134,10 @@ class PointNetwork(Touch, ABC):
         return self.select == "best" or bool(self.patience)
 
     @abstractmethod
-    def build(self, shape: Shape) -> nn.Module:
-        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.point_networks.Shape`).
+    def build(self, shape: PointNetworkShape) -> nn.Module:
+        """Return the network, of random weights, for what it reads and predicts.
+
+        ``shape`` is a `tacpipe.models.point_networks.PointNetworkShape`.
 
         It is called as ``network(points, numbers)`` and returns scaled values (cloud, ``shape.values``), those of the
         targets side by side.
@@ -170,7 +172,7 @@ class Patches(PointNetwork):
         """Add networks that the shared loop trains: one for all targets or one for each."""
         grasps.train_networks(self, model)
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: PointNetworkShape) -> nn.Module:
         """Return the network of patches."""
         from tacpipe.models.point_networks import PatchNetwork
 
@@ -222,11 +224,11 @@ class Pointnet(PointNetwork):
         """Add networks that the shared loop trains: one for all targets or one for each."""
         grasps.train_networks(self, model)
 
-    def build(self, shape: Shape) -> nn.Module:
+    def build(self, shape: PointNetworkShape) -> nn.Module:
         """Return the paper's network."""
         from tacpipe.models.point_networks import HEADS, PointNet
 
         return PointNet(shape.channels, shape.numbers, shape.values, head=HEADS[self.head], transform=self.transform)
 
 
-Params = Touch  # params of any architecture
+Params = TouchModelParams  # params of any architecture

@@ -19,7 +19,7 @@ from tacpipe.models.tensors import under
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import excerpt
 from tacpipe.tasks import calibrated
-from tacpipe.tasks.opened import Chain
+from tacpipe.tasks.opened import OpenedChain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines, Shrinkage
 from tacpipe.tasks.touch.grasps import Grasps, check
@@ -43,7 +43,7 @@ NEEDED = {
 
 
 @dataclass(frozen=True)
-class Touch:
+class PredictedReading:
     """The reading of both fingers, device counts; NaN for what the model does not predict.
 
     ``th`` is the thumb, ``mf`` the middle finger. A reading at rest is about 2,779 and 1,676 counts of ``pdc``, and 2,400
@@ -64,12 +64,12 @@ class Predictor:
     config: Config  # config.json
     members: Sequence[members.Member]
     baselines: Baselines | None
-    chain: Chain | None = None  # the stages that it was trained behind; None: unknown
+    chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
     shrinkage: Shrinkage | None = None  # shrinks predictions for objects that it was not trained on
     quantiles: ReadingQuantiles | None = None  # None unless `tacpipe calibrate` wrote the model
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
+    def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
         """Return the model among these files, as `tacpipe train touch` wrote them.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
@@ -122,7 +122,7 @@ class Predictor:
         """Return `tacpipe.tasks.calibrated.quantiles_of` of the model."""
         return calibrated.quantiles_of(self.quantiles, percents)
 
-    def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
+    def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[PredictedReading]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""
         for number, grasp in enumerate(grasps):
             check(f"Grasp {number}" if len(grasps) > 1 else "The grasp", cloud, grasp)
@@ -138,7 +138,7 @@ class Predictor:
         for target in set(biotac_sp.TARGETS) - set(readings):
             readings[target] = np.full((count, biotac_sp.width(target)), np.nan)
         return [
-            Touch(
+            PredictedReading(
                 float(readings["pdc_th"][at, 0]),
                 float(readings["pdc_mf"][at, 0]),
                 readings["e_th"][at],

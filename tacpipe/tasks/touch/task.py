@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
-    from tacpipe.tasks.opened import Chain
+    from tacpipe.tasks.opened import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
 OBJECTS, GRASPS = 1, 90  # objects of each of six families, grasps of each object
@@ -84,7 +84,7 @@ REQUIREMENTS = Requirements(
 )
 
 
-class Touch(Task):
+class TouchTask(Task):
     """Predicted readings of grasps."""
 
     name = "touch"
@@ -115,7 +115,7 @@ class Touch(Task):
 
         return predict(model.files, recordings, quantiles=request.quantiles)
 
-    def load(self, files: Files, chain: Chain | None = None) -> TouchModel:
+    def load(self, files: Files, chain: OpenedChain | None = None) -> TouchModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
         from tacpipe.tasks.touch.model import TouchModel
 

@@ -17,10 +17,10 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, Happening, Item, of_run, one_by_one, parse
-from tacpipe.simulation.emulation.pacing import Pace
-from tacpipe.simulation.emulation.source import Source, Timing
-from tacpipe.simulation.emulation.transmission import Plan
+from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, Happening, SentItem, of_run, one_by_one, parse
+from tacpipe.simulation.emulation.pacing import FramePace
+from tacpipe.simulation.emulation.source import SampleSource, Timing
+from tacpipe.simulation.emulation.transmission import TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
 WORLD = World(1)
@@ -29,11 +29,11 @@ SECONDS = 20
 
 def planned(
     sensor: Sensor, faults: Faults, *, packets: bool = False, seed: int = 5
-) -> tuple[list[Item], dict[int, bytes]]:
+) -> tuple[list[SentItem], dict[int, bytes]]:
     """Return the items sent in `SECONDS`, and the sound frames by number."""
-    source = Source(sensor, WORLD, Timing(sensor.rate_hz))
-    plan = Plan(source, Pace(), faults, [seed], packets=packets)
-    items: list[Item] = []
+    source = SampleSource(sensor, WORLD, Timing(sensor.rate_hz))
+    plan = TransmissionPlan(source, FramePace(), faults, [seed], packets=packets)
+    items: list[SentItem] = []
     frames: dict[int, bytes] = {}
     for block in range(round(SECONDS * sensor.rate_hz / source.rows)):
         items += plan.next_items()
@@ -42,7 +42,7 @@ def planned(
     return items, frames
 
 
-def framed(sensor: Sensor, items: list[Item]) -> list[bytes]:
+def framed(sensor: Sensor, items: list[SentItem]) -> list[bytes]:
     """Return the frames that the sensor's framer finds in the sent bytes."""
     framer = sensor.framer()
     chunks = [(item.due_ns, item.data) for item in items if item.data]
@@ -50,7 +50,7 @@ def framed(sensor: Sensor, items: list[Item]) -> list[bytes]:
     return [frame for run in runs + framer.flush()[0] for frame in of_run(run)]
 
 
-def of_cause(items: list[Item], cause: str) -> list[Item]:
+def of_cause(items: list[SentItem], cause: str) -> list[SentItem]:
     return [item for item in items if item.cause == cause]
 
 

@@ -20,30 +20,30 @@ from tacpipe.simulation import pick_and_move, taxels
 from tacpipe.simulation.emulation import joints, ledger
 from tacpipe.simulation.emulation.quantities import unit_scale
 from tacpipe.simulation.emulation.slide_source import SlideSource
-from tacpipe.simulation.emulation.source import Source, Timing
+from tacpipe.simulation.emulation.source import SampleSource, Timing
 from tacpipe.simulation.emulation.world import CYCLE_NS, World
-from tacpipe.simulation.slide import Rig, simulate_trial
+from tacpipe.simulation.slide import SlideRig, simulate_trial
 from tests.simulation.emulation.rigs import ALL_SENSORS
 
 WORLD = World(3)
 
 
-def values(source: Source, blocks: int) -> list[np.ndarray]:
+def values(source: SampleSource, blocks: int) -> list[np.ndarray]:
     return [np.concatenate(parts) for parts in zip(*(source.block(n).values for n in range(blocks)), strict=True)]
 
 
 def test_the_same_seed_gives_the_same_values_in_whatever_order_blocks_are_asked_for() -> None:
-    forward = Source(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
-    backward = Source(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
+    forward = SampleSource(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
+    backward = SampleSource(Xela(rate_hz=50), World(3), Timing(50), (3, 1))
     later = [backward.block(n).values[0] for n in (5, 2, 0)]
     for n, backward_block in zip((5, 2, 0), later, strict=True):
         assert np.array_equal(forward.block(n).values[0], backward_block)
-    other_finger = Source(Xela(rate_hz=50), World(3), Timing(50), (4, 1))
+    other_finger = SampleSource(Xela(rate_hz=50), World(3), Timing(50), (4, 1))
     assert not np.array_equal(other_finger.block(0).values[0], later[-1])
 
 
 def test_a_uskin_tells_the_force_of_the_contact() -> None:
-    source = Source(Xela(rate_hz=50), WORLD, Timing(50), finger=1)
+    source = SampleSource(Xela(rate_hz=50), WORLD, Timing(50), finger=1)
     counts = values(source, 20)[0].astype(float)
     t_ns = source.timing.taken_ns(np.arange(len(counts)))
     pressed_n = taxels.forces(WORLD.skins[1], counts)[:, :, 2].sum(axis=1)
@@ -55,7 +55,7 @@ def test_a_uskin_tells_the_force_of_the_contact() -> None:
 
 
 def test_the_drift_of_a_uskin_goes_on_from_block_to_block() -> None:
-    source = Source(Xela(rate_hz=50), WORLD, Timing(50))
+    source = SampleSource(Xela(rate_hz=50), WORLD, Timing(50))
     ends = [source._drifted(n)[[0, -1]] for n in range(40)]
     steps = np.array([after[0] - before[1] for before, after in itertools.pairwise(ends)])
     block_drifts = np.array([end[1] - end[0] for end in ends])
@@ -64,16 +64,16 @@ def test_the_drift_of_a_uskin_goes_on_from_block_to_block() -> None:
 
 
 def test_sensors_of_one_rig_see_the_same_grasp() -> None:
-    force = values(Source(OptoForce(axes=3), WORLD, Timing(1000)), 20)[1][::20, 2].astype(float)
-    skin = values(Source(Xela(rate_hz=50), WORLD, Timing(50)), 20)[0][:, 2::3].astype(float).sum(axis=1)
+    force = values(SampleSource(OptoForce(axes=3), WORLD, Timing(1000)), 20)[1][::20, 2].astype(float)
+    skin = values(SampleSource(Xela(rate_hz=50), WORLD, Timing(50)), 20)[0][:, 2::3].astype(float).sum(axis=1)
     load_n = WORLD.contact(np.arange(len(force)) * 20_000_000, lambda scene: scene.contact.force_n[:, 2])
     assert np.corrcoef(-force, load_n)[0, 1] > 0.95
     assert np.corrcoef(skin, np.abs(force))[0, 1] > 0.5
 
 
 def test_distance_grows_by_what_the_object_slips() -> None:
-    world = World(0, pick_and_move.Rig(effort=1.15))
-    source = Source(TfMini(unit="mm"), world, Timing(100))
+    world = World(0, pick_and_move.PickRig(effort=1.15))
+    source = SampleSource(TfMini(unit="mm"), world, Timing(100))
     distance_mm = values(source, 20)[0][:, 0].astype(float)
     t_ns = source.timing.taken_ns(np.arange(len(distance_mm)))
     down_m = -world.contact(t_ns, lambda scene: scene.contact.displacement_m[:, 1])
@@ -116,17 +116,17 @@ def test_nothing_jumps_from_a_cycle_to_the_next() -> None:
 
 
 def test_counters_go_round_when_they_are_told_to() -> None:
-    source = Source(OptoForce(), WORLD, Timing(1000, wrap_s=1.0))
+    source = SampleSource(OptoForce(), WORLD, Timing(1000, wrap_s=1.0))
     counts = np.concatenate([source.block(n).seq for n in range(3)])
     assert counts[999] == 65_535
     assert counts[1000] == 0
 
 
 def test_a_fast_clock_takes_samples_faster_and_shows_their_nominal_spacing() -> None:
-    from tacpipe.simulation.faults import Clock
+    from tacpipe.simulation.faults import DeviceClock
 
-    timing = Timing(100, clock=Clock(offset_ns=7_000_000, skew=1e-3))
-    source = Source(Xela(rate_hz=100), WORLD, timing)
+    timing = Timing(100, clock=DeviceClock(offset_ns=7_000_000, skew=1e-3))
+    source = SampleSource(Xela(rate_hz=100), WORLD, timing)
     stamps = source.block(1).t_device_ns
     assert stamps is not None
     assert set(np.diff(stamps).tolist()) <= {9_999_999, 10_000_000, 10_000_001}
@@ -142,7 +142,7 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
 
         samples = CloudSource(sensor, Timing(2), (0,)).block(0)
     else:
-        samples = Source(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
+        samples = SampleSource(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
     decoded_samples = ledger.decoded(sensor, sensor.encode(samples))
     assert len(decoded_samples) == len(samples)
     for sent, read in zip(samples.values, decoded_samples.values, strict=True):
@@ -174,7 +174,7 @@ def test_a_board_of_counts_stays_within_its_type() -> None:
     board = rig.parse(
         f'[[stream]]\nname = "a"\nsensor = "generic"\ntransport = "serial:/dev/x"\noptions = {{ {text} }}\n'
     )
-    counts = values(Source(board.streams["a"].sensor, WORLD, Timing(100)), 20)[0]
+    counts = values(SampleSource(board.streams["a"].sensor, WORLD, Timing(100)), 20)[0]
     assert counts.dtype == np.uint8
     assert 60 < counts.max() < 255
     assert counts[:20].max() < 10
@@ -186,7 +186,7 @@ def test_columns_keep_the_names_of_published_recordings() -> None:
 
 def test_a_biotac_that_slides_sends_the_trials_of_the_simulated_rig_one_after_another() -> None:
     sensor = BioTac()
-    rig_ = Rig(materials=2, arm_every=0)
+    rig_ = SlideRig(materials=2, arm_every=0)
     source = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
     second_source = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
     assert np.array_equal(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tacpipe.models.windows import POSE
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import causal, tracks
-from tacpipe.tasks.forward.causal import Arm, Plan
+from tacpipe.tasks.forward.causal import Arm, PosePlan
 from tests.tasks.forward import trials
 
 T_NS = np.arange(60) * 20_000_000
@@ -53,7 +53,7 @@ def test_a_plan_is_interpolated_and_its_end_is_kept() -> None:
     now = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0, *np.zeros(6)])
     points_ns = np.array([0, 100_000_000])
     turn = Rotation.from_rotvec([0, 0, 0.5]).as_quat()
-    plan = Plan(points_ns, np.array([[0.0, 0, 0.3, 0, 0, 0, 1], [0.1, 0, 0.3, *-turn]]))
+    plan = PosePlan(points_ns, np.array([[0.0, 0, 0.3, 0, 0, 0, 1], [0.1, 0, 0.3, *-turn]]))
     rows = causal.rows(plan, 0, AHEAD_NS, now)
     x = np.minimum(AHEAD_NS / 1e9, 0.1)
     np.testing.assert_allclose(rows[:, 0], x, atol=1e-6)
@@ -66,7 +66,7 @@ def test_a_plan_is_interpolated_and_its_end_is_kept() -> None:
 def test_a_plan_that_begins_later_is_reached_from_where_the_hand_is_and_one_that_ended_leaves_it_there() -> None:
     now = np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0, *np.ones(6)])
     nowhere = np.full(4, np.nan)
-    later = Plan(np.array([200_000_000]), np.array([[1.2, 0.0, 0.3, *nowhere]]))
+    later = PosePlan(np.array([200_000_000]), np.array([[1.2, 0.0, 0.3, *nowhere]]))
     rows = causal.rows(later, 0, AHEAD_NS, now)
     np.testing.assert_allclose(rows[:, 0], 1 + AHEAD_NS / 1e9, atol=1e-6)
     np.testing.assert_array_equal(rows[:, 3:7], np.tile([0, 0, 0, 1], (10, 1)))

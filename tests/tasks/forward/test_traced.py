@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from tacpipe.models.windows import ARM, Windows
+from tacpipe.models.windows import ARM, ForecastWindows
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.networks import Network
 from tests.live import rigs
@@ -23,14 +23,14 @@ def forecaster(tmp_path_factory: pytest.TempPathFactory) -> Forecaster:
     return Forecaster.load(model_files[0])
 
 
-def windows(forecaster: Forecaster, seed: int) -> Windows:
+def windows(forecaster: Forecaster, seed: int) -> ForecastWindows:
     rng = np.random.default_rng(seed)
     context, rows = forecaster.context, forecaster.context + forecaster.horizon
     touch = rng.normal(0, 50, (context, 1, len(forecaster.codec.latents))).cumsum(axis=0)
     arm = rng.normal(0, 0.01, (rows, 1, ARM))
     arm[..., 6] = 1
     parts = (touch, arm, rng.normal(0.04, 0.01, (context, 1)))
-    return Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
+    return ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
 
 
 def test_a_recorded_network_gives_what_the_network_gives_to_the_last_bit(forecaster: Forecaster) -> None:
@@ -50,7 +50,7 @@ class Moody(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, inputs: Windows) -> Any:
+    def forward(self, inputs: ForecastWindows) -> Any:
         predicted = self.network(inputs)
         return predicted + 1 if float(inputs.touch.abs().max()) > 0 else predicted
 
@@ -58,7 +58,7 @@ class Moody(nn.Module):
 class Unwilling(Moody):
     """Cannot be recorded."""
 
-    def forward(self, inputs: Windows) -> Any:
+    def forward(self, inputs: ForecastWindows) -> Any:
         if torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
             raise RuntimeError("not while recorded")
         return self.network(inputs)

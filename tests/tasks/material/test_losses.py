@@ -9,11 +9,11 @@ from sklearn.metrics import log_loss
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, RecurrentClassifier, Shape
-from tacpipe.tasks.material.losses import NONE, JointWork, Pairs, ScaledSlides, Weights
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape, RecurrentAutoencoder, RecurrentClassifier
+from tacpipe.tasks.material.losses import NONE, BatchPairs, JointWork, ScaledSlides, Weights
 
 CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
-SHAPES = {"a": Shape(4, 3, hidden=6, latents=5), "b": Shape(7, 3, hidden=6, latents=5)}
+SHAPES = {"a": AutoencoderShape(4, 3, hidden=6, latents=5), "b": AutoencoderShape(7, 3, hidden=6, latents=5)}
 
 
 def touched(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
@@ -29,7 +29,7 @@ def networks(architecture: str = "raec") -> nn.ModuleDict:
 
 def work(weights: Weights, frozen: str = "", **classes: Tensor) -> JointWork:
     slides_by_sensor = {name: touched(name, classes.get(name, CLASSES)) for name in SHAPES}
-    pairs = Pairs({name: sensor_slides.classes for name, sensor_slides in slides_by_sensor.items()}, 16)
+    pairs = BatchPairs({name: sensor_slides.classes for name, sensor_slides in slides_by_sensor.items()}, 16)
     return JointWork(slides_by_sensor, slides_by_sensor, pairs, weights, frozen)
 
 

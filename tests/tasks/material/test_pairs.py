@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.material.losses import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.losses import NONE, BatchPairs, permuted_classes
 
 LABELS = torch.arange(600) % 20
 
 
-def two(**changed: Any) -> Pairs:
-    return Pairs({"a": LABELS, "b": LABELS.flip(0)}, 32, **changed)
+def two(**changed: Any) -> BatchPairs:
+    return BatchPairs({"a": LABELS, "b": LABELS.flip(0)}, 32, **changed)
 
 
-def visited(pairs: Pairs, sensor: str) -> list[int]:
+def visited(pairs: BatchPairs, sensor: str) -> list[int]:
     return [int(row) for batch in pairs.epoch() for row in batch[sensor] if row != NONE]
 
 
@@ -48,7 +48,7 @@ def test_dropping_the_last_batch_leaves_whole_ones() -> None:
 
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=30), st.lists(st.integers(-1, 3), min_size=1, max_size=30))
 def test_the_slides_of_a_row_are_of_the_same_class(first_classes: list[int], second_classes: list[int]) -> None:
-    pairs = Pairs({"a": torch.tensor(first_classes), "b": torch.tensor(second_classes)}, 4)
+    pairs = BatchPairs({"a": torch.tensor(first_classes), "b": torch.tensor(second_classes)}, 4)
     rows = [row for batch in pairs.epoch() for row in zip(batch["a"].tolist(), batch["b"].tolist(), strict=True)]
     for first, second in rows:
         if NONE not in (first, second):
@@ -71,7 +71,7 @@ def test_permuted_pairs_are_of_the_partner_class_and_of_no_class_with_itself() -
 
 
 def test_random_pairs_differ_from_epoch_to_epoch_and_fixed_ones_do_not() -> None:
-    def matched(pairs: Pairs) -> set[tuple[int, int]]:
+    def matched(pairs: BatchPairs) -> set[tuple[int, int]]:
         return {row for batch in pairs.epoch() for row in zip(batch["a"].tolist(), batch["b"].tolist(), strict=True)}
 
     fixed, random, unshuffled = two(pairing="fixed"), two(), two(shuffle=False)
@@ -91,7 +91,7 @@ def test_the_same_state_of_the_generator_gives_the_same_epoch() -> None:
 
 
 def test_three_sensors_are_dealt_side_by_side() -> None:
-    pairs = Pairs({"a": LABELS[:40], "b": LABELS[:60], "c": LABELS[:20]}, 16)
+    pairs = BatchPairs({"a": LABELS[:40], "b": LABELS[:60], "c": LABELS[:20]}, 16)
     rows = [row for batch in pairs.epoch() for row in zip(*(batch[name].tolist() for name in "abc"), strict=True)]
     assert len(rows) == 60
     for row in rows:

@@ -15,7 +15,7 @@ from tacpipe.clouds import normalisation
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.normalisation import Extent
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch.inputs import MODES, Inputs, Sources
+from tacpipe.tasks.touch.inputs import MODES, CloudInputs, CloudSources
 from tests.tasks.touch.handmade import cloud, grasp
 
 COUNTS = {"xyz": (3, 0), "rgb": (6, 0), "xyzcont": (3, 6), "rgbcont": (6, 6), "xyzpose": (3, 15), "rgbpose": (6, 15)}
@@ -23,10 +23,10 @@ COUNTS = {"xyz": (3, 0), "rgb": (6, 0), "xyzcont": (3, 6), "rgbcont": (6, 6), "x
 
 def sources(
     mode: str = "xyzcont", points: int = 10, normalisation: str = "none", count: int = 3, **options: Any
-) -> Sources:
+) -> CloudSources:
     numbers = range(count)
-    inputs = Inputs(mode, points, normalisation, **options)
-    return Sources(inputs, [f"g{n}" for n in numbers], [cloud(n) for n in numbers], [grasp(n) for n in numbers])
+    inputs = CloudInputs(mode, points, normalisation, **options)
+    return CloudSources(inputs, [f"g{n}" for n in numbers], [cloud(n) for n in numbers], [grasp(n) for n in numbers])
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -74,7 +74,7 @@ def test_fixed_draws_depend_on_the_cloud_and_the_visit_alone() -> None:
     np.testing.assert_array_equal(drawn.fixed([1], 0)[0][0], points[1])
     np.testing.assert_array_equal(drawn.fixed([0, 1, 2, 3], 0)[0][3], points[0])
     assert not np.array_equal(drawn.fixed([3], 1)[0][0], points[0])
-    single = Sources(Inputs("xyzcont", 10, "none"), ["other"], [cloud(3)], [grasp(3)])
+    single = CloudSources(CloudInputs("xyzcont", 10, "none"), ["other"], [cloud(3)], [grasp(3)])
     np.testing.assert_array_equal(single.fixed([0], 0)[0][0], points[0])
     np.testing.assert_array_equal(numbers[0], np.concatenate([grasp(3).g1_m, grasp(3).g2_m]).astype(np.float32))
 
@@ -99,7 +99,9 @@ def test_the_grasps_points_are_normalised_with_the_clouds_own_constants() -> Non
 @pytest.mark.parametrize("method", ["minmax", "sphere"])
 def test_a_cloud_is_scaled_the_same_way_whichever_points_are_drawn(method: str) -> None:
     drawn = sources("rgbcont", 10, method)
-    all_points = Sources(Inputs("rgbcont", 40, method), ["all"], [cloud(1)], [grasp(1)]).draw([0], rng())[0][0]
+    all_points = CloudSources(CloudInputs("rgbcont", 40, method), ["all"], [cloud(1)], [grasp(1)]).draw([0], rng())[0][
+        0
+    ]
     for seed in range(5):
         for point in drawn.draw([1], rng(seed))[0][0]:
             assert np.abs(all_points - point).max(axis=1).min() < 1e-6
@@ -131,33 +133,37 @@ def test_in_the_wrists_axes_turns_are_not_seen() -> None:
 def test_an_estimated_wrist_stands_for_the_one_that_is_told() -> None:
     numbers = sources("xyzpose", wrist="estimated").fixed([0], 0)[1][0]
     np.testing.assert_allclose(numbers[6:].reshape(3, 3), frame.estimated_wrist(grasp(0)), atol=1e-6)
-    blind = Sources(Inputs("xyzpose", 5, "wrist", wrist="estimated"), ["g"], [cloud(0)], [grasp(0, wrist=False)])
+    blind = CloudSources(
+        CloudInputs("xyzpose", 5, "wrist", wrist="estimated"), ["g"], [cloud(0)], [grasp(0, wrist=False)]
+    )
     assert blind.draw([0], rng())[1].shape == (1, 15)
 
 
 @pytest.mark.parametrize(
     ("inputs", "given_cloud", "given_grasp", "sentence"),
     [
-        (Inputs("xyz", 41, "none"), cloud(0), grasp(0), "ball-7 has a cloud of 40 points, and 41 are to be drawn"),
+        (CloudInputs("xyz", 41, "none"), cloud(0), grasp(0), "ball-7 has a cloud of 40 points, and 41 are to be drawn"),
         (
-            Inputs("rgb", 5, "none"),
+            CloudInputs("rgb", 5, "none"),
             cloud(0, coloured=False),
             grasp(0),
             "ball-7 has a cloud without colours.*inputs rgb",
         ),
-        (Inputs("xyzpose", 5, "none"), cloud(0), grasp(0, wrist=False), "ball-7 .*wrist"),
-        (Inputs("xyz", 5, "wrist"), cloud(0), grasp(0, wrist=False), "ball-7 .*--wrist estimated"),
+        (CloudInputs("xyzpose", 5, "none"), cloud(0), grasp(0, wrist=False), "ball-7 .*wrist"),
+        (CloudInputs("xyz", 5, "wrist"), cloud(0), grasp(0, wrist=False), "ball-7 .*--wrist estimated"),
     ],
 )
 def test_a_grasp_that_lacks_what_is_read_is_refused_by_name(
-    inputs: Inputs, given_cloud: Cloud, given_grasp: Any, sentence: str
+    inputs: CloudInputs, given_cloud: Cloud, given_grasp: Any, sentence: str
 ) -> None:
     with pytest.raises(TacpipeError, match=sentence):
-        Sources(inputs, ["ball-7"], [given_cloud], [given_grasp])
+        CloudSources(inputs, ["ball-7"], [given_cloud], [given_grasp])
 
 
 def test_a_cloud_of_just_as_many_points_is_read_whole_and_colours_are_not_asked_for_in_vain() -> None:
-    drawn = Sources(Inputs("xyzcont", 40, "minmax"), ["g"], [cloud(0, coloured=False)], [grasp(0, wrist=False)])
+    drawn = CloudSources(
+        CloudInputs("xyzcont", 40, "minmax"), ["g"], [cloud(0, coloured=False)], [grasp(0, wrist=False)]
+    )
     points = drawn.draw([0], rng())[0][0]
     assert len(np.unique(points, axis=0)) == 40
 
@@ -175,4 +181,4 @@ def test_a_cloud_of_just_as_many_points_is_read_whole_and_colours_are_not_asked_
 )
 def test_inputs_that_there_are_not_are_refused(given: dict[str, Any], sentence: str) -> None:
     with pytest.raises(TacpipeError, match=sentence):
-        Inputs(**{"mode": "xyz", "points": 5, "normalisation": "none", **given})
+        CloudInputs(**{"mode": "xyz", "points": 5, "normalisation": "none", **given})

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch.inputs import UNIT_M, Patches, PatchSources
+from tacpipe.tasks.touch.inputs import UNIT_M, PatchOptions, PatchSources
 from tests.tasks.touch.handmade import POINTS, cloud, grasp
 
 
 def sources(points: int = 8, radius_m: float = 0.02, coloured: bool = False, placed: bool = False) -> PatchSources:
-    patches = Patches(points, radius_m, coloured, placed)
+    patches = PatchOptions(points, radius_m, coloured, placed)
     return PatchSources(patches, ["a", "b"], [cloud(0), cloud(1)], [grasp(0), grasp(1)])
 
 
@@ -76,7 +76,7 @@ def test_moving_cloud_and_grasp_together_changes_nothing_of_what_is_read(seed: i
     random = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=random).as_matrix(), random.uniform(-0.5, 0.5, 3)
     moved_cloud = Cloud((cloud(0).points_m @ turn.T + shift).astype(np.float32))
-    patches = Patches(8, 0.02, False, False)
+    patches = PatchOptions(8, 0.02, False, False)
     original, moved = (
         PatchSources(patches, ["a"], [scene], [planned])
         for scene, planned in ((cloud(0), grasp(0)), (moved_cloud, grasp(0).moved(turn, shift)))
@@ -87,9 +87,9 @@ def test_moving_cloud_and_grasp_together_changes_nothing_of_what_is_read(seed: i
 
 def test_what_cannot_be_read_is_refused() -> None:
     with pytest.raises(TacpipeError, match="points is 0; it must be 1 or more"):
-        Patches(0, 0.02, False, False)
+        PatchOptions(0, 0.02, False, False)
     for radius_m in (0.0, float("nan")):
         with pytest.raises(TacpipeError, match=r"radius_mm is (0|nan); it must be above 0"):
-            Patches(8, radius_m, False, False)
+            PatchOptions(8, radius_m, False, False)
     with pytest.raises(TacpipeError, match=r"ball-3 has a cloud without colours.*Train with inputs of xyz"):
-        PatchSources(Patches(8, 0.02, True, False), ["ball-3"], [cloud(0, coloured=False)], [grasp(0)])
+        PatchSources(PatchOptions(8, 0.02, True, False), ["ball-3"], [cloud(0, coloured=False)], [grasp(0)])

@@ -17,7 +17,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.model import TouchModel
-from tacpipe.tasks.touch.predictor import Touch
+from tacpipe.tasks.touch.predictor import PredictedReading
 from tests.tasks.touch.handmade import OBJECTS, POINTNET, cloud, grasp, grasps, trained
 
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
@@ -35,7 +35,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TouchModel]:
     return {name: TouchModel.load(trained(tmp_path_factory.mktemp(name), **changed)) for name, changed in KINDS.items()}
 
 
-def flat(touch: Touch) -> np.ndarray:
+def flat(touch: PredictedReading) -> np.ndarray:
     return np.concatenate([[touch.pdc_th, touch.pdc_mf], touch.e_th, touch.e_mf])
 
 

@@ -139,7 +139,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.forward.headline import MODEL
     from tacpipe.tasks.forward.slips import SlipAlarms
-    from tacpipe.tasks.opened import Chain as Stages
+    from tacpipe.tasks.opened import OpenedChain as Stages
     from tacpipe.tasks.opened import opened
 
     forecaster = Forecaster.load(model.files)

@@ -23,18 +23,18 @@ from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.plan import POSE
 from tacpipe.signals.resampling import GAP_NS
-from tacpipe.synchronization.causal import Grid, Rows
+from tacpipe.synchronization.causal import Grid, GridRows
 from tacpipe.tasks.forward import causal, headline
-from tacpipe.tasks.forward.causal import Arm, Plan, Rolling
+from tacpipe.tasks.forward.causal import Arm, PosePlan, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.live.inputs import Layout, plan_table
+from tacpipe.tasks.forward.live.inputs import InputLayout, plan_table
 from tacpipe.tasks.forward.live.plans import Targets, facing
 from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.live.decoding import Columns
+    from tacpipe.live.decoding import BatchColumns
 
 CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
 
@@ -56,7 +56,7 @@ BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class GridForecast:
     """The prediction at one grid point; each grid point has one, also where nothing can be predicted."""
 
     t_ns: int  # time of the grid point; step k is the time t_ns + k * period, on a uniform grid
@@ -103,7 +103,7 @@ class _Row(NamedTuple):
     gaps: tuple[str, ...]
 
 
-class Chain:
+class LiveChain:
     """The stages that a model was trained behind and the model, causally; one a live session, for one thread.
 
     Feed every decoded sample with `push`, and state with `advance` up to when all has come: rows and forecasts of the grid
@@ -115,7 +115,7 @@ class Chain:
         self,
         forecaster: Forecaster,
         steps: Sequence[Mapping[str, Any]],
-        layout: Layout,
+        layout: InputLayout,
         beginning: Beginning | None = None,
         targets: Targets | None = None,
         quantiles: Sequence[int] = (),
@@ -159,7 +159,7 @@ class Chain:
         quantiles: Sequence[int] = (),
         *,
         allow_look_ahead: bool = False,
-    ) -> Chain:
+    ) -> LiveChain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
         ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model; who
@@ -192,7 +192,7 @@ class Chain:
         if plan_from and plan_from not in layouts:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
-        layout = Layout.for_forecaster(forecaster, stages.synchronize, layouts, master)
+        layout = InputLayout.for_forecaster(forecaster, stages.synchronize, layouts, master)
         return cls(forecaster, steps, layout, beginning, targets, quantiles)
 
     @property
@@ -273,7 +273,7 @@ class Chain:
         """
         return {**self._grid.late, **({PLAN: self._late_plans} if self.reads_plan else {})}
 
-    def push(self, stream: str, batch: pa.RecordBatch | pa.Table | Columns) -> None:
+    def push(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> None:
         """Take samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
         if self._targets is not None and stream == self._targets.stream and batch.num_rows:
             self._targets.push(batch)
@@ -292,7 +292,7 @@ class Chain:
         """
         self._push_plans(plan_table(arrived_ns, t_ns, poses))
 
-    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return the forecasts of the grid points up to ``t_ns``: the caller states that all samples up to it were pushed.
 
         A sample or plan with a stamp up to ``t_ns`` that comes later is counted in `late`. With ``newest_only``, for whom
@@ -300,20 +300,20 @@ class Chain:
         """
         self._until_ns = t_ns if self._until_ns is None else max(t_ns, self._until_ns)
         rows = self._grid.rows(t_ns)
-        forecasts: list[Forecast] = []
+        forecasts: list[GridForecast] = []
         if not len(rows.t_ns):
             return forecasts
         with one_thread():
             for index, at_ns in enumerate(rows.t_ns.tolist()):
                 if not rows.has_samples[index]:
-                    forecasts.append(Forecast(at_ns, 0, None, None, Cause.START))
+                    forecasts.append(GridForecast(at_ns, 0, None, None, Cause.START))
                     continue
                 row = self._row(rows, index, at_ns)
                 skipped = newest_only and index < len(rows.t_ns) - 1
                 forecasts.append(self._forecast(row, skipped=skipped))
         return forecasts
 
-    def _row(self, rows: Rows, index: int, t_ns: int) -> _Row:
+    def _row(self, rows: GridRows, index: int, t_ns: int) -> _Row:
         """Return a row of the grid as the model reads it."""
         gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
         newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
@@ -322,13 +322,13 @@ class Chain:
         arm = self._arm.row(t_ns, *layout.placed(values))
         return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
 
-    def _forecast(self, row: _Row, *, skipped: bool) -> Forecast:
+    def _forecast(self, row: _Row, *, skipped: bool) -> GridForecast:
         """Return the forecast of a row, once the rows of the rest are known."""
         if self._resting is not None:
             first = self._resting[0] if self._resting else row
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
                 self._resting.append(row)
-                return Forecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
+                return GridForecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
             self._rest = self._layout.rest_levels(
                 self._stages.contacts, [resting_row.tactile for resting_row in self._resting]
             )
@@ -342,11 +342,11 @@ class Chain:
         cause |= Cause.SKIPPED if skipped and not cause else Cause.NONE
         now = self._rolling.now.astype(np.float32)
         if cause:
-            return Forecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
+            return GridForecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
         ahead, lacking = self._ahead(row.t_ns)
         count = self._rolling.predict(ahead)
         band = self._rolling.band(ahead, count)[..., self._quantiles] if self._quantiles else None
-        return Forecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
+        return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
 
     def _take(self, row: _Row) -> bool:
         """Give a row to the model's window; return whether its values are finite."""
@@ -376,7 +376,7 @@ class Chain:
         if not self._plans or self._plans[0][0] > t_ns:
             return causal.without(t_ns, ahead_ns, now), Cause.NO_PLAN
         rows = np.concatenate(self._plans[0][1])
-        plan = Plan(rows[:, 0].view(np.int64), rows[:, 1:])
+        plan = PosePlan(rows[:, 0].view(np.int64), rows[:, 1:])
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
         return causal.rows(plan, t_ns, ahead_ns, now), cause
 
@@ -392,7 +392,7 @@ class Chain:
         steps_ns: Times = np.rint(np.arange(1, self.horizon + 1) * period_ns).astype(np.int64)
         return steps_ns
 
-    def _push_plans(self, batch: pa.RecordBatch | pa.Table | Columns) -> None:
+    def _push_plans(self, batch: pa.RecordBatch | pa.Table | BatchColumns) -> None:
         """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""
         if not self.reads_plan or not batch.num_rows:
             return

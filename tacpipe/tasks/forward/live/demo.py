@@ -164,7 +164,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
     Raises `TacpipeError` if a command fails.
     """
     _train(output)
-    world = World(SEED, pick_and_move.Rig(effort=EFFORT))
+    world = World(SEED, pick_and_move.PickRig(effort=EFFORT))
     (port,) = free_ports(1)
     sys.setswitchinterval(SWITCH_S)
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:

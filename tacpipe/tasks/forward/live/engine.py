@@ -16,14 +16,14 @@ import numpy as np
 from tacpipe.live import messages
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward.live.alarms import NOTHING_KNOWN, Alarms
-from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
-from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.forward.live.chain import Beginning, Cause, GridForecast
+from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -36,7 +36,7 @@ STARTING_S = 0.005  # wait between two tries while the grid is unknown
 
 
 class CausalChain(Protocol):
-    """The part of `tacpipe.tasks.forward.live.chain.Chain` that an engine uses."""
+    """The part of `tacpipe.tasks.forward.live.chain.LiveChain` that an engine uses."""
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ class CausalChain(Protocol):
     def push(self, stream: str, batch: Any) -> None:
         """Take samples."""
 
-    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return the forecasts up to a time, on request of the newest grid point alone."""
 
 
@@ -127,10 +127,10 @@ class ForecastEngine(Engine):
         """The state that another process needs to continue this recording."""
         return self.chain.beginning
 
-    def describe(self, model: str) -> Description:
+    def describe(self, model: str) -> ForecastDescription:
         """Return what the values of messages are."""
         chain = self.chain
-        return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
+        return ForecastDescription(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
 
     def ready(self) -> dict[str, Any]:
         """Return how many channels are predicted, and the levels of the alarms."""
@@ -160,7 +160,7 @@ class ForecastEngine(Engine):
         self._begun.add(stream)
         self._decoders[stream] = Decoder(self.sensors[stream])
 
-    def take_note(self, stream: str, note: Note) -> None:
+    def take_note(self, stream: str, note: StreamNote) -> None:
         """Take a note on a stream; bytes that were lost go to its decoder."""
         super().take_note(stream, note)
         if note.what != BEGAN:
@@ -170,7 +170,7 @@ class ForecastEngine(Engine):
         """Keep bytes of a stream that the chain reads; before a recording, find out which columns the stream has."""
         self._keep(stream, chunks)
 
-    def _keep(self, stream: str, block: Chunks | Note) -> None:
+    def _keep(self, stream: str, block: Chunks | StreamNote) -> None:
         if stream in self.chain.streams or stream == PLAN or stream not in self._first:
             self._decoders[stream].take(block)
         if not self.running and stream not in self._first:
@@ -185,7 +185,7 @@ class ForecastEngine(Engine):
             return now_ns + round(STARTING_S * 1e9) // 5
         return max(due_ns - EARLY_NS, now_ns) if due_ns - EARLY_NS - now_ns > LITTLE_NS else due_ns
 
-    def step(self, now_ns: int) -> list[Message]:
+    def step(self, now_ns: int) -> list[ForecastMessage]:
         """Return the message that is due: the newest forecast, or that there has been none for `PERIODS`.
 
         Before a row is due what came is decoded, and nothing returned.
@@ -228,7 +228,7 @@ class ForecastEngine(Engine):
                 for batch in decoder.batches():
                     self.chain.push(name, decoder.columns(batch, offset_ns))
 
-    def _message(self, forecast: Forecast, now_ns: int) -> Message:
+    def _message(self, forecast: GridForecast, now_ns: int) -> ForecastMessage:
         values, levels, states = None, None, dict(NOTHING_KNOWN)
         if forecast.count is not None and forecast.now is not None:
             published_rows = [step - 1 for step in self.steps]
@@ -236,7 +236,7 @@ class ForecastEngine(Engine):
             if forecast.quantiles is not None:
                 levels = np.ascontiguousarray(forecast.quantiles[published_rows].transpose(2, 0, 1), dtype=np.float32)
             states = self.alarms.states(forecast.count, forecast.now, self.chain.layout)
-        return Message(
+        return ForecastMessage(
             self.next_seq(),
             forecast.t_ns,
             values,
@@ -249,7 +249,7 @@ class ForecastEngine(Engine):
             quantiles=levels,
         )
 
-    def _silence(self, now_ns: int) -> list[Message]:
+    def _silence(self, now_ns: int) -> list[ForecastMessage]:
         """Return a message without a forecast where there was none for too long."""
         assert self._offset_ns is not None
         if self._last_ns is None:
@@ -266,7 +266,9 @@ class ForecastEngine(Engine):
         reasons = [self._why] if self._why else []
         reasons += [f"nothing comes from {', '.join(silent)}"] if silent else []
         cause = "; ".join(reasons) or "no row is complete"
-        message = Message(self.next_seq(), now_ns + self._offset_ns, None, cause, skipped=self.skipped, late=self.late)
+        message = ForecastMessage(
+            self.next_seq(), now_ns + self._offset_ns, None, cause, skipped=self.skipped, late=self.late
+        )
         message.levels = self.quantiles
         return [message]
 
@@ -286,7 +288,7 @@ class ForecastEngine(Engine):
         return {name: Decoder(sensor) for name, sensor in self.sensors.items()}
 
 
-def words(forecast: Forecast) -> str:
+def words(forecast: GridForecast) -> str:
     """Return the cause of a forecast in words.
 
     >>> words(Forecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))

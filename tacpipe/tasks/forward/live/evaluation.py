@@ -29,7 +29,7 @@ from tacpipe.tasks.forward.alarms import loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
-from tacpipe.tasks.forward.live.chain import Chain, Forecast
+from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.slips import Leads, events, leads
@@ -149,8 +149,8 @@ def _offline(forecaster: Forecaster, track: Track) -> _Offline:
 
 def _errors(
     forecaster: Forecaster,
-    chain: Chain,
-    recomputed: Sequence[Forecast],
+    chain: LiveChain,
+    recomputed: Sequence[GridForecast],
     session: Published,
     track: Track,
     predicted: _Offline,
@@ -307,7 +307,7 @@ class Published:
         """Return values and quantiles (row, step + level x step, channel)."""
         return np.concatenate([self.values, self.quantiles], axis=1)
 
-    def matching_rows(self, forecasts: Sequence[Forecast]) -> Float32s:
+    def matching_rows(self, forecasts: Sequence[GridForecast]) -> Float32s:
         """Return the same of other forecasts, which all have values and as many quantiles as were published."""
         places = [step - 1 for step in self.steps]
         rows: list[Float32s] = []

@@ -14,7 +14,7 @@ from tacpipe.channels.schema import time_field
 from tacpipe.channels.streams import EVENTS, axes_of
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
-from tacpipe.live.decoding import Columns
+from tacpipe.live.decoding import BatchColumns
 from tacpipe.printable import listed
 from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tared
@@ -63,7 +63,7 @@ def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
 
 
 @dataclass(frozen=True)
-class Layout:
+class InputLayout:
     """The places of a forecaster's inputs in the samples of a rig's streams."""
 
     master: str
@@ -85,7 +85,7 @@ class Layout:
     @classmethod
     def for_forecaster(
         cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = ""
-    ) -> Layout:
+    ) -> InputLayout:
         """Return where inputs are in streams of these schemas, by the params of the model's `synchronize`.
 
         Raises `TacpipeError` where a stream or a channel is absent, or is another than the model's.
@@ -158,7 +158,7 @@ class Layout:
             poses.metres(grid.field(opening)) if opening else 1.0,
         )
 
-    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | Columns) -> tuple[Times, Floats]:
+    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> tuple[Times, Floats]:
         """Return stamps (time,) and the columns that are read (time, column) of a batch of a stream.
 
         Raises `TacpipeError` where a column is absent.
@@ -173,7 +173,7 @@ class Layout:
             self._places[stream] = place
         first, *value_columns = place[1]
         t_ns = _array(batch.column(first)).astype(np.int64, copy=False)
-        if isinstance(batch, Columns):
+        if isinstance(batch, BatchColumns):
             return t_ns, batch.columns_of(tuple(value_columns))
         values = np.empty((batch.num_rows, len(value_columns)))
         for index, number in enumerate(value_columns):

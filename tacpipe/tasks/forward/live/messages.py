@@ -12,7 +12,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Float32s
 from tacpipe.live import messages
 from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values, rounded
-from tacpipe.sensors.live import LSL, Column, Declaration, MessageSizes, Value, latency_values
+from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 from tacpipe.tasks.forward.live.alarms import NAMES, NOTHING_KNOWN, State
 
 FORECAST, ALARM = "forecast", "alarm"  # recorded streams
@@ -20,24 +20,24 @@ MATRIX = {"type": "array", "items": {"type": "array", "items": {"type": "number"
 QUANTILES: frozenset[str] = frozenset({"quantiles"})
 
 
-def _value_columns(sizes: MessageSizes) -> list[Column]:
+def _value_columns(sizes: MessageSizes) -> list[LiveColumn]:
     return [
-        Column(f"{channel}_t{step}", sizes.unit, {"step": str(step)})
+        LiveColumn(f"{channel}_t{step}", sizes.unit, {"step": str(step)})
         for step in sizes.steps
         for channel in sizes.channels
     ]
 
 
-def _quantile_columns(sizes: MessageSizes) -> list[Column]:
+def _quantile_columns(sizes: MessageSizes) -> list[LiveColumn]:
     return [
-        Column(f"{name}_q{level}", unit, {**metadata, "quantile": f"{level / 100:g}"})
+        LiveColumn(f"{name}_q{level}", unit, {**metadata, "quantile": f"{level / 100:g}"})
         for level in sizes.quantiles
         for name, unit, metadata in _value_columns(sizes)
     ]
 
 
-def _alarm_columns(suffix: str, sizes: MessageSizes) -> list[Column]:
-    return [Column(f"{alarm}_{suffix}") for alarm in sizes.alarms]
+def _alarm_columns(suffix: str, sizes: MessageSizes) -> list[LiveColumn]:
+    return [LiveColumn(f"{alarm}_{suffix}") for alarm in sizes.alarms]
 
 
 DECLARATION = Declaration(
@@ -94,7 +94,7 @@ DECLARATION = Declaration(
 
 
 @dataclass
-class Message(messages.Message):
+class ForecastMessage(messages.Message):
     """A forecast with its alarms, or why there is none."""
 
     seq: int
@@ -159,7 +159,7 @@ class Message(messages.Message):
 
 
 @dataclass(frozen=True)
-class Description(messages.Description):
+class ForecastDescription(messages.Description):
     """Describes the values of forecasts."""
 
     channels: tuple[str, ...]

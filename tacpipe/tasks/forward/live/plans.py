@@ -22,7 +22,7 @@ from tacpipe.links.link import Address
 from tacpipe.models.windows import POSE
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.recording import rig as rigs
-from tacpipe.recording.rig import Rig, Stream
+from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.signals import kinematics
@@ -54,7 +54,7 @@ def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
         )
     if scheme == "udp":
         place = _guarded(place, sender)
-    stream = Stream(PLAN, "plan", rigs.build_sensor("plan", {}, "--plan"), Address(scheme, place))
+    stream = RigStream(PLAN, "plan", rigs.build_sensor("plan", {}, "--plan"), Address(scheme, place))
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
 

@@ -14,7 +14,7 @@ from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, Chain, Forecast
+from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, GridForecast, LiveChain
 from tacpipe.tasks.forward.prediction import check_steps, prediction_table
 
 if TYPE_CHECKING:
@@ -111,19 +111,19 @@ def chain_of(
     quantiles: Sequence[int] = (),
     *,
     allow_look_ahead: bool = False,
-) -> Chain:
+) -> LiveChain:
     """Return the chain of a model for the streams ``tables`` of a recording, with the master and source of plans that it
     names; all else is as in `Chain.for_model`."""
     schemas = {name: table.schema for name, table in tables.items()}
     plan = str(recording.attributes.get("live_plan", ""))
     source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     master, source = str(recording.attributes.get("master", "")), source if source in schemas else ""
-    return Chain.for_model(
+    return LiveChain.for_model(
         forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles, allow_look_ahead=allow_look_ahead
     )
 
 
-def replayed(chain: Chain, tables: Mapping[str, pa.Table]) -> Iterator[Forecast]:
+def replayed(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
     """Yield the forecasts of a recording's streams, which are given to ``chain`` as they arrived, some at a time."""
     stamps = {
         name: tables[name].column("t_ns").to_numpy()

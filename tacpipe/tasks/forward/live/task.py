@@ -114,13 +114,13 @@ class ForwardLive(LiveTask):
         """Return the engine with the model's causal chain, which has made its first forecast."""
         from tacpipe.tasks.forward.forecaster import Forecaster
         from tacpipe.tasks.forward.live import plans
-        from tacpipe.tasks.forward.live.chain import Chain
+        from tacpipe.tasks.forward.live.chain import LiveChain
         from tacpipe.tasks.forward.live.engine import ForecastEngine
 
         own_settings = _own(settings)
         forecaster = Forecaster.load(model.files)
         open_chain = functools.partial(
-            Chain.for_model,
+            LiveChain.for_model,
             forecaster,
             model.source.chain,
             master=rig.master,

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import MODEL, Method, Question, Run
+from tacpipe.comparison.engine import Comparison, ComparisonRow
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Question
 from tacpipe.comparison.specification import Kind, TaskReport
 from tacpipe.metrics import pairing
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
-from tacpipe.report.charts import Line
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, Table, fold, number, table
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
@@ -33,7 +33,7 @@ class ForwardReport(TaskReport):
 
     title = "forecasts of tactile signals"
 
-    def read(self, results: Sequence[Dataset]) -> list[Run]:
+    def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that hold error sums of recordings which the model has not seen."""
         return methods.read_runs(results)
 
@@ -49,7 +49,9 @@ class ForwardReport(TaskReport):
         """Return whether a dataset is of ``tacpipe compress``, whose losses are drawn next to the errors of forecasts."""
         return representations.CODEC_FILE in dataset.files
 
-    def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
+    def columns(
+        self, context: Context, comparison: Comparison
+    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return the skill by step and errors with channels in other units."""
         return columns(context, comparison)
 
@@ -61,7 +63,7 @@ class ForwardReport(TaskReport):
         """Return what must be known about the numbers."""
         return caveats(context)
 
-    def run_columns(self, run: Run) -> dict[str, str | Cell]:
+    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
         return run_columns(run)
 
@@ -91,23 +93,23 @@ def folds(context: Context) -> list[Fold]:
     ]
 
 
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
     """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
     steps, known_objects = _steps(context), _known(comparison.question)
     unit = comparison.measure.unit
 
     @functools.cache
-    def skills(row: Row, group: str) -> Interval | None:
+    def skills(row: ComparisonRow, group: str) -> Interval | None:
         sums = skill.sums_of_row(row, steps, known_objects, group)
         return skill.skill_intervals(sums) if sums else None
 
-    def squared(group: str) -> Callable[[Row], Cell]:
+    def squared(group: str) -> Callable[[ComparisonRow], Cell]:
         return lambda row: number(skill.mean_squared(skill.sums_of_row(row, _all_steps(context), known_objects, group)))
 
-    def at(place: int) -> Callable[[Row], Cell]:
+    def at(place: int) -> Callable[[ComparisonRow], Cell]:
         return lambda row: skill.skill_cell(skills(row, "both"), place)
 
-    def windows(row: Row) -> Cell:
+    def windows(row: ComparisonRow) -> Cell:
         counts: dict[str, int] = {}
         for run in row.method.of(comparison.question):
             errors = run.details.errors
@@ -175,7 +177,7 @@ def _look_ahead(context: Context) -> list[str]:
     ]
 
 
-def run_columns(run: Run) -> dict[str, Cell | str]:
+def run_columns(run: ComparedRun) -> dict[str, Cell | str]:
     """Return more columns of the table of runs."""
     epochs = len(run.details.history)
     return {"epochs": str(epochs) if epochs else NONE}
@@ -196,7 +198,7 @@ def _ahead(context: Context) -> list[Fold]:
         for row in rows:
             interval = skill.skill_intervals(skill.sums_of_row(row, steps, _known(comparison.question)))
             mean, low, high = (getattr(interval, name)[:-1] for name in ("mean", "low", "high"))
-            lines.append(Line(row.name, x, mean, low, high, dashed=row.kind != "model"))
+            lines.append(Curve(row.name, x, mean, low, high, dashed=row.kind != "model"))
             cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
         caption = "Bands: 95 % intervals over recordings. Dashed: a baseline. Click a name to show it alone."
         caption += f" Ends at {blocks.signed(FLOOR, 1)}, above some of {blocks.listed(cut)}." if cut else ""
@@ -208,7 +210,7 @@ def _ahead(context: Context) -> list[Fold]:
     return fold("By time ahead", Charts(drawn)) if drawn else []
 
 
-def _shown(context: Context, comparison: Comparison) -> list[Row]:
+def _shown(context: Context, comparison: Comparison) -> list[ComparisonRow]:
     rows = comparison.models[:LINES]
     paper_row = context.row(comparison, figures.paper_representative(context))
     rows += [paper_row] if paper_row and paper_row not in rows else []
@@ -254,7 +256,7 @@ def _channels(context: Context) -> list[Fold]:
             *(f"skill {step}" for step in ahead),
         ]
         tables += [table(comparison.question.where, heads, rows)] if rows else []
-    note = Note("Skill is over persistence here.")
+    note = SmallPrint("Skill is over persistence here.")
     return fold("By sensor and axis", *tables, note)
 
 
@@ -263,7 +265,7 @@ def _ablations(context: Context) -> list[Fold]:
     steps = _steps(context)
     parts = list(dict.fromkeys(_known(comparison.question) for comparison in context.comparisons))
     tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
-    note = Note(
+    note = SmallPrint(
         "Differences are paired: both are on the same recordings. An interval above 0 shows that the plan helps."
     )
     return fold("What the plan and the timeline change", *tables, note)

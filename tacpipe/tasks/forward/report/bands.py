@@ -12,14 +12,14 @@ from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics import intervals
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, fold, number, table
-from tacpipe.report.charts import Line
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import PARTS
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
-    from tacpipe.comparison.runs import Run
+    from tacpipe.comparison.runs import ComparedRun
 
 COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
 NAMES = {
@@ -66,7 +66,7 @@ def band_folds(context: Context) -> list[Fold]:
 Sums = Mapping[str, dict[str, "AnyFloats"]]  # recording -> covered, width, pinball and values, each (step,)
 
 
-def _band_sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
+def _band_sums(runs: Sequence[ComparedRun]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
     """Return the sums of recordings that were not seen, by predictor, whether the object is known, and recording."""
     sums: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
     for run in runs:
@@ -95,7 +95,7 @@ def _coverage_chart(title: str, sums: Mapping[str, Mapping[str, Mapping[str, Any
         interval = intervals.share_interval(_sums_for(sums[name], "covered"), _sums_for(sums[name], "values"))
         low, high = (np.where(np.isnan(ends), interval.mean, ends) for ends in (interval.low, interval.high))
         steps = np.arange(1.0, len(low) + 1)
-        lines.append(Line(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
+        lines.append(Curve(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
     spec = charts.lines(lines, "rows ahead", "coverage", level=("asked for", level))
     return Chart(f"Coverage: {title}", spec)
 
@@ -119,7 +119,7 @@ def _coverage_rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyF
     return rows
 
 
-def _example_charts(run: Run) -> list[Chart]:
+def _example_charts(run: ComparedRun) -> list[Chart]:
     """Return a forecast with its band of each recording that the evaluation kept, next to what was measured."""
     drawn = []
     for example in json.loads(run.details.dataset.files[EXAMPLES]):
@@ -127,8 +127,8 @@ def _example_charts(run: Run) -> list[Chart]:
         low, middle, high = (example[levels[at][1]] for at in (0, len(levels) // 2, -1))
         time_s = np.array(example["t_s"]) - example["t_s"][0]
         lines = [
-            Line("measured", time_s, example["measured"]),
-            Line(f"predicted {example['step']} rows before", time_s, middle, low, high, dashed=True),
+            Curve("measured", time_s, example["measured"]),
+            Curve(f"predicted {example['step']} rows before", time_s, middle, low, high, dashed=True),
         ]
         spec = charts.lines(
             lines, "time (s)", f"{headline.unit_of_model(run.details.config)} above rest", points=False, height=190

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import MODEL, Method, Run
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.report.blocks import NONE, Cell, Fold, Table, fixed, fold, notes, number, table
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward.report.figures import predictor_title
@@ -136,7 +136,7 @@ def live_folds(context: Context) -> list[Fold]:
     return live_parts
 
 
-def _live_tables(run: Run, live: Mapping[str, Any]) -> list[Table]:
+def _live_tables(run: ComparedRun, live: Mapping[str, Any]) -> list[Table]:
     steps = sorted(next(iter(live["mae"].values()), {}), key=lambda step: int(step.removeprefix("t")))
     errors: list[Cells] = [
         [LIVE_NAMES.get(name, name), *(number(by_step[step]) for step in steps)]

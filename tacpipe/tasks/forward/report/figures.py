@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.comparison.runs import MODEL, Method, Run
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import Cell, Chart, Charts, Fold, Note, Table, counted, fold, number, table
-from tacpipe.report.charts import Line
+from tacpipe.report.blocks import Cell, Chart, Charts, Fold, SmallPrint, Table, counted, fold, number, table
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, Tree, loss_chart, median_run
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.report import methods
@@ -39,13 +39,13 @@ EXPLAINED = {
 }
 
 
-def run_folds(method: str, run: Run) -> list[Fold]:
+def run_folds(method: str, run: ComparedRun) -> list[Fold]:
     """Return the errors of a run of a method; nothing where the result holds no errors by step."""
     metrics, unit = run.details.metrics, headline.unit_of_model(run.details.config)
     names = _ordered_predictors(metrics)
     if not names:
         return []
-    notes = [Note(text) for text in (_describe_floor(metrics, unit), _describe_seen(metrics)) if text]
+    notes = [SmallPrint(text) for text in (_describe_floor(metrics, unit), _describe_seen(metrics)) if text]
     return fold(
         f"In full: {method}",
         *notes,
@@ -60,12 +60,12 @@ def predictor_title(predictor: str) -> str:
     return predictor.replace("_", " ")
 
 
-def _rmse_charts(run: Run, names: Sequence[str], unit: str) -> list[Chart]:
+def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Chart]:
     metrics, rate_hz = run.details.metrics, float(run.details.config.get("rate_hz") or 0)
     steps = sorted(int(name[1:]) for name in _both_groups(metrics[names[0]]["mse_counts"]) if name != "mean")
     x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
     lines = [
-        Line(
+        Curve(
             predictor_title(name),
             x,
             [float(np.sqrt(_both_groups(metrics[name]["mse_counts"])[f"t{step}"])) for step in steps],
@@ -224,8 +224,8 @@ def draw_traces(
     drawn = []
     for latent in (latent_names[index] for index in latents if index < len(latent_names)):
         ahead = [step for step in steps if f"{latent}_t{step}" in table.column_names]
-        lines = [Line(TRUTH, time_s, values(latent))]
-        lines += [Line(f"t+{step}", time_s, values(f"{latent}_t{step}"), dashed=True) for step in ahead]
+        lines = [Curve(TRUTH, time_s, values(latent))]
+        lines += [Curve(f"t+{step}", time_s, values(f"{latent}_t{step}"), dashed=True) for step in ahead]
         quantity = f"{latent} ({unit})" if unit else latent
         spec = charts.lines(lines, "time at which the prediction is known (s)", quantity, points=False, height=170)
         drawn.append(Chart(f"{title}: {latent}", spec, caption, wide=True))
@@ -241,7 +241,7 @@ def paper_representative(context: Context) -> Method | None:
     return methods.paper_method(context.methods) if context.published else None
 
 
-def _representatives(context: Context) -> list[tuple[Method, Run]]:
+def _representatives(context: Context) -> list[tuple[Method, ComparedRun]]:
     """Return a median run of the best method of the last part, and of the paper's: those that are shown singly."""
     compared = [candidate for candidate in context.comparisons if candidate.best]
     last = next(
@@ -276,10 +276,12 @@ def prediction_folds(context: Context) -> list[Fold]:
             drawn += draw_traces(
                 run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption, unit=_unit_of_run(run)
             )
-    return fold("Predictions next to the truth", *drawn, *_paper_traces(context), Note(UNSHIFTED) if drawn else None)
+    return fold(
+        "Predictions next to the truth", *drawn, *_paper_traces(context), SmallPrint(UNSHIFTED) if drawn else None
+    )
 
 
-def _unit_of_run(run: Run) -> str:
+def _unit_of_run(run: ComparedRun) -> str:
     """Return the unit of the latents of a run: that of the channels where they are not compressed, else none."""
     config = run.details.config
     return headline.unit_of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
@@ -311,7 +313,7 @@ def _paper_traces(context: Context) -> list[Chart]:
     return drawn
 
 
-def ranked_trials(run: Run) -> list[tuple[float, str]]:
+def ranked_trials(run: ComparedRun) -> list[tuple[float, str]]:
     """Return skill and name of the recordings that the model has not seen, of the predictions that a result holds."""
     text = run.dataset.files.get("trials.csv", b"").decode()
     return sorted(

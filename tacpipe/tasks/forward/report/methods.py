@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
 from tacpipe.comparison.specification import Kind
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
@@ -135,7 +135,7 @@ _NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are f
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 
-class Result(context.Result):
+class ForwardResult(context.ReportResult):
     """One result of forecasts."""
 
     STAGE = "train.forward"
@@ -185,7 +185,7 @@ def has_error_sums(dataset: Dataset) -> bool:
     return all(name in dataset.files for name in ("metrics.json", "config.json", ERRORS_FILE))
 
 
-def main_timeline(runs: Sequence[Result]) -> str:
+def main_timeline(runs: Sequence[ForwardResult]) -> str:
     """Return the timeline of most runs; where two have as many, the last in the alphabet, which puts uniform first."""
     count = Counter(run.timeline for run in runs)
     return max(count, key=lambda name: (count[name], name))
@@ -235,9 +235,9 @@ def _distance(method: Method) -> tuple[int, int, int, str]:
 ORACLES = ("codec", "codec_anchored")  # of what knows the true future
 
 
-def read_runs(results: Sequence[Dataset]) -> list[Run]:
+def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     """Return the runs of results that hold error sums of recordings which the model has not seen."""
-    all_results = [Result(result) for result in drop_duplicates(results) if has_error_sums(result)]
+    all_results = [ForwardResult(result) for result in drop_duplicates(results) if has_error_sums(result)]
     runs = [result for result in all_results if result.errors.recordings]
     if not runs:
         return []
@@ -277,13 +277,13 @@ def name_with_codec(predictor: str, codec: str) -> str:
     return f"{predictor} {codec}" if predictor.startswith("codec") else predictor
 
 
-def shown_steps(runs: Sequence[Result]) -> tuple[int, ...]:
+def shown_steps(runs: Sequence[ForwardResult]) -> tuple[int, ...]:
     """Return the steps to report on, those that all runs predict."""
     return headline.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
 def sums_by_recording(
-    run: Result, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
+    run: ForwardResult, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
 ) -> dict[str, AnyFloats]:
     """Return what `headline.sums` adds up, by recording; empty where a predictor has no errors in a group of channels."""
     errors = run.errors
@@ -302,7 +302,7 @@ def sums_by_recording(
     }  # fmt: skip
 
 
-def object_clusters(run: Result, known_objects: bool | None) -> dict[str, str] | None:
+def object_clusters(run: ForwardResult, known_objects: bool | None) -> dict[str, str] | None:
     """Return the object of each recording of unseen objects, which is what chance draws there; None of other recordings."""
     errors = run.errors
     if known_objects is not False or not errors.objects:
@@ -310,7 +310,7 @@ def object_clusters(run: Result, known_objects: bool | None) -> dict[str, str] |
     return {name: errors.objects.get(name, name) for name in errors.recordings}
 
 
-def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
+def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
     config = run.config
     elsewhere = run.timeline != usual
     timeline = f"{run.timeline} timeline" if elsewhere else ""
@@ -326,10 +326,10 @@ def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
             objects = object_clusters(run, known_objects)
             cluster = headline.OBJECTS if objects else headline.RECORDINGS
             measure = headline.measure(steps, headline.unit_of_model(config), cluster)
-            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = Errors(
+            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = PredictorErrors(
                 measure, by_predictor, objects
             )
-    return Run(
+    return ComparedRun(
         run.dataset,
         headline.TASK,
         run.name(usual),

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import MODEL, Method, Run, Spread, spread
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Spread, spread
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
-from tacpipe.report.charts import Line
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, Table, fold, number, table
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, Tree, is_published
 from tacpipe.tasks.forward.report import methods
 
@@ -25,7 +25,7 @@ CODEC_FILE = "codec.json"
 
 
 @dataclass(frozen=True)
-class Loss:
+class CodecLoss:
     """What codecs of one kind and width lose on the way to latents and back, the mean over the codecs."""
 
     series: str  # kind and class: PCA, AE-C1, …
@@ -52,7 +52,7 @@ def codec_series(codec: Tree) -> str:
     return name if codec.get("of", "levels") == "levels" else f"{name} {codec['of']}"
 
 
-def codec_losses(codecs: Sequence[Tree]) -> list[Loss]:
+def codec_losses(codecs: Sequence[Tree]) -> list[CodecLoss]:
     """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
     part = (
         "val"
@@ -69,7 +69,7 @@ def codec_losses(codecs: Sequence[Tree]) -> list[Loss]:
             measure: float(np.mean([loss_tree[part][measure] for loss_tree in described]))
             for measure in ("mse_standardised", "mae_counts")
         }
-        mean_losses.append(Loss(name, latents, len(described), part, **errors))
+        mean_losses.append(CodecLoss(name, latents, len(described), part, **errors))
     return mean_losses
 
 
@@ -110,21 +110,21 @@ def representation_folds(context: Context) -> list[Fold]:
     """Return the recurrent model on each representation, and codecs' variance, covariance and loss."""
     codecs = read_codecs([*(run.dataset for run in context.runs), *context.others])
     published = context.published or (
-        not context.runs and all(is_published(result, methods.Result.SETS) for result in context.bare)
+        not context.runs and all(is_published(result, methods.ForwardResult.SETS) for result in context.bare)
     )
     method_table = _representation_table(context) if context.runs else None
     note = OWN_SPACE + (
         " The paper's own recordings are not public; its numbers are as printed." if context.published else ""
     )
     return fold(
-        "Representations", method_table, Note(note) if method_table else None, *_codec_charts(codecs, published)
+        "Representations", method_table, SmallPrint(note) if method_table else None, *_codec_charts(codecs, published)
     )
 
 
 def represent_method(method: Method) -> Representation | None:
     """Return a method's errors in its own scaled space; None where the results do not state them."""
 
-    def error(run: Run, predictor: str, known_objects: bool | None = None) -> float | None:
+    def error(run: ComparedRun, predictor: str, known_objects: bool | None = None) -> float | None:
         steps = run.details.errors.steps
         error_sums = list(methods.sums_by_recording(run.details, predictor, steps, known_objects, "feature").values())
         total = np.sum(error_sums, axis=0) if error_sums else None
@@ -229,7 +229,7 @@ def _codec_charts(codecs: Sequence[Tree], published: bool) -> list[Charts | Tabl
         series.setdefault(share.series, {})[share.latents] = share.mse_standardised
     if any(len(widths) > 1 for widths in series.values()):
         lines = [
-            Line(name, sorted(by_width), [by_width[width] for width in sorted(by_width)])
+            Curve(name, sorted(by_width), [by_width[width] for width in sorted(by_width)])
             for name, by_width in sorted(series.items())
         ]
         caption = "Error of encoding and decoding, where 1 is what no latent at all would give. Lower is better."

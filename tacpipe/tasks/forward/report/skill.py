@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.comparison.engine import Row
+from tacpipe.comparison.engine import ComparisonRow
 from tacpipe.comparison.runs import MODEL, Method
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell, Fold, Note, fold, interval, number, table
+from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint, fold, interval, number, table
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward.headline import BASELINE, Parts
 from tacpipe.tasks.forward.report import methods
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacpipe.metrics.pairing import Sums
 
 
-def sums_of_row(row: Row, steps: Sequence[int], known_objects: bool | None, group: str = "both") -> Sums:
+def sums_of_row(row: ComparisonRow, steps: Sequence[int], known_objects: bool | None, group: str = "both") -> Sums:
     """Return the sums of a row's predictor at some steps in a group of channels, by seed and recording."""
     return sums_of_method(row.method, row.predictor.split(" ")[0], steps, known_objects, group)
 
@@ -103,7 +103,7 @@ def situation_folds(context: Context) -> list[Fold]:
     heads = ["situation", "method", "windows", "of persistence's error", "MAE of persistence", "MAE", "skill"]
     if not rows:
         return []
-    return fold("By situation", table("Errors by what the hand does", heads, rows), Note(SITUATION_NOTE))
+    return fold("By situation", table("Errors by what the hand does", heads, rows), SmallPrint(SITUATION_NOTE))
 
 
 def skill_in_situation(method: Method, situation: str) -> dict[str, float] | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.live.decoding import Decoder, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
 from tacpipe.live.messages import Message
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -117,7 +117,7 @@ class MaterialEngine(Engine):
         """Take note that nothing more of a stream belongs to the recording."""
         self._over.add(stream)
 
-    def take_note(self, stream: str, note: Note) -> None:
+    def take_note(self, stream: str, note: StreamNote) -> None:
         """Take a note on a stream; bytes that were lost go to its decoder."""
         super().take_note(stream, note)
         if note.what not in (BEGAN, OVER):
@@ -127,7 +127,7 @@ class MaterialEngine(Engine):
         """Keep bytes of a stream that is not over."""
         self._keep(stream, chunks)
 
-    def _keep(self, stream: str, block: Chunks | Note) -> None:
+    def _keep(self, stream: str, block: Chunks | StreamNote) -> None:
         if stream in self._decoders and stream not in self._over:
             self._decoders[stream].take(block)
 

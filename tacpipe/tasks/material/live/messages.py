@@ -12,7 +12,7 @@ import numpy as np
 from tacpipe.arrays import Float32s
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values
-from tacpipe.sensors.live import LSL, Column, Declaration, MessageSizes, Value, latency_values
+from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 WAITING, SLIDING, ENDED, FINAL = "waiting", "sliding", "ended", "final"  # states of a slide
 MATERIAL = "material"  # the recorded stream
@@ -20,8 +20,8 @@ RECORDED = (MATERIAL, LSL)
 LEAST_SEEN = 0.25  # default of the fraction of a slide before which its material is unknown
 
 
-def _probability_columns(sizes: MessageSizes) -> list[Column]:
-    return [Column(f"probability_{name}", "1", {"material": name}) for name in sizes.channels]
+def _probability_columns(sizes: MessageSizes) -> list[LiveColumn]:
+    return [LiveColumn(f"probability_{name}", "1", {"material": name}) for name in sizes.channels]
 
 
 DECLARATION = Declaration(

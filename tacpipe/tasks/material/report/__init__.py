@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Method, Run
+from tacpipe.comparison.engine import Comparison, ComparisonRow
+from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.comparison.specification import Kind, TaskReport
 from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell, Fold, Note
+from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint
 from tacpipe.report.context import Context
 from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.report import figures, joint, methods, scores, uncertainty
@@ -26,7 +26,7 @@ class MaterialReport(TaskReport):
     title = "recognition of materials by touch"
     usual = methods.USUAL
 
-    def read(self, results: Sequence[Dataset]) -> list[Run]:
+    def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that hold predictions of slides which the model has not seen."""
         return methods.read_runs(results)
 
@@ -42,7 +42,9 @@ class MaterialReport(TaskReport):
         """Return whether a dataset holds slides, which are drawn."""
         return figures.holds_slides(dataset)
 
-    def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
+    def columns(
+        self, context: Context, comparison: Comparison
+    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return counts, the last epoch, the skill over the mean level and the numbers of the paper."""
         return columns(context, comparison)
 
@@ -54,7 +56,7 @@ class MaterialReport(TaskReport):
         """Return what must be known about the numbers."""
         return caveats(context)
 
-    def run_columns(self, run: Run) -> dict[str, str | Cell]:
+    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
         return joint.run_columns(run)
 
@@ -72,10 +74,10 @@ def folds(context: Context) -> list[Fold]:
     return [
         *blocks.fold(
             "Joint learning",
-            *map(Note, joint.joint_effects(methods)),
+            *map(SmallPrint, joint.joint_effects(methods)),
             joint.difference_table(methods),
             joint.swap_table(methods),
-            Note(PAIRED),
+            SmallPrint(PAIRED),
         ),
         *blocks.fold("Fewer slides of one sensor", *joint.reduction_tables(methods)),
         *figures.few_slides_folds(methods),
@@ -88,7 +90,7 @@ def folds(context: Context) -> list[Fold]:
     ]
 
 
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
     """Return more columns of the table of all methods: counts, the last epoch, skill over the mean level, the paper's."""
     runs = [run for run in context.runs if comparison.question in run.questions]
     sensors = (
@@ -96,22 +98,22 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
     )
     sensor = next(sensors)
 
-    def runs_of(row: Row) -> list[Run]:
+    def runs_of(row: ComparisonRow) -> list[ComparedRun]:
         return row.method.of(comparison.question)
 
-    def named_right(row: Row) -> Cell:
+    def named_right(row: ComparisonRow) -> Cell:
         counted = row.predictor != headline.CHANCE  # chance names no material
         return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
 
-    def last(row: Row) -> Cell:
+    def last(row: ComparisonRow) -> Cell:
         counted = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
         return Cell(scores.format_percent(counted.fraction), value=counted.fraction) if counted else Cell(NONE)
 
-    def paper(row: Row) -> Cell:
+    def paper(row: ComparisonRow) -> Cell:
         value = joint.ACCURACIES.get(row.family, {}).get(sensor) if row.kind == "model" else None
         return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
 
-    more_columns: list[tuple[str, Callable[[Row], Cell]]] = [
+    more_columns: list[tuple[str, Callable[[ComparisonRow], Cell]]] = [
         ("slides named right", named_right),
         (
             "skill over the mean level",

@@ -12,12 +12,12 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Ints
 from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import Chart, Charts, Fold, Note, counted, fold, form, listed
-from tacpipe.report.charts import Line
+from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, counted, fold, form, listed
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, curves_of_methods, is_published, loss_chart, without_gaps
 from tacpipe.tasks.material.report import scores
 from tacpipe.tasks.material.report.methods import (
-    Result,
+    MaterialResult,
     has_usual_settings,
     method_title,
     ordered_sensors,
@@ -25,7 +25,7 @@ from tacpipe.tasks.material.report.methods import (
     sensor_title,
     sensors_of,
 )
-from tacpipe.tasks.material.report.predictions import MODEL, NOTHING, Predictions
+from tacpipe.tasks.material.report.predictions import MODEL, NOTHING, SlidePredictions
 from tacpipe.tasks.material.report.scores import accuracy
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def confusion_folds(context: Context) -> list[Fold]:
         best = compared.best.method if compared and compared.best else None
         chosen = dict.fromkeys(method for method in (best, joint) if method and runs_on(method, sensor))
         drawn += [_confusion_chart(method, sensor) for method in chosen]
-    return fold("Which materials are confused", Charts(drawn), Note(CONFUSION_NOTE)) if drawn else []
+    return fold("Which materials are confused", Charts(drawn), SmallPrint(CONFUSION_NOTE)) if drawn else []
 
 
 def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
@@ -137,7 +137,7 @@ def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
     return [Chart(title, spec, caption)]
 
 
-def alignment_by_epoch(run: Result) -> list[float]:
+def alignment_by_epoch(run: MaterialResult) -> list[float]:
     """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
     return without_gaps([epoch.get("alignment") for epoch in run.history])
 
@@ -168,7 +168,7 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
                     [100 * value for value in part]
                     for part in zip(*(counts_and_accuracies[at] for at in slides), strict=True)
                 )
-                lines.append(Line(name, slides, mean, low, high))
+                lines.append(Curve(name, slides, mean, low, high))
             chance = 100 / max(len(chosen[0].details[0].config.get("classes", ())), 1)
             spec = charts.lines(lines, "training slides", "accuracy (%)", level=("chance", chance))
             caption = "Unseen slides, with 95 % intervals; dashed across: chance."
@@ -190,7 +190,7 @@ def _add_points(points: dict[str, Points], name: str, method: Method, sensor: st
         points.setdefault(name, {})[max(described)] = (counted.fraction, counted.low, counted.high)
 
 
-def _validation_by_epoch(run: Result, sensor: str) -> list[float]:
+def _validation_by_epoch(run: MaterialResult, sensor: str) -> list[float]:
     """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
     accuracies = [epoch.get("val", {}).get(sensor, {}).get("accuracy") for epoch in run.history]
     return [100 * value for value in without_gaps(accuracies)]
@@ -211,7 +211,7 @@ def latent_folds(methods: Sequence[Method]) -> list[Fold]:
         return []
     chosen = main, scores.permuted_method(methods, main), scores.independent_method(methods, main)
     drawn = [chart for method in chosen if method and (chart := _latent_chart(method))]
-    return fold("Latents", Charts(drawn), Note(LATENT_NOTE)) if drawn else []
+    return fold("Latents", Charts(drawn), SmallPrint(LATENT_NOTE)) if drawn else []
 
 
 def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
@@ -226,7 +226,9 @@ def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
     return [(part - centre) @ axes.T for part in parts]
 
 
-def count_nearest_partners(first: Predictions, second: Predictions, partners: Mapping[int, int]) -> tuple[int, int]:
+def count_nearest_partners(
+    first: SlidePredictions, second: SlidePredictions, partners: Mapping[int, int]
+) -> tuple[int, int]:
     """Return of how many materials the nearest mean among the other's is that of its partner, and of how many.
 
     All latents count. ``partners`` has the other sensor's material of each; one that is not in it is its own.
@@ -276,7 +278,7 @@ def _latent_chart(method: Method) -> Chart | None:
 
 
 def _latent_rows(
-    points: Sequence[AnyFloats], parts: Sequence[Predictions], partners: Mapping[int, int]
+    points: Sequence[AnyFloats], parts: Sequence[SlidePredictions], partners: Mapping[int, int]
 ) -> list[tuple[str, AnyFloats, AnyFloats]]:
     """Return the name of each material, the mean of the first sensor's slides and of its partner's by the other."""
     means = [
@@ -291,7 +293,7 @@ def _latent_rows(
     ]
 
 
-def _paired_predictions(runs: Sequence[Result]) -> tuple[tuple[str, str], list[Predictions]] | None:
+def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str], list[SlidePredictions]] | None:
     """Return two sensors and the rows of each, of the first run that holds both, or else of the first of each."""
     with_latents = [run for run in runs if run.predictions.latents is not None]
     sensors = ordered_sensors([sensor for run in with_latents for sensor in run.sensors])[:2]
@@ -305,7 +307,7 @@ def _paired_predictions(runs: Sequence[Result]) -> tuple[tuple[str, str], list[P
     return (sensors[0], sensors[1]), parts
 
 
-def _latents_of(part: Predictions) -> AnyFloats:
+def _latents_of(part: SlidePredictions) -> AnyFloats:
     assert part.latents is not None
     return part.latents
 
@@ -323,7 +325,7 @@ def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
     shards = [shard for dataset in datasets for shard in dataset.recordings.values() if holds_slides(dataset)]
     if not shards:
         return []
-    published = all(is_published(dataset, Result.SETS) for dataset in datasets)
+    published = all(is_published(dataset, MaterialResult.SETS) for dataset in datasets)
     sensors = ordered_sensors([str(shard.attributes.get("sensor", "")) for shard in shards])
     parts = [
         _describe_counts([shard for shard in shards if shard.attributes.get("sensor", "") == sensor], sensor)
@@ -336,7 +338,7 @@ def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
         ]
         if sensor_shards:
             drawn += _profile_charts(typical_slide(sensor_shards), sensor, published)
-    return [Fold("The slides", [Note(" ".join(parts)), *([Charts(drawn)] if drawn else [])])]
+    return [Fold("The slides", [SmallPrint(" ".join(parts)), *([Charts(drawn)] if drawn else [])])]
 
 
 def typical_slide(shards: Sequence[Recording]) -> Recording:
@@ -381,7 +383,7 @@ def _profile_charts(shard: Recording, sensor: str, published: bool) -> list[Char
     drawn = []
     for number, title, quantity, columns, scale in profiles:
         lines = {label: scale * table[name].to_numpy() for name, label in columns.items() if name in table.column_names}
-        drawn_lines = [Line(label, time_s, values) for label, values in lines.items() if np.isfinite(values).any()]
+        drawn_lines = [Curve(label, time_s, values) for label, values in lines.items() if np.isfinite(values).any()]
         if drawn_lines:
             spec = charts.lines(drawn_lines, "time (s)", quantity, shade=shade, points=False, height=190)
             caption = f"{shard.name}, the slide of median force. Shaded: the slide."

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.comparison.runs import Method, Run
+from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.metrics.intervals import wilson
 from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell, Fold, Note, Table, number, p_value, signed
+from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint, Table, number, p_value, signed
 from tacpipe.report.context import SHORTENED, Tree
 from tacpipe.tasks.material.report import figures, scores
 from tacpipe.tasks.material.report.methods import (
@@ -23,7 +23,7 @@ from tacpipe.tasks.material.report.methods import (
     slides_kept,
 )
 from tacpipe.tasks.material.report.predictions import MODEL, SWAPPED
-from tacpipe.tasks.material.report.scores import Accuracy, Difference, accuracy
+from tacpipe.tasks.material.report.scores import Accuracy, MethodDifference, accuracy
 
 ACCURACIES: Mapping[str, Mapping[str, float]] = {  # Table I
     "X-LSTM": {"biotac": 94.50, "roboskin": 90.00},
@@ -135,7 +135,7 @@ def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
     return described
 
 
-def _describe_difference(difference: Difference) -> str:
+def _describe_difference(difference: MethodDifference) -> str:
     tests = [f"McNemar p = {p_value(difference.mcnemar).text}"]
     if not math.isnan(difference.runs.p):
         tests.append(
@@ -217,7 +217,7 @@ def difference_table(methods: Sequence[Method]) -> Table | None:
     return blocks.table("Paired comparisons: the first method minus the second, on the same slides", heads, rows)
 
 
-def run_columns(run: Run) -> dict[str, str | Cell]:
+def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
     """Return more columns of the table of runs: slides learned from, epochs and seconds."""
     result = run.details
     learned = " + ".join(f"{count}" for _, count in sorted(result.learned.items()))
@@ -346,7 +346,10 @@ def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
     described = blocks.table("Zero shot: accuracy on held-out materials", heads, rows)
     return blocks.fold(
-        "Materials that one sensor never saw", described, Note(ZERO_SHOT_NOTE), *map(Note, zero_shot_sentences(methods))
+        "Materials that one sensor never saw",
+        described,
+        SmallPrint(ZERO_SHOT_NOTE),
+        *map(SmallPrint, zero_shot_sentences(methods)),
     )
 
 

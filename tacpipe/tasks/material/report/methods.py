@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import Errors, Method, Question, Run, marks
+from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, marks
 from tacpipe.comparison.specification import Kind
 from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.material import headline
-from tacpipe.tasks.material.params import Material
+from tacpipe.tasks.material.params import MaterialModelParams
 from tacpipe.tasks.material.report import predictions
 from tacpipe.tasks.material.report.predictions import (
     LAST,
@@ -25,7 +25,7 @@ from tacpipe.tasks.material.report.predictions import (
     NOTHING,
     SHUFFLED,
     SWAPPED,
-    Predictions,
+    SlidePredictions,
 )
 
 if TYPE_CHECKING:
@@ -55,14 +55,14 @@ _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without 
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
-class Result(context.Result):
+class MaterialResult(context.ReportResult):
     """One result on materials."""
 
     STAGE = "train.material"
     SETS = ("biotac-slide", "roboskin")
 
     @cached_property
-    def predictions(self) -> Predictions:
+    def predictions(self) -> SlidePredictions:
         """The predictions for each slide that the model has not seen."""
         return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
@@ -114,7 +114,7 @@ class Result(context.Result):
         return described, "authors" if "authors" in layouts else "time"
 
 
-def settings(results: Sequence[Result]) -> list[dict[str, Any]]:
+def settings(results: Sequence[MaterialResult]) -> list[dict[str, Any]]:
     """Return all that makes a method of each result.
 
     That is architecture, joint or not, number of training slides, layout and split of the slides, and all params but the
@@ -159,7 +159,7 @@ def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
     return ordered_sensors([sensor for method in methods for result in method.details for sensor in result.sensors])
 
 
-def runs_on(method: Method, sensor: str) -> list[Run]:
+def runs_on(method: Method, sensor: str) -> list[ComparedRun]:
     """Return the runs of a method that were evaluated on slides of ``sensor``."""
     return [run for run in method.runs if sensor in run.details.sensors]
 
@@ -202,7 +202,7 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
 def base_name(settings: Tree, variants: bool = True) -> str:
     """Return the name that a method has before it is derived from others like it."""
     architecture = str(settings["architecture"])
-    name = architectures.title(Material, architecture)
+    name = architectures.title(MaterialModelParams, architecture)
     if settings["frozen_sensor"]:
         name = "mapping to known space"
     elif settings["joint"]:
@@ -226,7 +226,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
     return " · ".join(filter(None, parts))
 
 
-def _settings(run: Result) -> dict[str, Any]:
+def _settings(run: MaterialResult) -> dict[str, Any]:
     """Return all that makes a method but the number of its slides; what is of no effect is left out."""
     config, params, architecture = run.config, run.params, run.architecture
     frozen = str(params.get("frozen_sensor", ""))
@@ -262,7 +262,7 @@ def _settings(run: Result) -> dict[str, Any]:
     }
 
 
-def _few(run: Result, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
+def _few(run: MaterialResult, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
 
     Numbers are rounded to those of other runs that have about as many; ``described`` has the fractions of before. A
@@ -301,9 +301,9 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def read_runs(results: Sequence[Dataset]) -> list[Run]:
+def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     """Return the runs of results that hold predictions of slides which the model has not seen."""
-    all_results = [Result(result) for result in drop_duplicates(results) if "predictions" in result.recordings]
+    all_results = [MaterialResult(result) for result in drop_duplicates(results) if "predictions" in result.recordings]
     with_sensors = [result for result in all_results if result.sensors]
     return [_run(*pair) for pair in zip(with_sensors, settings(with_sensors), strict=True)]
 
@@ -318,19 +318,19 @@ def predictor_name(predictor: str) -> str:
     return PREDICTOR_NAMES.get(predictor, predictor.replace("_", " "))
 
 
-def question_on(run: Run, sensor: str) -> Question | None:
+def question_on(run: ComparedRun, sensor: str) -> Question | None:
     """Return the question that a run answers on slides of a sensor."""
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 
-def named_right(result: Result, sensor: str, predictor: str) -> dict[str, AnyFloats]:
+def named_right(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
     """Return whether each slide of a sensor was named right, 1 or 0, and 1, by recording."""
     rows = result.predictions.of(sensor)
     triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
     return {str(name): np.array([answer == truth, 1.0]) for name, answer, truth in triples if answer != NOTHING}
 
 
-def _run(result: Result, settings: dict[str, Any]) -> Run:
+def _run(result: MaterialResult, settings: dict[str, Any]) -> ComparedRun:
     place = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
     classes = len(result.config.get("classes", ()))
     questions = {}
@@ -339,10 +339,10 @@ def _run(result: Result, settings: dict[str, Any]) -> Run:
         if classes:
             sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
         part = ", ".join(filter(None, (sensor_title(sensor), place)))
-        questions[Question(part, place=int(settings["elsewhere"]))] = Errors(
+        questions[Question(part, place=int(settings["elsewhere"]))] = PredictorErrors(
             headline.MEASURE, {name: predictor_sums for name, predictor_sums in sums.items() if predictor_sums}
         )
-    return Run(
+    return ComparedRun(
         result.dataset,
         headline.TASK,
         base_name(settings),

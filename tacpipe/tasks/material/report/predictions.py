@@ -26,7 +26,7 @@ NOTHING = -1  # stands where a predictor stated nothing of a slide
 
 
 @dataclass(frozen=True)
-class Predictions:
+class SlidePredictions:
     """One row a slide, those of training left out."""
 
     recordings: NDArray[np.str_]  # (slide,)
@@ -37,13 +37,13 @@ class Predictions:
     naming: Naming = NUMBERS  # names of the materials
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
-    def of(self, sensor: str) -> Predictions:
+    def of(self, sensor: str) -> SlidePredictions:
         """Return the rows of one sensor."""
         rows = self.sensors == sensor
         predicted = {name: values[rows] for name, values in self.predicted.items()}
         latents = None if self.latents is None else self.latents[rows]
         sessions = None if self.sessions is None else self.sessions[rows]
-        return Predictions(
+        return SlidePredictions(
             self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, self.naming, sessions
         )
 
@@ -63,7 +63,7 @@ class Predictions:
         return all(len(names) == 1 for names in sessions.values())
 
 
-def read_predictions(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
+def read_predictions(table: pa.Table, config: Mapping[str, Any]) -> SlidePredictions:
     """Return what the table ``predictions`` of a result states of slides that its model has not seen.
 
     As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
@@ -73,7 +73,7 @@ def read_predictions(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
     table = table.filter(_counted_slides(table, config, naming))
     names = [name for name in table.column_names if name.startswith("z") and name[1:].isdigit()]
     latents = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64) if names else None
-    return Predictions(
+    return SlidePredictions(
         np.array(table["recording"].to_pylist(), dtype=np.str_),
         np.array(table["sensor"].to_pylist(), dtype=np.str_),
         _numbers(table, "material", naming),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import PairedRuns, observations, paired_runs
-from tacpipe.comparison.runs import Method, Question, Run
+from tacpipe.comparison.runs import ComparedRun, Method, Question
 from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.metrics.pairing import Gain
 from tacpipe.report import context
@@ -40,7 +40,7 @@ class Accuracy:
         return self.correct / self.evaluated
 
 
-def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:
+def accuracy(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> Accuracy | None:
     """Return how many slides of a sensor a predictor of these runs names right; None where none states anything."""
     named_right = slides_named_right(runs, sensor, predictor)
     if not len(named_right):
@@ -51,7 +51,7 @@ def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accura
     return Accuracy(correct, evaluated, slides, low, high, float(by_run.std()), len(by_run))
 
 
-def level_skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
+def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> float:
     """Return 1 - errors / errors of the mean level, of runs that hold both; NaN where the mean level never errs.
 
     1 is perfect, 0 no better than what the time-averaged channels state.
@@ -63,7 +63,7 @@ def level_skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> flo
     return 1 - (1 - counted.fraction) / (1 - level.fraction)
 
 
-def slides_named_right(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> pd.Series:
+def slides_named_right(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> pd.Series:
     """Return whether slides were named right, 1 or 0, by run and recording."""
     import pandas as pd
 
@@ -74,7 +74,7 @@ def slides_named_right(runs: Sequence[Run], sensor: str, predictor: str = MODEL)
 
 
 @dataclass(frozen=True)
-class Difference:
+class MethodDifference:
     """The difference of two methods on the slides that both were evaluated on."""
 
     slides: int
@@ -91,7 +91,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Pair:
+class MethodPair:
     """Two methods that a table compares."""
 
     name: str
@@ -101,7 +101,7 @@ class Pair:
 
 def compare_runs(
     first: Method, second: Method, sensor: str, predictors: tuple[str, str] = (MODEL, MODEL)
-) -> Difference | None:
+) -> MethodDifference | None:
     """Return what ``first`` has over ``second`` on slides of a sensor; None where they share none.
 
     McNemar's test takes a slide for right where at least half of a method's runs name it right.
@@ -119,20 +119,22 @@ def compare_runs(
     first_right, second_right = first_right.align(second_right, join="inner")
     p = mcnemar(first_right.to_numpy(), second_right.to_numpy())
     only = int((first_right & ~second_right).sum()), int((second_right & ~first_right).sum())
-    return Difference(
+    return MethodDifference(
         gain.clusters, gain, *only, p, paired_runs(runs_by_method[0], runs_by_method[1], question, predictors)
     )
 
 
-def method_pairs(methods: Sequence[Method]) -> list[Pair]:
+def method_pairs(methods: Sequence[Method]) -> list[MethodPair]:
     """Return which methods a table compares: what is asked to help, against the same without it."""
     candidates = [candidate for candidate in methods if has_usual_settings(candidate.settings)]
     all_pairs = []
     for joint in (candidate for candidate in candidates if candidate.family == "RAEC joint"):
         twins = independent_method(methods, joint), permuted_method(methods, joint)
-        all_pairs += [Pair(f"{joint.name} − {candidate.name}", joint, candidate) for candidate in twins if candidate]
         all_pairs += [
-            Pair(f"{candidate.name} − {joint.name}", candidate, joint)
+            MethodPair(f"{joint.name} − {candidate.name}", joint, candidate) for candidate in twins if candidate
+        ]
+        all_pairs += [
+            MethodPair(f"{candidate.name} − {joint.name}", candidate, joint)
             for candidate in candidates
             if candidate.family == "MiniRocket"
         ]

@@ -14,7 +14,7 @@ from tacpipe.metrics import calibration, headline
 from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
-from tacpipe.report.charts import Line
+from tacpipe.report.charts import Curve
 from tacpipe.tasks.material.report.methods import runs_on, sensor_title, sensors_of
 
 if TYPE_CHECKING:
@@ -146,9 +146,9 @@ def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFra
         if len(indices)
     ]
     right, low, high = ([getattr(value, name) for _, value in binned] for name in ("fraction", "low", "high"))
-    lines = [Line("calibrated", [probability for probability, _ in binned], right, low, high)]
+    lines = [Curve("calibrated", [probability for probability, _ in binned], right, low, high)]
     if before := _uncalibrated_points(method, sensor):
-        lines.append(Line("as trained", [value for value, _ in before], [value for _, value in before], dashed=True))
+        lines.append(Curve("as trained", [value for value, _ in before], [value for _, value in before], dashed=True))
     spec = charts.lines(lines, "stated probability", "fraction right", diagonal=(0, 1), height=220)
     return Chart(title, spec)
 
@@ -177,7 +177,7 @@ def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]])
                 loss_curves.append(100 * unknown_curve(known_scores, unknown))
         runs = np.stack(loss_curves)
         low, high = (runs.min(axis=0), runs.max(axis=0)) if len(runs) > 1 else (None, None)
-        drawn.append(Line(name, 100 * RATES, runs.mean(axis=0), low, high))
+        drawn.append(Curve(name, 100 * RATES, runs.mean(axis=0), low, high))
         lost, unknown_rate = (100 * rate_of(read[read.known == flag], "refused").fraction for flag in (True, False))
         points.append((name, lost, unknown_rate))
     x, y = "slides of known materials answered unknown (%)", "slides of unknown materials answered unknown (%)"

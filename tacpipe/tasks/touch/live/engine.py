@@ -13,13 +13,13 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
 from tacpipe.live.engine import Engine
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.grasps import Grasps, parsed
+from tacpipe.sensors.grasps import GraspRequests, parsed
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.touch.live import requests as touch_ranking
 from tacpipe.tasks.touch.live import requests as touch_requests
 from tacpipe.tasks.touch.live.messages import TouchDescription, TouchMessage
 from tacpipe.tasks.touch.live.requests import Criterion
-from tacpipe.tasks.touch.predictor import Predictor, Touch
+from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
 
 WAITING = 16  # requests that wait; of more the oldest are answered no more
 IDLE_NS = 5_000_000
@@ -31,7 +31,7 @@ class TouchEngine(Engine):
     def __init__(self, sensors: Mapping[str, Sensor], predictor: Predictor, criterion: Criterion) -> None:
         """Take the rig's sensors. Raises `TacpipeError` where none gives requests, or the model predicts too little."""
         super().__init__(sensors)
-        self.requests = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Grasps)}
+        self.requests = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, GraspRequests)}
         if not self.requests:
             raise TacpipeError(
                 "The rig has no stream of the sensor grasps for requests. Add one, as in docs/howto/live-grasps.md."
@@ -109,6 +109,6 @@ class TouchEngine(Engine):
         return message
 
 
-def values(touches: list[Touch]) -> Any:
+def values(touches: list[PredictedReading]) -> Any:
     """Return touches as `touch_messages.COLUMNS` (grasp, value)."""
     return np.array([[touch.pdc_th, touch.pdc_mf, *touch.e_th, *touch.e_mf] for touch in touches], np.float64)

@@ -13,7 +13,7 @@ from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.channels import biotac_sp
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
-from tacpipe.sensors.live import LSL, Column, Declaration, Value, latency_values
+from tacpipe.sensors.live import LSL, Declaration, LiveColumn, Value, latency_values
 
 COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # values of a touch
 TOUCH = "touch"  # the recorded stream, one row per grasp
@@ -21,8 +21,8 @@ ORDER = ("request", "grasp", "rank")
 SCORES = ("score", "level_th", "level_mf")
 
 
-def _names(*names: str) -> list[Column]:
-    return [Column(name) for name in names]
+def _names(*names: str) -> list[LiveColumn]:
+    return [LiveColumn(name) for name in names]
 
 
 DECLARATION = Declaration(
@@ -65,7 +65,7 @@ DECLARATION = Declaration(
             streams=(TOUCH,),
             unit="count",
             quantity="prediction",
-            columns=lambda sizes: [Column(name, sizes.unit) for name in sizes.channels],
+            columns=lambda sizes: [LiveColumn(name, sizes.unit) for name in sizes.channels],
         ),
         Value("cause", "reason why nothing is ranked", "string"),
         *latency_values("latency_ms", "skipped"),

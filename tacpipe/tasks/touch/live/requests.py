@@ -15,7 +15,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.printable import excerpt
-from tacpipe.tasks.touch.predictor import Touch
+from tacpipe.tasks.touch.predictor import PredictedReading
 
 NPZ = ".npz"
 LARGEST_BYTES = 1 << 28  # limit of an NPZ file
@@ -116,7 +116,7 @@ def criterion(text: str) -> Criterion:
     return Criterion(text, lambda levels: -np.abs(np.nanmean(levels, axis=1) - level), 1)
 
 
-def levels(touches: Sequence[Touch]) -> Floats:
+def levels(touches: Sequence[PredictedReading]) -> Floats:
     """Return how much each finger is touched (grasp, finger), thumb first: the mean of two fractions of fixed ranges.
 
     They are how far the pressure rises within its range, and how far the electrodes fall within theirs, on average; 0 to 1

@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Run
+from tacpipe.comparison.engine import Comparison, ComparisonRow
+from tacpipe.comparison.runs import ComparedRun
 from tacpipe.comparison.specification import TaskReport
 from tacpipe.metrics import headline
 from tacpipe.report import blocks, screen
@@ -36,7 +36,7 @@ class TouchReport(TaskReport):
     title = "prediction of fingertip readings from point clouds"
     usual = methods.USUAL
 
-    def read(self, results: Sequence[Dataset]) -> list[Run]:
+    def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that hold predictions of grasps which the model has not seen."""
         return methods.read_runs(results)
 
@@ -48,7 +48,9 @@ class TouchReport(TaskReport):
         """Return whether a dataset holds grasps, which are drawn."""
         return figures.holds_grasps(dataset)
 
-    def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
+    def columns(
+        self, context: Context, comparison: Comparison
+    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return R², skill over the constant, mean absolute error and batch means."""
         return columns(context, comparison)
 
@@ -64,7 +66,7 @@ class TouchReport(TaskReport):
         """Return what must be known about the numbers."""
         return caveats(context)
 
-    def run_columns(self, run: Run) -> dict[str, str | Cell]:
+    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
         return run_columns(run)
 
@@ -120,17 +122,17 @@ def folds(context: Context) -> list[Fold]:
     ]
 
 
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
     """Return more columns of the table of all methods: R², skill over the constant, mean absolute error and batch means."""
     target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
     known_objects = comparison.question.part.startswith(headlines.PARTS[True])
 
     @functools.cache
-    def score(row: Row) -> Score | None:
+    def score(row: ComparisonRow) -> Score | None:
         runs = [run.details.predictions for run in row.method.of(comparison.question)]
         return predictions.score(runs, target, known_objects, row.predictor)
 
-    def cell(value: Callable[[Score], Cell]) -> Callable[[Row], Cell]:
+    def cell(value: Callable[[Score], Cell]) -> Callable[[ComparisonRow], Cell]:
         return lambda row: value(found) if (found := score(row)) else Cell(NONE)
 
     return [
@@ -159,7 +161,7 @@ def caveats(context: Context) -> list[str]:
     ]
 
 
-def run_columns(run: Run) -> dict[str, str | Cell]:
+def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
     """Return more columns of the table of runs."""
     trained = run.details.trained
     rsquared = []

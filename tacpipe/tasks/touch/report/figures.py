@@ -17,18 +17,18 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.comparison.runs import Method
 from tacpipe.metrics import regression
 from tacpipe.report import blocks, charts, context
-from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
+from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL
 from tacpipe.tasks.touch.report import methods, paper, predictions
 from tacpipe.tasks.touch.report.methods import (
     PAPERS,
-    Result,
+    TouchResult,
     describe_training,
     one_per_architecture,
     predicted_targets,
 )
-from tacpipe.tasks.touch.report.predictions import Predictions
+from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
@@ -84,7 +84,7 @@ COLOURS = (
 
 
 @dataclass(frozen=True)
-class Chosen:
+class DrawnGrasp:
     """A grasp that is drawn, and why."""
 
     place: str
@@ -102,11 +102,16 @@ def electrode_folds(method: Method) -> list[Fold]:
     rows = method.details[0].predictions
     pairs = [_true_and_predicted(rows, grasp, fingers) for grasp in choose_grasps(rows)]
     return fold(
-        "Electrodes", Charts(drawn), Note(FINGERTIPS), *pairs, Note(COLOURS) if pairs else None, about=method.name
+        "Electrodes",
+        Charts(drawn),
+        SmallPrint(FINGERTIPS),
+        *pairs,
+        SmallPrint(COLOURS) if pairs else None,
+        about=method.name,
     )
 
 
-def choose_grasps(rows: Predictions) -> list[Chosen]:
+def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
     """Return the grasps of a run at the median, the best and the worst decile by the electrodes' error.
 
     Of grasps that err alike the first by name comes first, so the same results choose the same grasps.
@@ -124,7 +129,7 @@ def choose_grasps(rows: Predictions) -> list[Chosen]:
     error = np.sqrt(np.hstack(squared).mean(axis=1))
     order = np.lexsort((rows.recordings, error))
     places = [(place, int(order[round(place_fraction * (len(order) - 1))])) for place, place_fraction in PLACES.items()]
-    return [Chosen(place, row, str(rows.recordings[row]), float(error[row])) for place, row in places]
+    return [DrawnGrasp(place, row, str(rows.recordings[row]), float(error[row])) for place, row in places]
 
 
 def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
@@ -142,7 +147,7 @@ def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Ch
     return Chart(f"R² of each electrode, {headlines.PARTS[known_objects]}", draw_fingertips(rows))
 
 
-def _true_and_predicted(rows: Predictions, grasp: Chosen, fingers: Sequence[str]) -> Chart:
+def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequence[str]) -> Chart:
     """Return true next to predicted electrodes of one grasp."""
     tips: list[dict[str, object]] = []
     errors = []
@@ -208,7 +213,7 @@ def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[
     first = dict.fromkeys(sorted(shards)[:MOST_CLOUDS], "")
     described = {name: words for name, words in chosen.items() if name in shards} or first
     drawn = [_cloud_chart(shards[name], words) for name, words in described.items()]
-    return fold("Clouds and their grasps", Charts(drawn), Note(CLOUD_COLOURS))
+    return fold("Clouds and their grasps", Charts(drawn), SmallPrint(CLOUD_COLOURS))
 
 
 def _has_grasp(shard: Recording) -> bool:
@@ -292,7 +297,7 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     ]
 
 
-def losses_by_epoch(result: Result, target: str, name: str) -> list[float]:
+def losses_by_epoch(result: TouchResult, target: str, name: str) -> list[float]:
     """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
 
     The mean ends where the first network does. NaN stands where an epoch does not state the loss.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.runs import Errors, Method, Question, Run, distinct_names, marks
+from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, distinct_names, marks
 from tacpipe.metrics import regression
 from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
@@ -20,9 +20,9 @@ from tacpipe.report import blocks, context
 from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
-from tacpipe.tasks.touch.params import Touch
+from tacpipe.tasks.touch.params import TouchModelParams
 from tacpipe.tasks.touch.report import predictions
-from tacpipe.tasks.touch.report.predictions import Predictions
+from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
 if TYPE_CHECKING:
     from tacpipe.arrays import Floats
@@ -35,14 +35,14 @@ USUAL = ("split", "simulated")  # settings that no name states: parts of questio
 _NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
 
-class Result(context.Result):
+class TouchResult(context.ReportResult):
     """One result on touch."""
 
     STAGE = "train.touch"
     SETS = ("vision2tactile",)
 
     @cached_property
-    def predictions(self) -> Predictions:
+    def predictions(self) -> GraspPredictions:
         """The predictions for each grasp that the model has not seen."""
         return predictions.read_predictions(self.dataset.recordings[PREDICTIONS])
 
@@ -79,7 +79,7 @@ class Result(context.Result):
         return {**params, "architecture": self.architecture, "split": self.split, "simulated": self.simulated}
 
 
-def method_names(results: Sequence[Result]) -> list[str]:
+def method_names(results: Sequence[TouchResult]) -> list[str]:
     """Return what the method of each result is called.
 
     A name states what a method does without, colour, and the settings in which it differs from most methods of its
@@ -99,12 +99,12 @@ def method_names(results: Sequence[Result]) -> list[str]:
     return [names_by_key[key] for key in keys]
 
 
-def ordered_splits(results: Sequence[Result]) -> list[tuple[str, bool]]:
+def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
     """Return how the grasps of results were parted, and whether they were simulated: what is a question of its own.
 
     Recorded grasps come before simulated ones, then what the default method was run on, then the most targets and runs.
     """
-    by_split: dict[tuple[str, bool], list[Result]] = {}
+    by_split: dict[tuple[str, bool], list[TouchResult]] = {}
     for result in results:
         by_split.setdefault((result.split, result.simulated), []).append(result)
 
@@ -164,7 +164,7 @@ def _first_names(settings: Tree) -> list[str]:
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
         return ["trees on geometry and colour" if coloured else "trees on geometry"]
-    name = architectures.title(Touch, architecture)
+    name = architectures.title(TouchModelParams, architecture)
     return [
         f"{name} ({settings[SHORTENED]})" if SHORTENED in settings else name,
         *([] if coloured else ["without colour"]),
@@ -250,7 +250,7 @@ def describe_split(described: str, simulated: bool) -> str:
     return f"{name}, simulated" if simulated and "simulated" not in name else name
 
 
-def describe_schedule(run: Result) -> str:
+def describe_schedule(run: TouchResult) -> str:
     """Return how a run was trained, and whether that is the paper's way."""
     if not run.history:
         return "fitted without epochs"
@@ -285,9 +285,9 @@ def format_span(counts: Sequence[int]) -> str:
     return " to ".join(f"{count:,}" for count in dict.fromkeys((counts[0], counts[-1])))
 
 
-def read_runs(results: Sequence[Dataset]) -> list[Run]:
+def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     """Return the runs of results that hold predictions of grasps which the model has not seen."""
-    all_results = [Result(result) for result in drop_duplicates(results) if PREDICTIONS in result.recordings]
+    all_results = [TouchResult(result) for result in drop_duplicates(results) if PREDICTIONS in result.recordings]
     with_unseen_grasps = [result for result in all_results if len(result.predictions.recordings)]
     splits = ordered_splits(with_unseen_grasps)
     return [_run(*pair, splits) for pair in zip(with_unseen_grasps, method_names(with_unseen_grasps), strict=True)]
@@ -302,7 +302,7 @@ def predictor_name(predictor: str) -> str:
     return headline.BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def _run(run: Result, name: str, splits: Sequence[tuple[str, bool]]) -> Run:
+def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
     questions = {}
     for known_objects in (True, False):
         rows = run.predictions.of(known_objects)
@@ -321,16 +321,16 @@ def _run(run: Result, name: str, splits: Sequence[tuple[str, bool]]) -> Run:
             part = headline.PARTS[known_objects]
             if len(splits) > 1:
                 part += f", {describe_split(run.split, run.simulated)}"
-            questions[Question(part, headline.TARGETS[target], place)] = Errors(
+            questions[Question(part, headline.TARGETS[target], place)] = PredictorErrors(
                 measure, sums, None if known_objects else objects
             )
-    return Run(
+    return ComparedRun(
         run.dataset,
         headline.TASK,
         name,
         run.settings,
         questions,
-        family=architectures.title(Touch, run.architecture),
+        family=architectures.title(TouchModelParams, run.architecture),
         seed=run.params.get("seed"),
         simulated=run.simulated,
         published=run.published,

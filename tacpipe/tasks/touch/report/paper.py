@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import NONE, Block, Cell, Chart, Note, Table
+from tacpipe.report.blocks import NONE, Block, Cell, Chart, SmallPrint, Table
 from tacpipe.report.charts import Dot
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.headline import MODEL, OBJECT_MEAN
@@ -23,7 +23,7 @@ from tacpipe.tasks.touch.report.methods import (
     one_per_architecture,
     predicted_targets,
 )
-from tacpipe.tasks.touch.report.predictions import Predictions, Score
+from tacpipe.tasks.touch.report.predictions import GraspPredictions, Score
 
 HEADS: Mapping[object, tuple[float, float]] = {  # Table I
     "fc1": (0.02598, 0.00043),
@@ -123,7 +123,7 @@ def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | 
     return rows
 
 
-def predictions_of_runs(method: Method) -> list[Predictions]:
+def predictions_of_runs(method: Method) -> list[GraspPredictions]:
     """Return what the runs of a method predicted."""
     return [result.predictions for result in method.details]
 
@@ -147,7 +147,7 @@ def _table_by_object(method: Method) -> Table | None:
     return blocks.table(f"By object, {method.name}: RMSE above that of the object's mean", heads, rows, kinds)
 
 
-def _object_cells(runs: Sequence[Predictions], target: str, known_objects: bool) -> list[str | Cell]:
+def _object_cells(runs: Sequence[GraspPredictions], target: str, known_objects: bool) -> list[str | Cell]:
     """Return the RMSE on an object, above that of its mean where there is one, and the skill over the constant."""
     scored, mean = (predictions.score(runs, target, known_objects, predictor) for predictor in (MODEL, OBJECT_MEAN))
     if scored is None:
@@ -242,7 +242,7 @@ def setting_tables(methods: Sequence[Method]) -> list[Block]:
     """Return the tables of which at least two rows were run; none where there is none."""
     described = [block for form in FORMS for block in _setting_table(form, methods)]
     published = all(block.published for block in methods)
-    return [*described, *([Note(SCALES)] if published and described else [])]
+    return [*described, *([SmallPrint(SCALES)] if published and described else [])]
 
 
 def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Method]:
@@ -297,7 +297,7 @@ def _setting_table(form: Form, methods: Sequence[Method]) -> list[Block]:
     notes += [ESTIMATED] if any(item.settings.get("wrist") == "estimated" for item in by_value.values()) else []
     drawn = [_setting_chart(form, described, dict(baselines))] if form.drawn else []
     table = blocks.table(f"{title}; {headlines.TARGETS[TARGET]}, known objects", heads, rows, kinds)
-    return [table, *drawn, Note(" ".join(item for item in notes if item))]
+    return [table, *drawn, SmallPrint(" ".join(item for item in notes if item))]
 
 
 def _printed_setting(form: Form, value: object) -> list[str | Cell]:
@@ -401,7 +401,7 @@ def _generalisation_table(known_method: Method, novel: Method) -> list[Block]:
     evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
     note = f"{describe_training(chosen)} {evaluated} {TRAINED_ON if published else ''} {caution(chosen)}"
     title = f"{blocks.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known_method.name}"
-    return [blocks.table(title, heads, rows, kinds), Note(note)]
+    return [blocks.table(title, heads, rows, kinds), SmallPrint(note)]
 
 
 def _pair_cells(test: Score | None, novel: Score | None) -> list[str | Cell]:

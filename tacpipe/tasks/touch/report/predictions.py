@@ -28,7 +28,7 @@ UNNAMED = "unnamed"  # an object of which no recording states the name
 
 
 @dataclass(frozen=True)
-class Predictions:
+class GraspPredictions:
     """One row a grasp, those of training left out."""
 
     recordings: NDArray[np.str_]  # (grasp,)
@@ -51,25 +51,27 @@ class Predictions:
         """The targets that the model predicts, in the order of tables."""
         return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
-    def of(self, known_objects: bool | None) -> Predictions:
+    def of(self, known_objects: bool | None) -> GraspPredictions:
         """Return the rows of known or of novel objects, or all."""
         return self if known_objects is None else self.rows(self.known == known_objects)
 
-    def rows(self, chosen: AnyArray) -> Predictions:
+    def rows(self, chosen: AnyArray) -> GraspPredictions:
         """Return some rows, stated by a mask (grasp,) or by their numbers."""
         predicted = {
             name: {target: values[chosen] for target, values in touch.items()} for name, touch in self.predicted.items()
         }
         true = {target: values[chosen] for target, values in self.true.items()}
         t_ns = None if self.t_ns is None else self.t_ns[chosen]
-        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns)
+        return GraspPredictions(
+            self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns
+        )
 
 
-def read_predictions(shard: Recording) -> Predictions:
+def read_predictions(shard: Recording) -> GraspPredictions:
     """Return what the recording ``predictions`` of a result states of grasps that its model has not seen."""
     grasps = shard.table(GRASPS)
     targets_by_stream = {name: _read_targets(shard.table(name)) for name in shard.streams if name != GRASPS}
-    predictions = Predictions(
+    predictions = GraspPredictions(
         np.array(grasps["recording"].to_pylist(), dtype=np.str_),
         np.array([name or UNNAMED for name in grasps["object"].to_pylist()], dtype=np.str_),
         np.array(grasps["known"].to_pylist(), dtype=bool),
@@ -121,7 +123,7 @@ def to_counts(target: str, fraction: float) -> float:
     return fraction * (high - low)
 
 
-class _Rows(NamedTuple):
+class _TargetRows(NamedTuple):
     """The rows that a run reports on a target."""
 
     true: AnyFloats  # (grasp, value), normalised
@@ -131,7 +133,9 @@ class _Rows(NamedTuple):
     objects: NDArray[np.str_]  # (grasp,)
 
 
-def score(runs: Sequence[Predictions], target: str, known_objects: bool | None, predictor: str = MODEL) -> Score | None:
+def score(
+    runs: Sequence[GraspPredictions], target: str, known_objects: bool | None, predictor: str = MODEL
+) -> Score | None:
     """Return how a predictor does, from the predictions of runs on known or on novel objects, or on all; None without any.
 
     Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
@@ -155,13 +159,15 @@ def score(runs: Sequence[Predictions], target: str, known_objects: bool | None, 
     )
 
 
-def r2_by_electrode(runs: Sequence[Predictions], target: str, known_objects: bool | None) -> AnyFloats | None:
+def r2_by_electrode(runs: Sequence[GraspPredictions], target: str, known_objects: bool | None) -> AnyFloats | None:
     """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
     parts = _rows(runs, target, known_objects, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 
 
-def _rows(runs: Sequence[Predictions], target: str, known_objects: bool | None, predictor: str) -> list[_Rows]:
+def _rows(
+    runs: Sequence[GraspPredictions], target: str, known_objects: bool | None, predictor: str
+) -> list[_TargetRows]:
     """Return what each run states that holds the target, the predictor and such objects."""
     parts = []
     for rows in (run.of(known_objects) for run in runs):
@@ -172,15 +178,15 @@ def _rows(runs: Sequence[Predictions], target: str, known_objects: bool | None, 
         true, described, mean = (
             biotac_sp.normalised(target, values) for values in (rows.true[target], predicted[target], constant)
         )
-        parts.append(_Rows(true, described, mean, rows.recordings, rows.objects))
+        parts.append(_TargetRows(true, described, mean, rows.recordings, rows.objects))
     return parts
 
 
-def _pooled(parts: Sequence[_Rows]) -> _Rows:
-    return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+def _pooled(parts: Sequence[_TargetRows]) -> _TargetRows:
+    return _TargetRows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Estimate:
+def _skill(rows: _TargetRows, clusters: NDArray[np.str_]) -> Estimate:
     """Return the skill over the constant on rows where there is one."""
     defined = ~np.isnan(rows.constant).any(axis=1)
     model, baseline = (

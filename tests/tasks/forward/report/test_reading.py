@@ -139,7 +139,7 @@ def test_only_steps_that_all_runs_predict_are_shown() -> None:
     first, second = result(), result(seed=1)
     files = {**second.files, "errors.parquet": errors({"model": dict.fromkeys(WINDOWS, 0.5)}, steps=range(1, 11))}
     datasets: list[Any] = [first, FakeDataset(second.recordings, files, second.manifest)]
-    runs = [methods.Result(dataset) for dataset in datasets]
+    runs = [methods.ForwardResult(dataset) for dataset in datasets]
     assert methods.shown_steps(runs[1:]) == (1, 3, 5, 10)
     assert methods.shown_steps(runs) == (1, 3)
 
@@ -206,7 +206,7 @@ def test_the_papers_method_is_the_recurrent_one_of_twenty_components() -> None:
 
 
 def test_most_runs_decide_which_timeline_is_the_main_one() -> None:
-    fresh, uniform, logged = (methods.Result(result(timeline=name)) for name in ("fresh", "uniform", "logged"))
+    fresh, uniform, logged = (methods.ForwardResult(result(timeline=name)) for name in ("fresh", "uniform", "logged"))
     assert methods.main_timeline([fresh, uniform, fresh]) == "fresh"
     assert methods.main_timeline([fresh, uniform, logged]) == "uniform"
 

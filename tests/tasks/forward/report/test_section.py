@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tacpipe.comparison.runs import grouped
-from tacpipe.report.blocks import Note, Section
+from tacpipe.report.blocks import Section, SmallPrint
 from tacpipe.tasks.forward.report import events, methods, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -259,7 +259,7 @@ def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -
         name: [
             note.text
             for note in parts.folds(page)["What these numbers rest on"].blocks
-            if isinstance(note, Note) and "look ahead" in note.text
+            if isinstance(note, SmallPrint) and "look ahead" in note.text
         ]
         for name, page in pages.items()
     }

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from tacpipe.comparison.runs import Run
+from tacpipe.comparison.runs import ComparedRun
 from tacpipe.metrics.intervals import wilson
 from tacpipe.tasks.material.report import methods, scores
 from tests.tasks.material.report.material_fakes import result
 
 
-def runs(*results: Any) -> list[Run]:
+def runs(*results: Any) -> list[ComparedRun]:
     return methods.read_runs(results)
 
 

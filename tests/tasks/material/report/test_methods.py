@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.comparison.runs import Method
 from tacpipe.tasks.material.report import methods
-from tacpipe.tasks.material.report.methods import Result
+from tacpipe.tasks.material.report.methods import MaterialResult
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result
 
@@ -163,10 +163,10 @@ def test_a_mapped_method_tells_of_the_sensor_that_was_mapped() -> None:
 
 @pytest.mark.parametrize(("params", "slides"), [({"reduce": "biotac", "ratio": 25, "batch": 32}, 160), ({}, 576)])
 def test_a_reduced_sensor_learns_from_its_share_of_the_batches(params: dict[str, Any], slides: int) -> None:
-    run = Result(result(wrong=BOTH, joint=True, **params))
+    run = MaterialResult(result(wrong=BOTH, joint=True, **params))
     assert run.learned == {"biotac": slides, "roboskin": 576}
 
 
 def test_a_readout_learns_from_validation_slides_too_where_it_says_so() -> None:
     fake_result = result("minirocket", wrong=BOTH, use_validation=True, validation_slides=200)
-    assert Result(fake_result).learned == {"biotac": 776, "roboskin": 776}
+    assert MaterialResult(fake_result).learned == {"biotac": 776, "roboskin": 776}

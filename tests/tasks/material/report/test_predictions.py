@@ -6,13 +6,13 @@ import json
 from typing import Any
 
 from tacpipe.tasks.material.report import predictions
-from tacpipe.tasks.material.report.predictions import Predictions
+from tacpipe.tasks.material.report.predictions import SlidePredictions
 from tests.tasks.material.report.material_fakes import result
 
 BOTH = {"biotac": 1, "roboskin": 2}
 
 
-def read(fake_result: Any, **config: Any) -> Predictions:
+def read(fake_result: Any, **config: Any) -> SlidePredictions:
     content = {**json.loads(fake_result.files["config.json"]), **config}
     return predictions.read_predictions(fake_result.recordings["predictions"].table(), content)
 

@@ -11,7 +11,7 @@ from tacpipe.comparison.runs import Method
 from tacpipe.report import context
 from tacpipe.report.blocks import Section
 from tacpipe.tasks.material.report import figures, scores
-from tacpipe.tasks.material.report.methods import Result
+from tacpipe.tasks.material.report.methods import MaterialResult
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.material.report import material_fakes
@@ -163,7 +163,7 @@ def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -
 
 def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
     unpermuted, permuted = (
-        Result(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
+        MaterialResult(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
         for partners in (None, PARTNERS)
     )
     assert figures.count_nearest_partners(unpermuted.of("biotac"), unpermuted.of("roboskin"), {}) == (4, 4)

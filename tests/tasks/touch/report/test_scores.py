@@ -9,14 +9,14 @@ import pytest
 
 from tacpipe.channels import biotac_sp
 from tacpipe.tasks.touch.report import paper, predictions
-from tacpipe.tasks.touch.report.methods import Result, baseline_name
-from tacpipe.tasks.touch.report.predictions import Predictions
+from tacpipe.tasks.touch.report.methods import TouchResult, baseline_name
+from tacpipe.tasks.touch.report.predictions import GraspPredictions
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import KNOWN, NOVEL, result
 
 
-def runs(*results: Any) -> list[Predictions]:
-    return [Result(dataset).predictions for dataset in results]
+def runs(*results: Any) -> list[GraspPredictions]:
+    return [TouchResult(dataset).predictions for dataset in results]
 
 
 @pytest.mark.parametrize("target", biotac_sp.TARGETS)

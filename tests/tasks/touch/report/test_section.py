@@ -13,7 +13,7 @@ from tacpipe.report import context
 from tacpipe.report.blocks import Section
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.report import NO_EVIDENCE, figures
-from tacpipe.tasks.touch.report.methods import Result
+from tacpipe.tasks.touch.report.methods import TouchResult
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import NOVEL, recorded, result
@@ -153,7 +153,7 @@ def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
     names = [f"object{number:02d}" for number in range(11)]
     off = {name: 0.01 * (11 - number) for number, name in enumerate(names)}
     fake_result = result(off=off, known=names, per_object=1)
-    chosen = figures.choose_grasps(Result(fake_result).predictions)
+    chosen = figures.choose_grasps(TouchResult(fake_result).predictions)
     assert [(item.place, item.recording) for item in chosen] == [
         ("median", "object05-000"),
         ("best decile", "object09-000"),
@@ -163,7 +163,7 @@ def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
     shard = fake_result.recordings["predictions"]
     back = list(range(len(names)))[::-1]
     shard.tables = {name: table.take(back) for name, table in shard.tables.items()}
-    assert [item.recording for item in figures.choose_grasps(Result(fake_result).predictions)] == [
+    assert [item.recording for item in figures.choose_grasps(TouchResult(fake_result).predictions)] == [
         item.recording for item in chosen
     ]
 
@@ -210,13 +210,13 @@ def test_a_dataset_without_clouds_or_grasps_is_not_read() -> None:
 
 
 def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
-    run = Result(result("pointnet", targets=("pdc_th", "e_th"), epochs=4))
+    run = TouchResult(result("pointnet", targets=("pdc_th", "e_th"), epochs=4))
     lines = [
         {"epoch": epoch, "train_loss": loss, "val_loss": None, "target": "all", "network": network}
         for network, losses in enumerate(([4.0, 2.0, 1.0], [2.0, 1.0]))
         for epoch, loss in enumerate(losses, 1)
     ]
-    with_networks = Result(run.dataset)
+    with_networks = TouchResult(run.dataset)
     with_networks.__dict__["history"] = [*run.history, *lines]
     assert figures.losses_by_epoch(with_networks, "all", "train_loss") == [3.0, 1.5]
     assert figures.losses_by_epoch(with_networks, "all", "val_loss") == []
