@@ -85,8 +85,10 @@ def rate_hz(table: pa.Table | Columns) -> float | None:
 
 
 def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
-    """Return the rows of a stream before which samples are missing: by the device's own counter where there is one, else by
-    steps above three times the median one, which is that of the table unless it is given.
+    """Return the rows of a stream before which samples are missing.
+
+    The device's own counter shows them. A stream without a counter misses samples where a step is longer than three times
+    the median step, which is that of the table unless it is given.
     """
     import numpy as np
 
@@ -141,10 +143,10 @@ def entry(stream: str) -> str:
 def absent(
     recording: str, quantity: str, fields: Iterable[pa.Field] | Mapping[str, Iterable[pa.Field]], *, unit: str = ""
 ) -> TacpipeError:
-    """Return the error of a recording without a channel of ``quantity``; ``fields`` are those of all its columns, or of each
-    stream.
+    """Return the error of a recording without a channel of ``quantity``.
 
-    It names the quantities that are there, the columns without one, and the line of a layout file that sets it.
+    ``fields`` are those of all its columns, or of each stream. The error names the quantities that are there, the
+    columns without one, and the line of a layout file that sets it.
     """
     undeclared: list[str] = []
     counts: dict[str, int] = {}

@@ -1,7 +1,8 @@
 """Compare methods with each other and with their baselines: errors, gain over the best baseline, and intervals.
 
 Runs of a method are pooled: its errors are summed by seed and recording. Intervals are over clusters of recordings, and over
-seeds where there are several (`tacpipe.metrics.pairing`)."""
+seeds where there are several (`tacpipe.metrics.pairing`).
+"""
 
 from __future__ import annotations
 

@@ -88,10 +88,10 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
 
 
 def to_json(tree: Mapping[str, Any]) -> bytes:
-    """Return the text of a JSON file of a model or a result: keys sorted, one per line.
+    r"""Return the text of a JSON file of a model or a result: keys sorted, one per line.
 
     >>> to_json({"b": [1], "a": None})
-    b'{\\n "a": null,\\n "b": [\\n  1\\n ]\\n}\\n'
+    b'{\n "a": null,\n "b": [\n  1\n ]\n}\n'
     """
     return (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode()
 

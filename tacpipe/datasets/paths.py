@@ -23,9 +23,9 @@ def shard_path(recording: str, stream: str) -> str:
 
 
 def safe_path(path: str) -> bool:
-    """Return whether a path stays within the directory that it is relative to, and every file system takes it.
+    r"""Return whether a path stays within the directory that it is relative to, and every file system takes it.
 
-    >>> [safe_path(path) for path in ("trial-01/xela1.parquet", "../x", "/x", ".git/x", "a//b", "a\\nb", "")]
+    >>> [safe_path(path) for path in ("trial-01/xela1.parquet", "../x", "/x", ".git/x", "a//b", "a\nb", "")]
     [True, False, False, False, False, False, False]
     """
     try:

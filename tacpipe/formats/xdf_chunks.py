@@ -87,9 +87,9 @@ def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
 
 
 def read_length(data: Content, at: int) -> tuple[int, int] | None:
-    """Return a length of 1, 4 or 8 bytes and where it ends; None where there is none.
+    r"""Return a length of 1, 4 or 8 bytes and where it ends; None where there is none.
 
-    >>> read_length(b"\\x01\\x05...", 0), read_length(b"\\x02\\x05", 0)
+    >>> read_length(b"\x01\x05...", 0), read_length(b"\x02\x05", 0)
     ((5, 2), None)
     """
     width = data[at] if at < len(data) else 0

@@ -102,8 +102,10 @@ def expect_parsed(path: Path | str, size: int) -> None:
 
 
 def source(path: Path | str) -> bytes:
-    """Return what a file of a recording's source holds. Raises `TacpipeError` where it is not a regular one, as
-    `failing`."""
+    """Return the content of a file of a recording's source.
+
+    Raises `TacpipeError` if it is not a regular file, as `failing` does.
+    """
     with failing(path):
         return content(path)
 

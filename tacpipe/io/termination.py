@@ -1,5 +1,4 @@
-"""A termination request, by Ctrl-C, SIGTERM or SIGHUP: a command exits within a second, whatever it is doing, and
-states one sentence.
+"""End a command within a second of Ctrl-C, SIGTERM or SIGHUP, whatever it is doing, with one sentence.
 
 Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
 the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.

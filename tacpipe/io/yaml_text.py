@@ -16,8 +16,10 @@ MAX_CHARACTERS = 10_000_000  # characters
 
 
 def load(content: str | bytes) -> Any:
-    """Return the value of a YAML document. Raises `ValueError`, with a line that states why, for what is none or too
-    much."""
+    """Return the value of a YAML document.
+
+    Raises `ValueError`, with a line that states why, for text that is not YAML or is too large.
+    """
     import yaml
 
     if len(content) > MAX_CHARACTERS:

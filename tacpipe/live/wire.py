@@ -1,8 +1,8 @@
 """Connect the recording process with the model's process: blocks as in a spool one way, lines of JSON back.
 
-The threads that read the links call `Tap.put`, which never waits and never raises. Blocks that the socket does not accept at
-once wait in a queue of bounded size. When it is full, the whole queue is dropped and counted, and the model's process is
-informed. The recording loses nothing.
+The threads that read the links call `RecorderTap.put`, which never waits and never raises. Blocks that the socket does
+not accept at once wait in a queue of bounded size. When it is full, the whole queue is dropped and counted, and the
+model's process is informed. The recording loses nothing.
 """
 
 from __future__ import annotations

@@ -264,8 +264,10 @@ def _manifest(store: RemoteStore, name: str) -> Manifest | None:
 
 
 def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Manifest]) -> set[str]:
-    """Return the digests of manifests that nothing names, and that hold recordings or labels that no other one holds, with
-    those of all that they name."""
+    """Return the digests of manifests that hold the only copy of recordings or labels, though nothing names them.
+
+    The digests of all that these manifests name are among them.
+    """
     covered = {possession for manifest in recorded for possession, _ in replacing.possessions(manifest)}
     retained: set[str] = set()
     for name, manifest in threads.map_in_threads(lambda name: (name, _manifest_or_none(store, name)), names, AT_ONCE):

@@ -74,7 +74,7 @@ class ChangeForecast(nn.Module):
         return ((steps - self.motion_mean) / self.motion_scale).clamp(-CLIPPED, CLIPPED), up
 
     def inputs(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-        """Return past (context, window, `ForecastShape.past`) and plan (horizon, window, `Shape.plan`), scaled."""
+        """Return past (context, window, `ForecastShape.past`) and plan (horizon, window, `ForecastShape.plan`), scaled."""
         steps, up = self.arm(windows)
         arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
         past, plan = arm[: windows.context], arm[windows.context :]

@@ -44,11 +44,11 @@ class ResidualQuantiles:
     def fit(
         cls, features: Float32s, errors: Float32s, levels: AnyFloats, *, seed: int = 0, passes: int = PASSES
     ) -> Self:
-        """Return quantiles fitted to ``errors`` (window, channel, step), true less predicted, and ``features`` of each
-        channel (window, channel, feature).
+        """Fit quantiles to errors, and return them.
 
-        ``passes`` are steps of the optimiser. The same seed gives the same weights. Raises `TacpipeError` for fewer than
-        100 values, and where one is not finite.
+        ``errors`` are true less predicted values (window, channel, step), ``features`` those of each channel (window,
+        channel, feature). ``passes`` are steps of the optimiser. The same seed gives the same weights. Raises
+        `TacpipeError` for fewer than 100 values, and where one is not finite.
         """
         if errors.shape[0] * errors.shape[1] < FEWEST:
             raise TacpipeError(
@@ -71,8 +71,10 @@ class ResidualQuantiles:
         return cls(np.asarray(levels, np.float64), unit, centre, spread, weights, biases)
 
     def predict(self, features: Float32s) -> Float32s:
-        """Return quantiles of the error (window, channel, step, level), in ascending order, of features (window, channel,
-        feature)."""
+        """Return quantiles of the error (window, channel, step, level), in ascending order.
+
+        ``features`` are (window, channel, feature).
+        """
         hidden: AnyFloats = _scaled(features.reshape(-1, features.shape[-1]), self.centre, self.spread)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = _silu(hidden @ weight + bias)

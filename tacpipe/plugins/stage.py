@@ -166,7 +166,7 @@ class Stage(Generic[P, R]):
         return kinds
 
     def argument(self, kind: str) -> str | None:
-        """The name of the argument of this kind, or None."""
+        """Return the name of the argument of this kind, or None."""
         return next((name for name, argument_kind in self.arguments.items() if argument_kind == kind), None)
 
     def optional(self, name: str) -> bool:

@@ -74,9 +74,9 @@ def keys() -> Iterator[Keys]:
 
 
 def _find_key(typed: bytes, *, lines: bool) -> tuple[int, bool]:
-    """Return how many typed bytes are processed, and whether one of them is Enter or the space bar.
+    r"""Return how many typed bytes are processed, and whether one of them is Enter or the space bar.
 
-    >>> _find_key(b"ab  ", lines=False), _find_key(b"go", lines=True), _find_key(b"go\\n\\n", lines=True)
+    >>> _find_key(b"ab  ", lines=False), _find_key(b"go", lines=True), _find_key(b"go\n\n", lines=True)
     ((3, True), (0, False), (3, True))
     """
     places = [place for place in (typed.find(key) for key in ((b"\n",) if lines else (b"\n", b" "))) if place >= 0]

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 Tree = Mapping[str, Any]
 CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `tacpipe calibrate` adds
-SHORTENED = "shortened"  # setting of a method on the recordings of a paper: `Result.epochs_of_paper`, if not empty
+SHORTENED = (
+    "shortened"  # setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
+)
 GROWS = "trained_on"  # a part that names the recordings of the calibration too
 
 
@@ -126,10 +128,10 @@ def is_simulated(result: Dataset) -> bool:
 
 
 def is_published(result: Dataset, sets: Collection[str]) -> bool:
-    """Return whether all recordings of a result are of published ``sets``: what their papers state is about these data
-    alone.
+    """Return whether all recordings of a result are of published ``sets``.
 
-    The attribute ``published``, which `tacpipe ingest` sets, names the set of a recording.
+    The papers' numbers are about these data alone. The attribute ``published``, which `tacpipe ingest` sets, names the
+    set of a recording.
     """
     set_names = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.recordings.values()]
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)

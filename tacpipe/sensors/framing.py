@@ -1,8 +1,8 @@
 """Define chunks of bytes, the description of frames in them, losses, and the interface of framers.
 
-Every framer accounts for every byte: it ends up in a frame, in a `Loss`, or in what is still pending; `Account` holds the
-sums. `ByteFramer` is for streams of bytes, `LineFramer` for lines of text, `PacketFramer` and `TextFramer` for links that
-give packets.
+Every framer accounts for every byte: it ends up in a frame, in a `FramingLoss`, or in what is still pending; `Account`
+holds the sums. `ByteFramer` is for streams of bytes, `LineFramer` for lines of text, `PacketFramer` and `TextFramer`
+for links that give packets.
 """
 
 from __future__ import annotations

@@ -174,8 +174,10 @@ class Franka(Sensor):
 
 
 class _Arm(Device):
-    """The arm's side of a connection: it sends its state to ``port`` once that was given; other commands are not
-    answered."""
+    """The arm's side of a connection.
+
+    It sends its state to ``port`` once that was given, and answers no other command.
+    """
 
     port: int | None = None
 

@@ -79,8 +79,7 @@ class ScanFramer:
         return [FrameRun(data[rows_of_scans].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
 
     def _can_frames(self, chunks: Chunks) -> tuple[Bytes, Times, list[FramingLoss]]:
-        """Return the CAN frames of this board (frame, 13), their arrival, and packets that are not a CAN frames as
-        losses."""
+        """Return the CAN frames of this board (frame, 13), their arrival, and packets that are no CAN frames as losses."""
         right = (chunks.size > 0) & (chunks.size % CAN == 0)  # some adapters give several at once
         losses = [
             FramingLoss(int(at_ns), MALFORMED, 0, int(size))

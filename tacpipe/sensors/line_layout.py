@@ -95,7 +95,7 @@ def cells(columns: tuple[LineColumn, ...]) -> tuple[LineCell, ...]:
 
     Raises `UsageError` for a name that cannot be a channel's or is there twice, and for braces that name nothing.
 
-    >>> [cell.name for cell in cells((Column("t", "u32"), Column("taxel{1..2}_{x,y}", "u16")))]
+    >>> [cell.name for cell in cells((LineColumn("t", "u32"), LineColumn("taxel{1..2}_{x,y}", "u16")))]
     ['t', 'taxel01_x', 'taxel01_y', 'taxel02_x', 'taxel02_y']
     """
     by_name: dict[str, LineCell] = {}

@@ -182,9 +182,9 @@ class _Module(Device):
 
 
 def with_crc(body: bytes) -> bytes:
-    """Return a message with its CRC behind it, low byte first.
+    r"""Return a message with its CRC behind it, low byte first.
 
-    >>> with_crc(b"\\x01\\x42").hex(" ")
+    >>> with_crc(b"\x01\x42").hex(" ")
     '01 42 80 11'
     """
     return body + int(crc16_modbus(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")

@@ -277,9 +277,9 @@ class _RtdeController(Device):
 
 
 def packed(kind: int, payload: bytes = b"") -> bytes:
-    """Return a package.
+    r"""Return a package.
 
-    >>> packed(VERSION, b"\\0\\2").hex(" ")
+    >>> packed(VERSION, b"\0\2").hex(" ")
     '00 05 56 00 02'
     """
     return HEADER.pack(HEADER.size + len(payload), kind) + payload

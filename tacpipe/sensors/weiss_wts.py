@@ -193,9 +193,9 @@ class _Wts(Device):
 
 
 def message(number: int, payload: bytes = b"") -> bytes:
-    """Return a message, to the sensor or from it.
+    r"""Return a message, to the sensor or from it.
 
-    >>> message(0x06, b"\\xff").hex(" ")
+    >>> message(0x06, b"\xff").hex(" ")
     'aa aa aa 06 01 00 ff 2a 87'
     """
     body = MARKER + bytes([number]) + len(payload).to_bytes(2, "little") + payload

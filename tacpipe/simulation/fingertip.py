@@ -44,8 +44,10 @@ def gains() -> Floats:
 
 
 def leans() -> Floats:
-    """Return the fraction of the friction that each electrode measures as pressure (electrode,): d, forward of the
-    centre > 0."""
+    """Return the fraction of the friction that each electrode measures as pressure (electrode,).
+
+    This is the term d; it is positive forward of the centre.
+    """
     lean: Floats = LEAN * np.tanh((ALONG_M - CENTRE_M[0]) / 0.005)
     return lean
 

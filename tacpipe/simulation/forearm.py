@@ -33,16 +33,20 @@ ALONG_M = PLACES_M[:, 0]  # (taxel,), xi: by which a taxel measures the surface 
 
 
 def fractions(patch_m: Floats) -> Floats:
-    """Return how much of the patch's pressure each taxel measures (time, taxel), 1 at its centre ``patch_m`` (time,
-    axis)."""
+    """Return the fraction of the patch's pressure that each taxel measures (time, taxel).
+
+    It is 1 at the patch's centre ``patch_m`` (time, axis).
+    """
     distance2 = ((PLACES_M - patch_m[:, None]) ** 2).sum(axis=2)
     fraction: Floats = np.exp(-distance2 / (2 * SIGMA_M**2))
     return fraction
 
 
 def leans(patch_m: Floats) -> Floats:
-    """Return the fraction of the friction that each taxel measures as pressure (time, taxel): d, forward of the patch >
-    0."""
+    """Return the fraction of the friction that each taxel measures as pressure (time, taxel).
+
+    This is the term d; it is positive forward of the patch.
+    """
     lean: Floats = LEAN * np.tanh((ALONG_M - patch_m[:, :1]) / SIGMA_M)
     return lean
 

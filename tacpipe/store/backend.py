@@ -27,8 +27,10 @@ T = TypeVar("T")
 
 
 class Backend(Protocol):
-    """A place that keeps bytes by name. Every verb raises `StorageError` where the place fails, which states nothing of
-    what it keeps."""
+    """A place that keeps bytes by name.
+
+    Every method raises `StorageError` if the place fails. Such an error says nothing about what the place holds.
+    """
 
     place: str  # Name in messages
 

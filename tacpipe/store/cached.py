@@ -49,8 +49,10 @@ def _of_user() -> Path:
 
 
 class CachedStore(Store):
-    """The store at an address; ``root`` is the folder in front of it. Raises `StorageError` where the bucket is needed
-    and cannot be reached."""
+    """The store at an address; ``root`` is the folder that caches it.
+
+    Methods raise `StorageError` if they need the bucket and cannot reach it.
+    """
 
     distant = True
 

@@ -1,5 +1,6 @@
-"""Remember that all files of a large dataset were present, and the state of the folders: while they are unchanged, the
-files are there, and none of them is looked at.
+"""Remember that all files of a large dataset were present, with the state of their folders.
+
+While the folders are unchanged the files are there, and none of them is looked at.
 
 A folder changes its time whenever a name in it comes, goes or is given to another file. Where it changed so shortly before
 the look that the next change might have the same time, its time is not noted. Of a folder of objects each object is looked

@@ -69,8 +69,10 @@ class RemoteStore:
         return True
 
     def prepare(self) -> None:
-        """Begin the store where there is none yet. Raises `UsageError` as `check` does, and where the server does not
-        refuse to create what is there already."""
+        """Create the store if there is none yet.
+
+        Raises `UsageError` as `check` does, and if the server creates an object that exists already.
+        """
         if self.files.create(layout.MARK, layout.FORMAT.encode() + b"\n"):
             self._expect_conditional()
         self.check()

@@ -112,19 +112,19 @@ class TimedStream:
         return channel_names(self.columns.schema)
 
     def field(self, name: str) -> pa.Field:
-        """The field of a channel: of one that was unwrapped as it is then."""
+        """Return the field of a channel; of an unwrapped one with the type after unwrapping."""
         import pyarrow as pa
 
         channel = self.columns.schema.field(name)
         return channel.with_type(pa.int32()) if name in self.unwrapped else channel
 
     def values(self, name: str) -> AnyArray:
-        """A channel of numbers (time,)."""
+        """Return a channel of numbers (time,)."""
         unwrapped_values = self.unwrapped.get(name)
         return self.columns.column(name).to_numpy() if unwrapped_values is None else unwrapped_values
 
     def at(self, name: str, rows: pa.Array) -> pa.Array:
-        """A channel of any type at some rows."""
+        """Return a channel of any type at some rows."""
         import pyarrow as pa
 
         unwrapped_values = self.unwrapped.get(name)

@@ -40,16 +40,16 @@ class Follower(Protocol):
     """Receive calls as a training proceeds."""
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
-        """A network is trained from here; ``history`` are its epochs before an interruption."""
+        """Begin to follow the training of a network; ``history`` are its epochs before an interruption."""
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
-        """Another batch is learned; ``passed`` is the fraction of the epoch, ``loss`` returns the mean so far."""
+        """Follow a batch that was learned; ``passed`` is the fraction of the epoch, ``loss`` returns the mean so far."""
 
     def line(self, line: Line, learning_rate: float) -> None:
-        """An epoch is over and its checkpoint written."""
+        """Follow an epoch that is over and whose checkpoint is written."""
 
     def end(self, *, trained: bool) -> None:
-        """The network is trained, or an error or a user ended its training."""
+        """End: the network is trained, or an error or a user ended its training."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def outputs(inputs: Tensor, h: Tensor, c: Tensor, w: Tensor, r: Tensor, b: Tenso
 def reference(
     inputs: Tensor, h: Tensor, c: Tensor, w: Tensor, r: Tensor, b: Tensor, *lead: Tensor
 ) -> tuple[nn.LSTM, list[Tensor]]:
-    """torch's own layer with these weights."""
+    """Torch's own layer with these weights."""
     layer = nn.LSTM(inputs.shape[-1], HIDDEN).to(inputs.dtype)
     with torch.no_grad():
         for name, value in (("weight_ih", w), ("weight_hh", r), ("bias_ih", b), ("bias_hh", torch.zeros_like(b))):

@@ -46,7 +46,8 @@ class Browser:
 
     def show(self, page: bytes, width: int) -> None:
         """Show a page in a window of so many CSS pixels, and wait until it is loaded, its fonts are there and the charts
-        in view are drawn."""
+        in view are drawn.
+        """
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         self._call("Emulation.setDeviceMetricsOverride", size)
         file = self._folder / f"page-{self._number}.html"

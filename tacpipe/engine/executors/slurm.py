@@ -156,9 +156,9 @@ def _numbers(cluster: SLURMCluster) -> list[str]:
 
 
 def _reason(text: str) -> str:
-    """Return what sbatch printed, of an error of dask-jobqueue.
+    r"""Return what sbatch printed, of an error of dask-jobqueue.
 
-    >>> _reason("Exit code: 1\\nCommand:\\nsbatch x\\nstdout:\\n\\nstderr:\\nsbatch: error: invalid partition: x\\n\\n")
+    >>> _reason("Exit code: 1\nCommand:\nsbatch x\nstdout:\n\nstderr:\nsbatch: error: invalid partition: x\n\n")
     'invalid partition: x'
     """
     printed = text.rpartition("stderr:")[2].strip().splitlines()

@@ -68,7 +68,7 @@ class Tree(Protocol):
         """Sentences about the missing part of a truncated file."""
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
-        """The arrays in a group, and the paths of the groups in it."""
+        """Return the arrays in a group, and the paths of the groups in it."""
 
     def is_group(self, path: str) -> bool:
         """Return True where a group has this path."""
@@ -77,16 +77,16 @@ class Tree(Protocol):
         """Return a value that is equal for all paths of one group; links can give a group several paths."""
 
     def attributes(self, group: str) -> Mapping[str, Any]:
-        """The attributes of a group."""
+        """Return the attributes of a group."""
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-        """The rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
+        """Return the rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
-        """The files that hold rows of an array, by path within the store; None where all lies in one file."""
+        """Return the files that hold rows of an array, by path within the store; None where all lies in one file."""
 
     def encoding_metadata(self, array: ArrayDescription) -> Any:
-        """How the rows of an array are encoded, as JSON, without how many there are."""
+        """Return how the rows of an array are encoded, as JSON, without their number."""
 
 
 def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription]:
@@ -94,7 +94,7 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
 
     Where no dimension is, time is the first unless it is a small part of the longest.
 
-    >>> arrays = [Array("tactile", (18, 3, 400), np.dtype("f4")), Array("t", (400,), np.dtype("f8"))]
+    >>> arrays = [ArrayDescription("tactile", (18, 3, 400), np.dtype("f4")), ArrayDescription("t", (400,), np.dtype("f8"))]
     >>> [array.shape for array in with_time_first(arrays)]
     [(400, 18, 3), (400,)]
     """
@@ -150,9 +150,9 @@ def is_frames(array: ArrayDescription) -> bool:
 def is_image(array: ArrayDescription) -> bool:
     """Return whether an array holds a decoded picture a row.
 
-    >>> is_image(Array("obs/agentview_image", (9, 84, 84, 3), np.dtype("uint8")))
+    >>> is_image(ArrayDescription("obs/agentview_image", (9, 84, 84, 3), np.dtype("uint8")))
     True
-    >>> is_image(Array("obs/tactile", (9, 16, 3), np.dtype("uint16")))
+    >>> is_image(ArrayDescription("obs/tactile", (9, 16, 3), np.dtype("uint16")))
     False
     """
     sides = array.shape[1:]
@@ -165,7 +165,7 @@ def is_image(array: ArrayDescription) -> bool:
 def reason_left_out(array: ArrayDescription) -> str:
     """Return why an array is not read as columns, as in "NAME …"; empty where it is.
 
-    >>> reason_left_out(Array("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
+    >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
     'holds decoded pictures (480 x 640 x 3), which are not read'
     """
     if array.problem:

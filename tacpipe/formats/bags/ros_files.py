@@ -1,7 +1,7 @@
 """Read the records of ROS 1 bags and of ROS 2's SQLite files: topics with their definitions, raw messages, metadata.
 
 The readers of all three storages (MCAP, ROS 1 bags, SQLite) start at the first record, without its index, and yield the same
-types. A reader that stops early yields a `Damage` last.
+types. A reader that stops early yields a `BagDamage` last.
 """
 
 from __future__ import annotations

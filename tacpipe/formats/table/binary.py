@@ -155,10 +155,10 @@ class Archive(Protocol):
     """An opened archive of arrays."""
 
     def infolist(self) -> list[zipfile.ZipInfo]:
-        """The files in it."""
+        """Return the names of the files in the archive."""
 
     def open(self, name: str, /) -> contextlib.AbstractContextManager[IO[bytes]]:
-        """A file in it, opened for reading."""
+        """Open a file of the archive for reading."""
 
 
 @dataclass(frozen=True)

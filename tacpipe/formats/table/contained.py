@@ -37,7 +37,7 @@ class ContainerCommand:
 
     ::
 
-        COMMAND = Command("xdf")
+        COMMAND = ContainerCommand("xdf")
 
         @stage(
             version=1,

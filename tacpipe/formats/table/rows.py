@@ -115,10 +115,10 @@ class RowFile(Protocol):
         """The path of the file."""
 
     def names(self) -> list[str]:
-        """The names of its columns."""
+        """Return the names of the columns."""
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Any:
-        """Its columns, block by block."""
+        """Return the columns, block by block."""
 
     def place(self, index: int) -> str:
         """How a row is named in errors."""

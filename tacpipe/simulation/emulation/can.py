@@ -118,10 +118,10 @@ class Slcan(Pty):
 
 
 def line(identifier: int, data: bytes) -> bytes:
-    """Return the line of a CAN frame.
+    r"""Return the line of a CAN frame.
 
-    >>> line(0x440, b"\\x40\\xf0")
-    b't440240F0\\r'
+    >>> line(0x440, b"\x40\xf0")
+    b't440240F0\r'
     """
     head = f"T{identifier & 0x1FFFFFFF:08X}" if identifier & EXTENDED else f"t{identifier & 0x7FF:03X}"
     return f"{head}{len(data)}{data.hex().upper()}\r".encode()

@@ -1,5 +1,4 @@
-"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults state, sent when they are
-due."""
+"""Send a stream of an emulated rig: samples are planned ahead, changed by the faults, and sent when they are due."""
 
 from __future__ import annotations
 

@@ -252,8 +252,10 @@ class Forecaster:
         return quantiles[0] if single else quantiles
 
     def signs(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
-        """Return what states how uncertain the forecast ``ahead`` (window, step, channel) is: `uncertainty.window_signs`
-        of windows and their levels ``past`` (window, context, channel), both above rest."""
+        """Return features of how uncertain a forecast is: `uncertainty.window_signs` of windows.
+
+        Forecasts ``ahead`` (window, step, channel) and levels ``past`` (window, context, channel) are above rest.
+        """
         return window_signs(windows, past, ahead, self.channel_scale, self.actions)
 
     def band(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:

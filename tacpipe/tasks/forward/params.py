@@ -1,6 +1,6 @@
 """How a model of the task ``forward`` is built and trained: the params of `tacpipe train forward`, one class a family.
 
-Classes of other packages extend `Forward`, whose `build` states what a network reads and returns.
+Classes of other packages extend `ForwardModelParams`, whose `build` states what a network reads and returns.
 """
 
 from __future__ import annotations

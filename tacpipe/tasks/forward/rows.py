@@ -41,8 +41,10 @@ class Rows:
         return loop.WindowSet(len(self.starts), self.loss)
 
     def pick(self, starts: Tensor) -> tuple[ForecastWindows, Tensor]:
-        """Return the windows that begin at ``starts`` (window,) and their future tactile signals (horizon, window,
-        feature)."""
+        """Return the windows that begin at ``starts`` (window,), and their future.
+
+        The future is that of the tactile signals (horizon, window, feature).
+        """
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
         touch, arm = (values.index_select(0, rows.flatten()).view(*rows.shape, -1) for values in (self.touch, self.arm))

@@ -88,7 +88,6 @@ class ForwardTask(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated recordings, for the default model and that of the paper."""
-
         return demo(output)
 
 

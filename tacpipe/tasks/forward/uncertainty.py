@@ -84,8 +84,10 @@ class Uncertainty:
         return calibrated.percents(self.errors.levels)
 
     def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
-        """Return quantiles in counts above rest (window, step, channel, level), ascending, of the forecast ``ahead``
-        (window, step, channel) and its ``signs`` (window, channel, feature)."""
+        """Return quantiles in counts above rest (window, step, channel, level), ascending.
+
+        They are those of the forecast ``ahead`` (window, step, channel), whose features are (window, channel, feature).
+        """
         quantiles = self.errors.predict(read)  # (window, channel, step, level)
         middle, unit = len(self.percents) // 2, self.errors.unit[None]
         for at in range(len(self.percents)):

@@ -44,8 +44,11 @@ class SensorCalibration:
         return self.scores_by_rule(scores, frames)[self.rule]
 
     def scores_by_rule(self, scores: AnyFloats, frames: Float32s) -> dict[Rule, Floats]:
-        """Return `score` by rule: the log odds of the largest probability, and minus half the squared distance to the
-        nearest class."""
+        """Return `score` by rule.
+
+        ``probability`` is the log odds of the largest probability, ``distance`` minus half the squared distance to the
+        nearest class.
+        """
         return {
             "probability": _log_odds(scores / self.temperature),
             "distance": self.distance.scores(frames).max(axis=1),

@@ -198,7 +198,7 @@ def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], na
 def difference(expected: SlideLayout, layout: SlideLayout) -> str:
     """Return in words how one layout differs from another.
 
-    >>> difference(Layout("a", ("x",), 400, 100.0), Layout("a", ("x",), 75, 100.0))
+    >>> difference(SlideLayout("a", ("x",), 400, 100.0), SlideLayout("a", ("x",), 75, 100.0))
     'has 75 frames, not 400'
     """
     if layout.channels != expected.channels:

@@ -145,5 +145,4 @@ class MaterialTask(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated slides."""
-
         return demo(output)

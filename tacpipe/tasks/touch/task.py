@@ -159,5 +159,4 @@ class TouchTask(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated grasps."""
-
         return demo(output)

@@ -1,7 +1,7 @@
 """A model's chain of stages, fed samples as they arrive: rows on the model's grid, latents, windows and forecasts.
 
 Nothing here reads a clock, a file or a link: what comes out depends on the samples, their stamps and the plan alone, and
-not on how they were cut into batches. `tacpipe predict --causal` feeds a recording to the same `Chain`, and so gives bit
+not on how they were cut into batches. `tacpipe predict --causal` feeds a recording to the same `LiveChain`, and so gives bit
 for bit what a live session published. docs/explanation/causal.md states the rules.
 """
 

@@ -291,7 +291,7 @@ class ForecastEngine(Engine):
 def words(forecast: GridForecast) -> str:
     """Return the cause of a forecast in words.
 
-    >>> words(Forecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))
+    >>> words(GridForecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))
     'nothing new comes from xela2'
     """
     cause = forecast.cause

@@ -1,4 +1,4 @@
-"""Recordings given to a `Chain` as they were recorded: what `tacpipe predict --causal` writes."""
+"""Recordings given to a `LiveChain` as they were recorded: what `tacpipe predict --causal` writes."""
 
 from __future__ import annotations
 
@@ -112,8 +112,10 @@ def chain_of(
     *,
     allow_look_ahead: bool = False,
 ) -> LiveChain:
-    """Return the chain of a model for the streams ``tables`` of a recording, with the master and source of plans that it
-    names; all else is as in `Chain.for_model`."""
+    """Return the chain of a model for the streams ``tables`` of a recording.
+
+    The recording names the master stream and the source of plans. The rest is as in `LiveChain.for_model`.
+    """
     schemas = {name: table.schema for name, table in tables.items()}
     plan = str(recording.attributes.get("live_plan", ""))
     source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""

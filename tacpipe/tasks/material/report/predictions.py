@@ -53,8 +53,10 @@ class SlidePredictions:
 
     @property
     def one_session_each(self) -> bool:
-        """True if all slides of a material that a sensor measured are of one session, so that both cannot be
-        distinguished."""
+        """True if all slides of a material that a sensor measured are of one session.
+
+        The material and the session cannot be distinguished then.
+        """
         if self.sessions is None or not len(self.sessions) or (self.sessions == "").any():
             return False
         sessions: dict[tuple[str, int], set[str]] = {}
