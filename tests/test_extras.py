@@ -22,7 +22,7 @@ from tests import without_extras
 from tests.clouds import shapes
 from tests.commands import run as run_all
 from tests.conftest import Lab, forget, run_python, write_plugin
-from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
+from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.lerobot import files as lerobot_files
 from tests.promises.warm import Warm, serving
@@ -94,6 +94,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "limits data/grasps": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
+    "ingest gelsight-slip gels -o {o}": "video",
     "ingest table workbooks --guess": "xlsx",
     "ingest mcap bags -o {o}": "ros",
     "ingest rosbag bags -o {o}": "ros",
@@ -154,6 +155,7 @@ def prepare(folder: Path) -> None:
     slide_files.write_biotac(folder / "biotac")
     slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
+    video_files.write_gelsight(folder / "gels")
     points_m = shapes.visible_half(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
     split = "tacpipe split data/segments -o data/split-again"

@@ -19,6 +19,7 @@ OWN = (NAME, "tacpipe_stages")
 PLUGINS = "tacpipe."  # groups of entry points
 PACKAGES = {  # modules whose package has another name
     "can": "python-can",
+    "cv2": "opencv-python-headless",
     "google": "protobuf",
     "hid": "hidapi",
     "hidraw": "hidapi",

@@ -29,7 +29,7 @@ T = TypeVar("T")
 class Backend(Protocol):
     """A place that keeps bytes by name.
 
-    Every method raises `StorageError` if the place fails. Such an error says nothing about what the place holds.
+    Every method raises `StorageError` if the place fails. Such an error states nothing about what the place holds.
     """
 
     place: str  # Name in messages

@@ -23,7 +23,7 @@ from tacpipe.errors import UsageError
 from tacpipe.formats.published import PREFIX, trials, valid
 from tacpipe.io import files, regular
 from tests.conftest import Lab
-from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats import grasp_files, slide_files, video_files, xela_files
 
 Trial = Callable[..., Path]
 
@@ -219,6 +219,7 @@ FORMATS = {  # format: file of each kind that it reads, and how it is made
     "xela-psc": ("xela_sensor2.csv", "robot_state.csv", "slip_label.csv", "meta_data.csv"),
     "biotac-slide": ("mat3_7_bio.csv", "mat3_7_cv.csv"),
     "roboskin": ("icub_fold_0.npy", "labels_fold_0.npy"),
+    "gelsight-slip": ("camera_0.avi", "camera_2.avi"),
     "vision2tactile": ("cloud-object.pcd", "best-grasp.txt", "tactile.tac"),
 }
 
@@ -230,6 +231,9 @@ def published(name: str, folder: Path) -> None:
     elif name == "biotac-slide":
         slide_files.write_biotac(folder)
         slide_files.write_biotac(folder, trial=8)
+    elif name == "gelsight-slip":
+        video_files.write_gelsight(folder)
+        video_files.write_gelsight(folder, trial=2)
     elif name == "vision2tactile":
         grasp_files.write_grasp(folder)
         grasp_files.write_grasp(folder, after_s=60, seed=1)

@@ -59,6 +59,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # Commands that work with each extra and
     "slurm": (),
     "tensorboard": (),
     "track": (),
+    "video": (),
     "wandb": (),
     "xlsx": (),
     "zarr": ZARR,

@@ -201,7 +201,7 @@ def _ingest(name: str) -> Case:
 
 def _publish(name: str, place: Path) -> None:
     """Write recordings in a published format."""
-    from tests.formats import grasp_files, slide_files, xela_files
+    from tests.formats import grasp_files, slide_files, video_files, xela_files
     from tests.formats.arrays import files as array_files
     from tests.formats.lerobot import files as lerobot_files
     from tests.promises import targets
@@ -212,6 +212,8 @@ def _publish(name: str, place: Path) -> None:
         slide_files.write_roboskin(place, slide_files.touched(2))
     elif name == "vision2tactile":
         grasp_files.write_grasp(place)
+    elif name == "gelsight-slip":
+        video_files.write_gelsight(place)
     elif name == "table":
         place.mkdir()
         for trial in "ab":
@@ -252,7 +254,10 @@ STAGES = (
     Case("report", "report results/f -o report.html", FORWARD),
     *_export(("card", "csv", "hdf5", "mcap"), "data/r", 1),
     *_export(("lerobot", "zarr"), "data/synced", 2),
-    *(_ingest(name) for name in ("biotac-slide", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")),
+    *(
+        _ingest(name)
+        for name in ("biotac-slide", "gelsight-slip", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")
+    ),
     *(_ingest(name) for name in CONTAINERS),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}

@@ -40,7 +40,7 @@ from tacpipe.plugins.stage import Source
 from tacpipe.recording import rig, spool, spool_folders, spooled
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
-from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
+from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.bags import writers
 from tests.formats.lerobot import files as lerobot_files
@@ -333,6 +333,7 @@ TREES: dict[str, Callable[[Path], object]] = {  # Functions that write a valid s
     "rosbag": _bags,
     "roboskin": _roboskin,
     "table": _tables,
+    "gelsight-slip": video_files.write_gelsight,
     "vision2tactile": _grasps,
     "xdf": _session,
     "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),

@@ -33,7 +33,7 @@ from mcap.writer import Writer as McapWriter
 from tacpipe.plugins import registry
 from tests import peaks
 from tests.conftest import Lab, Ran
-from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
+from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.bags import writers
 from tests.formats.lerobot import files as lerobot_files
@@ -255,6 +255,7 @@ NAMED_TWICE: dict[str, list[Case] | str] = {
             "are the same block",
         )
     ],
+    "gelsight-slip": [Case(_write_twice(video_files.write_gelsight), "would both be named lemon-1")],
     "vision2tactile": [Case(_write_twice(grasp_files.write_grasp), "would both be named bleach")],
     "xela-flat": [Case(_write_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nested, 2)],
     "xela-psc": [Case(_write_twice(lambda place: xela_files.write_psc(place / "trial")), 2)],
@@ -438,6 +439,7 @@ DAMAGED: dict[str, list[Case] | str] = {
             "labels_fold_0.npy",
         )
     ],
+    "gelsight-slip": "files of video have no checksums; packets are stored as they lie in the file",
     "vision2tactile": [Case(_changed(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
     "xela-flat": [
         Case(_changed(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
@@ -530,6 +532,7 @@ LEADS_OUT: dict[str, list[Case] | str] = {
     "roboskin": [
         Case(_linked(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels*"), OUT)
     ],
+    "gelsight-slip": [Case(_linked(video_files.write_gelsight, "camera_2.avi"), OUT)],
     "vision2tactile": [Case(_linked(grasp_files.write_grasp, "tactile.tac"), OUT)],
     "xela-flat": [Case(_linked(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), OUT)],
     "xela-psc": [Case(_linked(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), OUT)],
@@ -633,6 +636,7 @@ RUNS_CODE: dict[str, list[Case] | str] = {
             "icub_fold_0.npy",
         )
     ],
+    "gelsight-slip": "the codecs of video are those of FFmpeg, none of which runs code",
     "vision2tactile": TEXT,
     "xela-flat": TEXT,
     "xela-psc": TEXT,
@@ -833,6 +837,7 @@ DECLARED: dict[str, list[Case] | str] = {
             "icub_fold_0.npy",
         )
     ],
+    "gelsight-slip": "packets are no larger than their file, and frames have a largest size",
     "vision2tactile": "its clouds are asked in test_hostile_files.py",
     "xela-flat": "numbers in text declare no size",
     "xela-psc": "numbers in text declare no size",

@@ -1,0 +1,82 @@
+"""Trials of two GelSight Mini on a Franka hand that holds, lifts and shakes an object: Incipient-Slip-Detection (BSD-2).
+
+Published as amitparag/Incipient-Slip-Detection. A trial is a folder ``OBJECT/exp_num_N`` with a video of each sensor,
+``camera_0.avi`` and ``camera_2.avi`` (MPEG-4, 25 frames per second, no clock), and an empty file ``slip.txt`` if the object
+slipped. A trial with a slip ends at the slip, so its length alone gives the label away: compare windows at equal times
+since the start.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacpipe.datasets import recording_names
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.published import published_attribute, require, text, valid
+from tacpipe.io.files import walk
+from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VIDEOS = {"camera_0.avi": "gel0", "camera_2.avi": "gel2"}  # stream of each video
+SLIP = "slip.txt"
+NAMES = (*VIDEOS, SLIP)
+
+
+@dataclass(frozen=True)
+class Params(StreamSelection):
+    """How trials are read."""
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the files of each trial below ``source`` by recording name, ``lemon-3`` for ``lemon/exp_num_3/``.
+
+    Files are named as they lie, ``lemon/exp_num_3/camera_0.avi``, so that the object is part of a key. Raises
+    `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` if two trials share a name.
+    """
+    if not source.is_dir():
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds those of the objects, lemon and so on."
+        )
+    files_by_trial: dict[str, dict[str, Path]] = {}
+    named_folders: list[tuple[str, Path]] = []
+    for place, _, names in walk(source):
+        present_names = [name for name in NAMES if name in names]
+        if not present_names:
+            continue
+        above, folder = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
+        label, trial = text(os.path.basename(above)), text(folder)  # noqa: PTH119
+        name = valid(f"{label}-{trial.removeprefix('exp_num_')}")
+        named_folders.append((name, Path(place)))
+        files_by_trial[name] = {f"{label}/{trial}/{file}": Path(place, file) for file in present_names}
+    recording_names.refuse_shared(named_folders)
+    if not files_by_trial:
+        raise TacpipeError(
+            f"{source} holds no trial: no folder in it has {', '.join(VIDEOS)}. Give the folder of the unpacked data set."
+        )
+    return dict(sorted(files_by_trial.items()))
+
+
+@stage(version=1, discover=discover)
+def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
+    """Read published videos of two GelSight Mini, with slip.
+
+    Returns the streams gel0 and gel2, a row per frame, and the labels object and slip. A trial with a slip ends at the
+    slip, so the length of a recording gives the label away.
+    """
+    from tacpipe.video.files import read_stream, scan
+
+    trial_files = {Path(name).name: path for name, path in files.items()}
+    require(trial_files, tuple(VIDEOS))
+    streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
+    for name, stream in VIDEOS.items():
+        frames = scan(trial_files[name])
+        streams[stream] = read_stream(trial_files[name], frames, frames.times_ns(), frames.stamp_origin())
+    label = next(iter(files)).split("/", 1)[0]
+    attributes: dict[str, Attribute] = {"sensor": "gelsight-mini", "object": label, "slip": SLIP in trial_files}
+    return RecordingOutput(streams, {**attributes, **published_attribute("gelsight-slip")})

@@ -1,0 +1,1 @@
+"""Streams of encoded frames: their columns, reading and writing video files, decoding and encoding."""

@@ -1,0 +1,150 @@
+"""Decode the frames of a stream into arrays, one after another; PyAV (FFmpeg) decodes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.arrays import AnyArray, Bytes
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins import extras
+from tacpipe.printable import plain
+from tacpipe.video.stream import (
+    BATCH_ROWS,
+    DTS,
+    KEY_FRAME,
+    PACKET,
+    PTS,
+    VideoFormat,
+    cut_rows,
+    in_decode_order,
+    read_format,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.io.columns import Columns
+
+NEEDED_BY = "Reading video"  # begins the error of a missing extra
+MAX_DELAY = 16  # frames that a decoder may hold back
+DECODERS = {"av1": "libdav1d"}  # FFmpeg's own decoder of AV1 needs a graphics card
+RGB, GREY = "rgb24", "gray"  # FFmpeg's names
+
+
+def decode_frames(
+    video_format: VideoFormat, batches: Iterable[pa.Table], *, grey: bool = False
+) -> Iterator[tuple[int, Bytes]]:
+    """Yield row number and image of each frame, uint8 (height, width, rgb), or (height, width) for ``grey``.
+
+    ``batches`` are rows of a stream in presentation order, from a key frame on; rows are counted from the first of them.
+    Frames come in the order of rows. A row that has no picture, as an empty packet, is left out. Few frames are in memory
+    at once. Raises `TacpipeError` where a frame cannot be decoded or has another size, `MissingModuleError` without PyAV.
+    """
+    for row, frame in _decode(video_format, batches):
+        image: Bytes = frame.to_ndarray(format=GREY if grey else RGB)
+        yield row, image
+
+
+def decode_samples(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, AnyArray]]:
+    """Yield as `decode_frames` does, in the type of the samples: uint16 (height, width) for grey images of 16 bits."""
+    deep = video_format.pixel_format.startswith("gray16")
+    for row, frame in _decode(video_format, batches):
+        if deep:
+            yield row, frame.to_ndarray(format="gray16le")
+        else:
+            yield row, frame.to_ndarray(format=GREY if video_format.pixel_format == GREY else RGB)
+
+
+def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> Iterator[pa.Table]:
+    """Yield the rows ``start`` to ``stop`` of a stream of frames as small batches, for `decode_frames`."""
+    first = 0
+    stop = columns.num_rows if stop is None else stop
+    for batch in columns.batches([PACKET, PTS, DTS, KEY_FRAME], BATCH_ROWS):
+        rows = batch.slice(max(0, start - first), max(0, stop - max(first, start)))
+        if rows.num_rows:
+            yield rows
+        first += batch.num_rows
+        if first >= stop:
+            return
+
+
+def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) -> dict[int, Bytes]:
+    """Return the images of some rows of a stream of frames by row, as `decode_frames` yields them.
+
+    Only what each needs is decoded: the rows from the key frame before it.
+    """
+    video_format = read_format(columns)
+    if video_format is None:
+        raise TacpipeError("This stream holds no frames. Give the stream of a camera.")
+    clocks = columns.read([DTS, KEY_FRAME])
+    dts, key_frame = clocks[DTS].to_numpy(), clocks[KEY_FRAME].to_numpy()
+    images: dict[int, Bytes] = {}
+    pending = sorted(set(rows))
+    while pending:
+        start, stop = cut_rows(dts, key_frame, pending[0], pending[0] + 1)
+        group = [row for row in pending if row < stop]
+        for index, frame in _decode(video_format, read_batches(columns, start, stop)):
+            if start + index in group:
+                images[start + index] = frame.to_ndarray(format=GREY if grey else RGB)
+        pending = pending[len(group) :]
+    return images
+
+
+def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, Any]]:
+    """Yield row number and decoded frame of PyAV."""
+    with extras.explain_missing(NEEDED_BY):
+        import av
+    context = open_decoder(video_format)
+    started = False
+    row = 0
+    try:
+        for row, columns in in_decode_order(video_format, batches):
+            if not started and not columns[KEY_FRAME]:
+                raise TacpipeError(
+                    f"Frame {row} cannot be decoded: it is the first to be decoded, and no key frame. Start at a key frame."
+                )
+            started = True
+            if not columns[PACKET]:
+                continue
+            packet = av.Packet(columns[PACKET])
+            packet.pts = packet.dts = row
+            for frame in context.decode(packet):
+                yield _numbered(video_format, frame)
+        for frame in context.decode(None) if started else ():
+            yield _numbered(video_format, frame)
+    except (av.error.FFmpegError, ValueError) as error:
+        reason = plain(str(getattr(error, "strerror", None) or error), 100)
+        raise TacpipeError(
+            f"Frame {row} cannot be decoded as {plain(video_format.codec)}: {reason}. Check that the video plays in another "
+            f"program, and ingest it again."
+        ) from error
+
+
+def open_decoder(video_format: VideoFormat) -> Any:
+    """Return a decoder of PyAV, on one thread. Raises `TacpipeError` where FFmpeg has none for the codec."""
+    with extras.explain_missing(NEEDED_BY):
+        import av
+    try:
+        context: Any = av.CodecContext.create(DECODERS.get(video_format.codec, video_format.codec), "r")
+    except ValueError as error:  # UnknownCodecError is one
+        raise TacpipeError(
+            f"There is no decoder for the codec {plain(video_format.codec)}. Convert the video to H.264 first."
+        ) from error
+    context.thread_count = 1  # a stage runs on one core per recording
+    context.width, context.height = video_format.width_px, video_format.height_px
+    if video_format.pixel_format:
+        context.pix_fmt = video_format.pixel_format
+    if video_format.extradata:
+        context.extradata = video_format.extradata
+    context.reorder_depth = min(video_format.reorder_frames, MAX_DELAY)
+    return context
+
+
+def _numbered(video_format: VideoFormat, frame: Any) -> tuple[int, Any]:
+    if (frame.width, frame.height) != (video_format.width_px, video_format.height_px):
+        raise TacpipeError(
+            f"Frame {frame.pts} has {frame.width} x {frame.height} pixels, and the stream {video_format.width_px} x "
+            f"{video_format.height_px}. Frames of a stream have one size: divide the video where the size changes."
+        )
+    return int(frame.pts), frame

@@ -1,0 +1,317 @@
+"""Read video files into streams of frames and write streams as video files: packets are copied, never encoded again."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, Bools, Int64s, Times
+from tacpipe.errors import TacpipeError
+from tacpipe.io import regular
+from tacpipe.plugins import extras
+from tacpipe.printable import plain
+from tacpipe.video.decoding import NEEDED_BY, open_decoder
+from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, PACKET, PTS, VideoFormat, in_decode_order, reorder_frames
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DEMUXERS = {  # FFmpeg's names by extension: what a file contains does not choose, as a playlist would open other files
+    ".avi": "avi",
+    ".m4v": "mp4",
+    ".mjpeg": "mjpeg",
+    ".mjpg": "mjpeg",
+    ".mkv": "matroska",
+    ".mov": "mp4",
+    ".mp4": "mp4",
+    ".webm": "matroska",
+}
+WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files that do not state when a frame is presented
+NOMINAL = "from nominal rate"  # origin of stamps that a file's frame rate gave
+FROM_PTS = "from presentation times"  # origin of stamps that a file's own presentation times gave
+FRAME_TOLERANCE = 1e-6  # frames by which a time may differ from the grid of the nominal rate, besides one tick
+
+
+@dataclass(frozen=True)
+class VideoScan:
+    """The frames of a video file without their packets, in presentation order."""
+
+    video_format: VideoFormat
+    pts: Int64s  # (frame,)
+    dts: Int64s  # (frame,)
+    key_frame: Bools  # (frame,)
+    packet_index: Int64s  # (frame,), position in the file
+    bytes: int  # size of all packets
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.pts)
+
+    def times_ns(self) -> Times:
+        """Return the time of each frame since the first in ns, shape (frame,)."""
+        step_ns = self.video_format.time_base * 10**9
+        numerator, denominator = step_ns.numerator, step_ns.denominator
+        ticks = (self.pts - self.pts[:1]).tolist()
+        return np.array([(tick * numerator * 2 + denominator) // (2 * denominator) for tick in ticks], np.int64)
+
+    def counter(self) -> Int64s | None:
+        """Return the number of each frame, shape (frame,), with gaps where frames are missing.
+
+        None where frames have no common rate.
+        """
+        rate = self.video_format.nominal_rate_hz
+        return None if rate is None else _grid(self.pts, self.video_format.time_base, rate)
+
+    def stamp_origin(self) -> str:
+        """Return how the stamps of frames came about: from the nominal rate, or from times in the file."""
+        return NOMINAL if self.video_format.nominal_rate_hz is not None else FROM_PTS
+
+
+def scan(path: Path) -> VideoScan:
+    """Return the frames of the first video of a file. Raises `TacpipeError`, naming the file, where it cannot be read.
+
+    Where a file does not state when frames are presented, and its codec may order them in another way than they lie in
+    the file, the frames are decoded once to find their order.
+    """
+    with _open_input(path) as container:
+        video = _video_stream(path, container)
+        rows = [
+            (packet.pts, packet.dts, packet.is_keyframe, packet.size)
+            for packet in container.demux(video)
+            if packet.size
+        ]
+        if not rows:
+            raise TacpipeError(f"{path} has no frame. Copy it again from its source, or leave it out.")
+        video_format = _format(path, video)
+        rates = (video.base_rate, video.average_rate)
+        delayed = bool(video.codec_context.has_b_frames)
+    pts, dts = [row[0] for row in rows], [row[1] for row in rows]
+    if None in pts or len(set(pts)) < len(pts) or (delayed and DEMUXERS[path.suffix.lower()] in WITHOUT_PTS):
+        order = _presentation_order(path, video_format) if delayed else list(range(len(rows)))
+        dts = _strict(dts)
+        delay = max(dts[position] - dts[rank] for rank, position in enumerate(order))
+        pts = [stamp for _, stamp in sorted((position, dts[rank] + delay) for rank, position in enumerate(order))]
+    elif None in dts or not _grows(dts):
+        sorted_pts = sorted(pts)
+        delay = max(early - stamp for early, stamp in zip(sorted_pts, pts, strict=True))
+        dts = [stamp - delay for stamp in sorted_pts]
+    order_by_pts = np.argsort(np.array(pts, np.int64), kind="stable")
+    all_pts, all_dts = np.array(pts, np.int64)[order_by_pts], np.array(dts, np.int64)[order_by_pts]
+    rate = next((rate for rate in rates if rate and _grid(all_pts, video_format.time_base, rate) is not None), None)
+    return VideoScan(
+        replace(
+            video_format,
+            nominal_rate_hz=None if rate is None else Fraction(rate),
+            reorder_frames=reorder_frames(all_dts),
+        ),
+        all_pts,
+        all_dts,
+        np.array([row[2] for row in rows], bool)[order_by_pts],
+        order_by_pts.astype(np.int64),
+        sum(row[3] for row in rows),
+    )
+
+
+def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
+    """Yield the packets of a file in presentation order, given its `scan`; at most ``reorder_frames`` and one wait."""
+    rows = np.argsort(frames.packet_index).tolist()  # rows in the order of the file
+    waiting: list[tuple[int, bytes]] = []
+    following = 0
+    with _open_input(path) as container:
+        packets = (packet for packet in container.demux(_video_stream(path, container)) if packet.size)
+        for row, packet in zip(rows, packets, strict=False):
+            heapq.heappush(waiting, (row, bytes(packet)))
+            while waiting and waiting[0][0] == following:
+                yield heapq.heappop(waiting)[1]
+                following += 1
+    if following != len(frames):
+        raise TacpipeError(f"{path} changed while it was read. Run the command again.")
+
+
+def read_stream(path: Path, frames: VideoScan, t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
+    """Return the stream of frames of a file, read as it is taken; ``t_ns`` (frame,) are the stamps.
+
+    Raises `TacpipeError`, also while it is taken, where the file cannot be read.
+    """
+    return packet_stream(
+        frames.video_format,
+        read_packets(path, frames),
+        (frames.pts, frames.dts, frames.key_frame),
+        t_ns,
+        frames.counter(),
+        stamp_origin,
+    )
+
+
+def packet_stream(
+    video_format: VideoFormat,
+    packets: Iterable[bytes],
+    clocks: tuple[Int64s, Int64s, Bools],
+    t_ns: Times,
+    seq: Int64s | None,
+    stamp_origin: str | None,
+) -> pa.RecordBatchReader:
+    """Return a stream of frames of packets in presentation order.
+
+    ``clocks`` are ``pts``, ``dts`` and ``key_frame`` of each packet (frame,).
+    """
+    import pyarrow as pa
+
+    schema = video_format.schema(stamp_origin, counted=seq is not None)
+    pts, dts, key_frame = clocks
+    columns: dict[str, AnyArray] = {"t_ns": t_ns, PTS: pts, DTS: dts, KEY_FRAME: key_frame}
+    if seq is not None:
+        columns["seq"] = seq
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        source = iter(packets)
+        for first in range(0, len(t_ns), BATCH_ROWS):
+            stop = min(first + BATCH_ROWS, len(t_ns))
+            content = [next(source) for _ in range(first, stop)]
+            arrays = [
+                pa.array(content, pa.binary()) if field.name == PACKET else pa.array(columns[field.name][first:stop])
+                for field in schema
+            ]
+            yield pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+    return pa.RecordBatchReader.from_batches(schema, batches())
+
+
+def write_file(path: Path, video_format: VideoFormat, batches: Iterable[pa.Table]) -> None:
+    """Write rows of a stream of frames, from a key frame on, as the video file ``path``, whose ending states its kind.
+
+    Packets are copied. Times begin at 0. Raises `TacpipeError` where the kind of file cannot hold the codec.
+    """
+    with extras.explain_missing("Writing video"):
+        import av
+    try:
+        with av.open(str(path), "w") as container:
+            stream = add_stream(container, video_format)
+            start = None
+            for packet, columns in decode_order_packets(video_format, batches):
+                start = packet.pts if start is None else start
+                packet.pts, packet.dts = columns[PTS] - start, columns[DTS] - start
+                packet.stream = stream
+                container.mux_one(packet)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise TacpipeError(
+            f"{path} cannot be written: a {path.suffix} file does not hold {plain(video_format.codec)} as it was recorded "
+            f"({plain(str(error), 100)}). Give a name that ends in .mkv or .mp4."
+        ) from error
+
+
+def add_stream(container: Any, video_format: VideoFormat) -> Any:
+    """Return a stream of an output file of PyAV that takes packets of this format as they are."""
+    import av
+
+    with av.open("/dev/null", "w", format="nut") as scratch:
+        template = scratch.add_stream(video_format.codec, rate=video_format.nominal_rate_hz or 1)
+        stream = container.add_stream_from_template(template, opaque=True)
+    context = stream.codec_context
+    context.width, context.height = video_format.width_px, video_format.height_px
+    if video_format.pixel_format:
+        context.pix_fmt = video_format.pixel_format
+    context.extradata = video_format.extradata or None
+    context.framerate = video_format.nominal_rate_hz or Fraction(0)
+    stream.time_base = video_format.time_base
+    return stream
+
+
+def decode_order_packets(
+    video_format: VideoFormat, batches: Iterable[pa.Table]
+) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Yield packets of PyAV with their times, and the columns of their rows, in the order of decoding."""
+    import av
+
+    step = 1
+    if video_format.nominal_rate_hz:
+        step = max(1, round(1 / (video_format.nominal_rate_hz * video_format.time_base)))
+    for _, columns in in_decode_order(video_format, batches):
+        if not columns[PACKET]:
+            continue
+        packet = av.Packet(columns[PACKET])
+        packet.time_base, packet.duration = video_format.time_base, step
+        packet.pts, packet.dts = int(columns[PTS]), int(columns[DTS])
+        packet.is_keyframe = bool(columns[KEY_FRAME])
+        yield packet, columns
+
+
+@contextmanager
+def _open_input(path: Path) -> Iterator[Any]:
+    """Yield a video file that PyAV opened; errors of FFmpeg name the file."""
+    with extras.explain_missing(NEEDED_BY):
+        import av
+    with regular.failing(path), regular.opened(path) as file:
+        try:
+            with av.open(file, format=DEMUXERS[path.suffix.lower()]) as container:
+                yield container
+        except (av.error.FFmpegError, ValueError) as error:
+            reason = plain(str(getattr(error, "strerror", None) or error), 100)
+            raise TacpipeError(
+                f"{path} cannot be read as a video: {reason}. Copy it again from its source, or leave it out."
+            ) from error
+
+
+def _video_stream(path: Path, container: Any) -> Any:
+    if not container.streams.video:
+        raise TacpipeError(f"{path} has no video in it. Give a file with a video, or leave it out.")
+    return container.streams.video[0]
+
+
+def _format(path: Path, video: Any) -> VideoFormat:
+    context = video.codec_context
+    if not (context.width and context.height and video.time_base):
+        raise TacpipeError(
+            f"{path} does not state the size of its frames. Copy it again from its source, or leave it out."
+        )
+    return VideoFormat(
+        context.codec.canonical_name,
+        context.width,
+        context.height,
+        context.pix_fmt or "",
+        Fraction(video.time_base),
+        extradata=context.extradata or b"",
+    )
+
+
+def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
+    """Return the positions in the file of frames in the order in which a decoder presents them; others follow."""
+    order: list[int] = []
+    position = 0
+    with _open_input(path) as container:
+        decoder = open_decoder(replace(video_format, reorder_frames=1))
+        for packet in container.demux(_video_stream(path, container)):
+            if packet.size:
+                packet.pts = packet.dts = position
+                position += 1
+                order += [int(frame.pts) for frame in decoder.decode(packet)]
+        order += [int(frame.pts) for frame in decoder.decode(None)]
+    return order + sorted(set(range(position)) - set(order))
+
+
+def _strict(dts: Sequence[int | None]) -> list[int]:
+    """Return decoding times that grow with each frame: those of the file, or numbers where it does not state them."""
+    stamps = [stamp for stamp in dts if stamp is not None]
+    return stamps if len(stamps) == len(dts) and _grows(stamps) else list(range(len(dts)))
+
+
+def _grows(stamps: Sequence[int | None]) -> bool:
+    return all(early is not None and late is not None and early < late for early, late in itertools.pairwise(stamps))
+
+
+def _grid(pts: Int64s, time_base: Fraction, rate: Fraction) -> Int64s | None:
+    """Return the number of each frame at a common rate, (frame,), from 0; None where the times do not fit the rate."""
+    per_tick = Fraction(rate) * time_base
+    frames = (pts - pts[0]).astype(np.float64) * float(per_tick)
+    numbers = np.rint(frames).astype(np.int64)
+    tolerance = min(0.25, (0.0 if per_tick == 1 else float(per_tick)) + FRAME_TOLERANCE)
+    fits = bool((np.abs(frames - numbers) <= tolerance).all()) and bool((np.diff(numbers) > 0).all())
+    return numbers if fits else None

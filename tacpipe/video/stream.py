@@ -1,0 +1,178 @@
+"""Describe streams of frames: one row per frame with its encoded packet, the codec in the metadata of the packet column.
+
+Rows are in presentation order. `DTS` gives the order of decoding, which differs where a codec has B-frames. Rows whose
+`KEY_FRAME` is true can be decoded without the rows before them. pyarrow is imported when fields are built.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import heapq
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import excerpt
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import Bools, Int64s
+    from tacpipe.io.columns import Columns
+
+PACKET, PTS, DTS, KEY_FRAME = "packet", "pts", "dts", "key_frame"
+BATCH_ROWS = 64  # frames that are in memory at once, encoded
+MAX_SIDE_PX = 1 << 14  # largest width and height of a frame
+MAX_REORDER = 1 << 10  # largest number of frames between decoding and presentation that is plausible
+_CODEC, _WIDTH, _HEIGHT, _PIXELS = "codec", "width_px", "height_px", "pixel_format"
+_TIME_BASE, _RATE, _EXTRADATA, _REORDER = "time_base_s", "nominal_rate_hz", "extradata", "reorder_frames"
+
+
+@dataclass(frozen=True)
+class VideoFormat:
+    """The codec of a stream of frames, and all that a decoder or a file needs besides the packets."""
+
+    codec: str  # FFmpeg's name, such as mjpeg, mpeg4, h264, hevc, av1, png
+    width_px: int
+    height_px: int
+    pixel_format: str  # FFmpeg's name, such as yuv420p
+    time_base: Fraction  # seconds per unit of pts and dts
+    nominal_rate_hz: Fraction | None = None  # frames per second that the source states; None: no common rate
+    extradata: bytes = b""  # the codec's headers that are not part of a packet
+    reorder_frames: int = 0  # largest number of rows by which a frame is decoded earlier than it is presented
+
+    def __post_init__(self) -> None:
+        sides_fit = 0 < self.width_px <= MAX_SIDE_PX and 0 < self.height_px <= MAX_SIDE_PX
+        if not sides_fit or self.time_base <= 0 or not 0 <= self.reorder_frames <= MAX_REORDER or not self.codec:
+            raise TacpipeError(
+                f"A video of {self.width_px} x {self.height_px} pixels (codec {self.codec or 'unknown'}, time base "
+                f"{self.time_base} s, {self.reorder_frames} frames out of order) cannot be read; frames have 1 to "
+                f"{MAX_SIDE_PX} pixels a side."
+            )
+
+    def to_metadata(self) -> dict[str, str]:
+        """Return the metadata of the packet column."""
+        rate = {} if self.nominal_rate_hz is None else {_RATE: str(self.nominal_rate_hz)}
+        headers = {_EXTRADATA: base64.b64encode(self.extradata).decode()} if self.extradata else {}
+        return {
+            "quantity": "image",
+            _CODEC: self.codec,
+            _WIDTH: str(self.width_px),
+            _HEIGHT: str(self.height_px),
+            _PIXELS: self.pixel_format,
+            _TIME_BASE: str(self.time_base),
+            **rate,
+            _REORDER: str(self.reorder_frames),
+            **headers,
+        }
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[bytes, bytes]) -> VideoFormat:
+        """Return the format that the metadata of a packet column states. Raises `TacpipeError` where it states none."""
+        texts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
+        try:
+            return cls(
+                texts[_CODEC],
+                int(texts[_WIDTH]),
+                int(texts[_HEIGHT]),
+                texts[_PIXELS],
+                Fraction(texts[_TIME_BASE]),
+                Fraction(texts[_RATE]) if _RATE in texts else None,
+                base64.b64decode(texts.get(_EXTRADATA, ""), validate=True),
+                int(texts[_REORDER]),
+            )
+        except (KeyError, ValueError, ZeroDivisionError, binascii.Error) as error:
+            raise TacpipeError(
+                f"The column {PACKET} does not state its video format ({excerpt(error)}). Ingest the recording again."
+            ) from error
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields ``packet``, ``pts``, ``dts`` and ``key_frame``."""
+        import pyarrow as pa
+
+        ticks = {"unit": "1", "quantity": "time"}
+        return [
+            pa.field(PACKET, pa.binary(), metadata=self.to_metadata()),
+            pa.field(PTS, pa.int64(), metadata=ticks),
+            pa.field(DTS, pa.int64(), metadata=ticks),
+            pa.field(KEY_FRAME, pa.bool_(), metadata={"unit": "1", "quantity": "mask"}),
+        ]
+
+    def schema(self, stamp_origin: str | None = None, *, counted: bool = True) -> pa.Schema:
+        """Return the schema of a stream: ``t_ns``, ``seq`` where frames are ``counted``, and `fields`.
+
+        ``stamp_origin`` states how stamps were computed that no clock gave.
+        """
+        import pyarrow as pa
+
+        from tacpipe.channels.schema import device_fields, time_field
+
+        counter = device_fields(clock=False, counters=["seq"]) if counted else []
+        return pa.schema([time_field(stamp_origin), *counter, *self.fields()])
+
+
+def read_format(source: pa.Table | pa.Schema | Columns) -> VideoFormat | None:
+    """Return the format of a stream of frames; None for a stream of another kind. Raises as `VideoFormat.from_metadata`."""
+    schema: pa.Schema = getattr(source, "schema", source)
+    if not {PACKET, DTS, KEY_FRAME} <= set(schema.names):
+        return None
+    metadata = schema.field(PACKET).metadata or {}
+    return VideoFormat.from_metadata(metadata) if _CODEC.encode() in metadata else None
+
+
+def reorder_frames(dts: Int64s) -> int:
+    """Return the largest number of rows by which a frame is decoded earlier than it is presented.
+
+    >>> reorder_frames(np.array([0, 2, 3, 1, 4]))  # presented I B B P P, decoded I P B B P
+    2
+    """
+    if not len(dts):
+        return 0
+    decode_index = np.argsort(np.argsort(dts, kind="stable"), kind="stable")
+    return int((np.arange(len(dts)) - decode_index).max())
+
+
+def in_decode_order(
+    video_format: VideoFormat, batches: Iterable[pa.Table]
+) -> Iterator[tuple[int, dict[str, int | bool | bytes]]]:
+    """Yield row number and columns of each frame in the order of decoding, given batches of rows in presentation order.
+
+    At most ``reorder_frames`` frames wait.
+    """
+    waiting: list[tuple[int, int, dict[str, int | bool | bytes]]] = []  # dts, row, columns
+    row = 0
+    for batch in batches:
+        names = [name for name in (PACKET, PTS, DTS, KEY_FRAME) if name in batch.column_names]
+        for columns in batch.select(names).to_pylist():
+            heapq.heappush(waiting, (columns[DTS], row, columns))
+            row += 1
+            if len(waiting) > video_format.reorder_frames:
+                _, index, frame = heapq.heappop(waiting)
+                yield index, frame
+    while waiting:
+        _, index, frame = heapq.heappop(waiting)
+        yield index, frame
+
+
+def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int, int]:
+    """Return the smallest range of rows that contains rows ``start`` to ``stop`` (exclusive) and can be decoded alone.
+
+    It begins at a key frame, and no frame in it needs one that is presented after it. Raises `TacpipeError` where no key
+    frame precedes ``start``.
+    """
+    if not 0 <= start < stop <= len(dts):
+        raise TacpipeError(f"The rows {start} to {stop} are not in a stream of {len(dts)} frames.")
+    keys = np.flatnonzero(key_frame[: start + 1])
+    if not len(keys):
+        raise TacpipeError(
+            f"Frame {start} cannot be decoded: no key frame precedes it. Record or export the video from a key frame on."
+        )
+    latest = np.maximum.accumulate(dts)  # (row,)
+    earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), of this row and all after it
+    is_boundary = np.append(latest[:-1] < earliest[1:], True)  # whether a cut may follow each row
+    return int(keys[-1]), stop + int(np.argmax(is_boundary[stop - 1 :]))
