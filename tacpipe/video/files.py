@@ -308,10 +308,13 @@ def _grows(stamps: Sequence[int | None]) -> bool:
 
 
 def _grid(pts: Int64s, time_base: Fraction, rate: Fraction) -> Int64s | None:
-    """Return the number of each frame at a common rate, (frame,), from 0; None where the times do not fit the rate."""
+    """Return the number of each frame at a common rate, (frame,), from 0; None where the times do not fit the rate.
+
+    They do not fit either where most frames would be missing: FFmpeg guesses such rates for frames at irregular times.
+    """
     per_tick = Fraction(rate) * time_base
     frames = (pts - pts[0]).astype(np.float64) * float(per_tick)
     numbers = np.rint(frames).astype(np.int64)
     tolerance = min(0.25, (0.0 if per_tick == 1 else float(per_tick)) + FRAME_TOLERANCE)
     fits = bool((np.abs(frames - numbers) <= tolerance).all()) and bool((np.diff(numbers) > 0).all())
-    return numbers if fits else None
+    return numbers if fits and np.median(np.diff(numbers, append=numbers[-1] + 1)) == 1 else None
