@@ -109,6 +109,7 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
                 continue
             packet = av.Packet(columns[PACKET])
             packet.pts = packet.dts = row
+            packet.is_keyframe = bool(columns[KEY_FRAME])  # FFmpeg adds other PNG images to the one before
             for frame in context.decode(packet):
                 yield _numbered(video_format, frame)
         for frame in context.decode(None) if started else ():

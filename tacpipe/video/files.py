@@ -34,6 +34,9 @@ DEMUXERS = {  # FFmpeg's names by extension: what a file contains does not choos
     ".mp4": "mp4",
     ".webm": "matroska",
 }
+IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # FFmpeg's names by extension
+IMAGE_DEMUXERS = {"mjpeg": "jpeg_pipe", "png": "png_pipe", "webp": "webp_pipe"}
+MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
 WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files that do not state when a frame is presented
 NOMINAL = "from nominal rate"  # origin of stamps that a file's frame rate gave
 FROM_PTS = "from presentation times"  # origin of stamps that a file's own presentation times gave
@@ -118,6 +121,43 @@ def scan(path: Path) -> VideoScan:
         order_by_pts.astype(np.int64),
         sum(row[3] for row in rows),
     )
+
+
+def scan_images(paths: Sequence[Path]) -> VideoFormat:
+    """Return the format of a stream whose packets are image files, each a key frame.
+
+    Raises `TacpipeError`, naming the file, for one that is no image and one of another kind or size than the first.
+    """
+    first: VideoFormat | None = None
+    for path in paths:
+        codec = IMAGE_CODECS[path.suffix.lower()]
+        with _open_input(path, IMAGE_DEMUXERS[codec]) as container:
+            image_format = replace(_format(path, _video_stream(path, container)), time_base=MICROSECOND)
+        first = first or replace(image_format, codec=codec)
+        size, first_size = (
+            (codec, image_format.width_px, image_format.height_px),
+            (first.codec, first.width_px, first.height_px),
+        )
+        if size != first_size:
+            raise TacpipeError(
+                f"{path} is {codec} of {size[1]} x {size[2]} pixels, and {paths[0]} is {first.codec} of {first.width_px} x "
+                f"{first.height_px}. The images of a stream have one kind and size: put others into another folder."
+            )
+    if first is None:
+        raise TacpipeError("There is no image. Give a folder with JPEG, PNG or WebP files.")
+    return first
+
+
+def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
+    """Return a stream of frames of image files, read as it is taken; ``t_ns`` (frame,) are the stamps.
+
+    Presentation times are microseconds since the first frame, and differ. Raises `TacpipeError` as `scan_images` does.
+    """
+    video_format = scan_images(paths)
+    index = np.arange(len(paths))
+    pts = np.maximum.accumulate((t_ns - t_ns[:1]) // 1000 - index) + index
+    clocks = (pts, pts, np.ones(len(paths), bool))
+    return packet_stream(video_format, map(regular.source, paths), clocks, t_ns, None, stamp_origin)
 
 
 def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
@@ -245,13 +285,13 @@ def decode_order_packets(
 
 
 @contextmanager
-def _open_input(path: Path) -> Iterator[Any]:
+def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
     """Yield a video file that PyAV opened; errors of FFmpeg name the file."""
     with extras.explain_missing(NEEDED_BY):
         import av
     with regular.failing(path), regular.opened(path) as file:
         try:
-            with av.open(file, format=DEMUXERS[path.suffix.lower()]) as container:
+            with av.open(file, format=demuxer or DEMUXERS[path.suffix.lower()]) as container:
                 yield container
         except (av.error.FFmpegError, ValueError) as error:
             reason = plain(str(getattr(error, "strerror", None) or error), 100)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.printable import excerpt
+from tacpipe.printable import excerpt, plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -54,6 +54,11 @@ class VideoFormat:
                 f"{self.time_base} s, {self.reorder_frames} frames out of order) cannot be read; frames have 1 to "
                 f"{MAX_SIDE_PX} pixels a side."
             )
+
+    def describe(self) -> str:
+        """Return codec, size and rate in words, as ``mpeg4, 320 x 240 pixels, 25 frames/s``."""
+        rate = "" if self.nominal_rate_hz is None else f", {float(self.nominal_rate_hz):.6g} frames/s"
+        return f"{plain(self.codec)}, {self.width_px} x {self.height_px} pixels{rate}"
 
     def to_metadata(self) -> dict[str, str]:
         """Return the metadata of the packet column."""

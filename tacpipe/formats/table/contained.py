@@ -147,6 +147,8 @@ class _ContainerShares:
 
         streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
+        if kind in layouts.CAMERA:
+            return None
         if place not in self._opened:
             self._opened[place] = open_container(str(kind), place)
         container = self._opened[place]
@@ -169,7 +171,7 @@ def preview_text(
     from tacpipe.formats import source_files
     from tacpipe.formats.table import preview
 
-    paths = [path for recording in listed_sources for path in recording.files.values()]
+    paths = [path for recording in listed_sources for path in member_files(recording.files).values()]
     left_out = source_files.describe(source, paths, why_unread(layout, source, kind))
     return "\n".join([preview.describe_sources(layout, source, listed_sources, kind), *left_out])
 

@@ -164,11 +164,12 @@ class FileSample:
     encoding: str = "utf-8"
     arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # files of arrays only
     units: Mapping[str, str] = field(default_factory=dict)  # units by column, as a row below the header states them
+    frames: int | None = None  # number of frames of a video or a folder of images
 
     @property
     def row_count(self) -> int | None:
-        """Return the number of rows of the arrays, None for other files."""
-        return next((array.rows for array in self.arrays.values()), None)
+        """Return the number of rows of the arrays, or of frames; None for other files."""
+        return next((array.rows for array in self.arrays.values()), self.frames)
 
     def stated_unit(self, column: str) -> str:
         """Return the unit that the header or the row below it states for a column, '' where neither does."""

@@ -14,12 +14,22 @@ from pathlib import Path
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
 from tacpipe.formats import source_files
-from tacpipe.formats.table import column_names, file_sample, pattern
+from tacpipe.formats.table import column_names, file_sample, pattern, reading
 from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
 from tacpipe.formats.table.label_table import RECORDING, read_label_table
-from tacpipe.formats.table.layout import EXTENSIONS, TREES, UNKNOWN, extension, quoted, why_unreadable
+from tacpipe.formats.table.layout import (
+    CAMERA_EXTENSIONS,
+    EXTENSIONS,
+    IMAGE_NAME,
+    TREES,
+    UNKNOWN,
+    extension,
+    quoted,
+    why_unreadable,
+)
 from tacpipe.io import files as file_system
 from tacpipe.printable import shown
+from tacpipe.video.files import DEMUXERS, IMAGE_CODECS, scan, scan_images
 
 VOCABULARY = (  # help for the person who replaces a "?"
     "quantity: what a column measures, as tactile, position, orientation (a quaternion), joint_position, force, torque,",
@@ -38,6 +48,8 @@ class _FileGroup:
     stamps: str = ""  # pattern of the files that hold the stamps
     clock: FileSample | None = None  # sample of the first file of stamps
     skipped: tuple[str, ...] = ()  # arrays of the file that belong to other streams
+    camera: tuple[str, ...] = ()  # entries of a stream of frames
+    members: tuple[Path, ...] = ()  # images in the folders ``paths``
 
 
 def guess_layout(folder: Path) -> str:
@@ -46,15 +58,19 @@ def guess_layout(folder: Path) -> str:
         Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names
     ]
     data = [path for path in all_paths if extension(path) in EXTENSIONS]
-    if not data:
-        raise UsageError(f"{folder} holds no file of {', '.join(EXTENSIONS)}; there is nothing to guess from.")
+    videos = [path for path in all_paths if extension(path) in DEMUXERS]
+    images = [path for path in all_paths if extension(path) in IMAGE_CODECS and path.parent.parts]
+    if not (data or videos or images):
+        kinds = ", ".join((*EXTENSIONS, *CAMERA_EXTENSIONS))
+        raise UsageError(f"{folder} holds no file of {kinds}; there is nothing to guess from.")
     groups, labels, damaged = _group_files(folder, data)
+    groups += _camera_groups(folder, videos, images, {group.stream for group in groups}, damaged)
     groups, stamps = _with_stamps(groups)
     if not groups:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
     trees = _label_files(folder, [path for path in all_paths if path.suffix.lower() in TREES], groups)
     in_groups = [*(group.paths for group in [*groups, *stamps, *labels]), *trees.values()]
-    read = [folder / path for paths in in_groups for path in paths]
+    read = [folder / path for paths in [*in_groups, *(group.members for group in groups)] for path in paths]
 
     def reason(path: str) -> str:
         return damaged.get(path) or why_unreadable(
@@ -99,6 +115,51 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         else:
             streams += _by_length(group)
     return streams, labels, damaged
+
+
+def _camera_groups(
+    folder: Path, videos: Sequence[Path], images: Sequence[Path], used: set[str], damaged: dict[str, str]
+) -> list[_FileGroup]:
+    """Return the streams of video files and of folders of images; why others cannot be read is added to ``damaged``."""
+    by_template: dict[tuple[str, bool], list[Path]] = {}
+    folders = dict.fromkeys(path.parent for path in images)
+    for path in sorted([*videos, *folders]):
+        by_template.setdefault((_template(path), path in folders), []).append(path)
+    groups = []
+    for (_, are_folders), paths in by_template.items():
+        for alike in _by_file_name(paths):
+            try:
+                entries, count = (_image_entries if are_folders else _video_entries)(folder / alike[0])
+            except MissingModuleError:
+                raise
+            except TacpipeError as error:
+                damaged |= {path.as_posix(): str(error).rstrip(".") for path in alike}
+                continue
+            sample = FileSample((), {}, frames=count)
+            members = tuple(path for path in images if path.parent in alike) if are_folders else ()
+            name = _stream_name(alike, used)
+            groups.append(
+                _FileGroup(name, pattern.generalize(alike), tuple(alike), sample, camera=entries, members=members)
+            )
+    return groups
+
+
+def _video_entries(path: Path) -> tuple[tuple[str, ...], int]:
+    """Return the entries of a video file, and the number of its frames."""
+    frames = scan(path)
+    return (f"# {frames.video_format.describe()}; without an entry time, stamps are those of the file",), len(frames)
+
+
+def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
+    """Return the entries of a folder of images, and their number; names with a large number state the time."""
+    paths = reading.image_paths(folder)
+    numbers = [reading.last_number(path) for path in paths]
+    values = tuple(float(number) if "." in number else int(number) for number in numbers if number is not None)
+    is_stamp = len(values) == len(paths) and min(values) >= 1e8
+    time = file_sample.time_entry(FileSample((IMAGE_NAME,), {IMAGE_NAME: values}), IMAGE_NAME) if is_stamp else ""
+    ending = "" if is_stamp else f'time = {{ rate_hz = "{UNKNOWN}" }}  # the names hold no stamps'
+    lines = ('format = "images"', f"# {scan_images(paths[:1]).describe()}", f"time = {time}" if time else ending)
+    return lines, len(paths)
 
 
 def _by_length(group: _FileGroup) -> list[_FileGroup]:
@@ -232,6 +293,12 @@ def _stream_text(group: _FileGroup) -> str:
         f"[streams.{group.stream}]",
         f"files = {quoted(group.pattern)}  # {len(group.paths)} file{'s' * (len(group.paths) != 1)}",
     ]
+    if group.camera:
+        lines += [line for line in group.camera if not (group.stamps and line.startswith("time"))]
+        if group.clock is not None:
+            file = f"file = {quoted(group.stamps)}"
+            lines.append(f"time = {file_sample.time_entry(group.clock, group.clock.names[0], file)}")
+        return "\n".join(lines)
     if sample.text is not None:
         lines += _text_entries(sample, group.paths[0])
     axis = next((array.time_axis for array in sample.arrays.values()), 0)

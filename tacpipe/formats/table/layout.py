@@ -22,9 +22,25 @@ from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
 from tacpipe.printable import excerpt, plain
+from tacpipe.video.files import DEMUXERS, IMAGE_CODECS
 
 MAX_LAYOUT_BYTES = 1 << 20  # largest layout file
-Format = Literal["csv", "parquet", "npz", "npy", "xlsx", "jsonl", "mcap", "rosbag", "hdf5", "zarr", "xdf", "lerobot"]
+Format = Literal[
+    "csv",
+    "parquet",
+    "npz",
+    "npy",
+    "xlsx",
+    "jsonl",
+    "video",
+    "images",
+    "mcap",
+    "rosbag",
+    "hdf5",
+    "zarr",
+    "xdf",
+    "lerobot",
+]
 Kind = Literal[
     "int8",
     "uint8",
@@ -52,6 +68,9 @@ EXTENSIONS: Mapping[str, Format] = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
 }
+CAMERA = ("video", "images")  # formats of streams of frames: a video file, and a folder of images
+CAMERA_EXTENSIONS = (*DEMUXERS, *IMAGE_CODECS)
+IMAGE_NAME = "name"  # the column of the stamps where an image's file name holds them
 TREES = (".json", ".yaml", ".yml")  # files that hold labels by name
 TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
 STAMPS = ".stamps"  # suffix of a stream's name that marks the file of its stamps
@@ -114,6 +133,11 @@ class StreamLayout:
     optional: bool = False  # True: recordings without this stream are read too
 
     @property
+    def camera(self) -> str:
+        """Return ``video`` or ``images`` for a stream of frames: its format, or that of its extension; else ""."""
+        return camera_format(self.format, self.files)
+
+    @property
     def contained(self) -> bool:
         """True where the stream is one of several in a container."""
         return self.format in KINDS
@@ -151,11 +175,15 @@ def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
     ('no pattern matches', '`tacpipe ingest mcap` reads such files')
     """
     readable = [name for name in KINDS if has_ending(name, path)]
-    if unmatched and (kind in readable or extension(Path(path)) in (*EXTENSIONS, *TREES)):
+    if unmatched and (kind in readable or extension(Path(path)) in (*EXTENSIONS, *CAMERA_EXTENSIONS, *TREES)):
         return unmatched
     if readable and kind not in readable:
         return f"`tacpipe ingest {readable[0]}` reads such files"
-    reads = describe_kind(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
+    reads = (
+        describe_kind(kind)
+        if kind is not None
+        else ", ".join(f"*{ending}" for ending in (*EXTENSIONS, *CAMERA_EXTENSIONS))
+    )
     return f"the command reads {reads}"
 
 
@@ -358,10 +386,14 @@ def _expect_required(values: Mapping[str, Any], place: str, container: Format | 
         if "files" not in values and container is None:
             raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{values["format"]}".')
         return
+    camera = camera_format(values.get("format"), values.get("files"))
     if values.get("source"):
         raise UsageError(f"{place}: source is for containers ({', '.join(KINDS)}). Set format to one of them.")
     if "files" not in values:
         raise UsageError(f"{place}: entry files must be given.")
+    if camera:
+        _expect_camera(values, place, camera)
+        return
     if "time" not in values:
         raise UsageError(
             f'{place}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
@@ -369,6 +401,36 @@ def _expect_required(values: Mapping[str, Any], place: str, container: Format | 
         )
     if not values.get("columns"):
         raise UsageError(f'{place}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
+
+
+def camera_format(kind: object, files: object) -> str:
+    """Return ``video`` or ``images`` for a stream of frames: its format, or that of the extension of its files; else "".
+
+    >>> camera_format(None, "{trial}/left.AVI"), camera_format("images", "{trial}/left"), camera_format(None, "a.csv")
+    ('video', 'images', '')
+    """
+    if kind is None and isinstance(files, str):
+        kind = "video" if extension(Path(files)) in DEMUXERS else None
+    return str(kind) if kind in CAMERA else ""
+
+
+def _expect_camera(values: Mapping[str, Any], place: str, camera: str) -> None:
+    """Raise `UsageError` for an entry of a table in a stream of frames, and for images without a time."""
+    table_entries = [name for name in ("columns", "recording", "long", "header", "separator") if values.get(name)]
+    if table_entries:
+        raise UsageError(
+            f"{place}: {table_entries[0]} is for tables. A {camera} stream has a row per frame; remove it."
+        )
+    time = values.get("time")
+    if camera == "images" and time is None:
+        raise UsageError(
+            f'{place}: time must be given, as time = {{ column = "{IMAGE_NAME}", unit = "ns" }} (the last number in the '
+            'names of the images), { file = "{trial}/stamps.csv" } or { rate_hz = 25 }.'
+        )
+    column = time.get("column") if isinstance(time, dict) and not time.get("file") else None
+    if column and (camera == "video" or column != IMAGE_NAME):
+        expected = f'column = "{IMAGE_NAME}", file or rate_hz' if camera == "images" else "file or rate_hz, or no time"
+        raise UsageError(f"{place}: time.column is {excerpt(column)}; a stream of {camera} takes {expected}.")
 
 
 def _parse_time(values: Mapping[str, Any], place: str) -> Time:

@@ -6,6 +6,7 @@ follows another. So runs of rows are sorted, put in a spill file and merged, in 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -22,10 +23,12 @@ from tacpipe.formats.table import columns, rows, stamps
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout
 from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
+from tacpipe.io import files as file_system
 from tacpipe.io.spill import Piece, Spill, in_order
 from tacpipe.plugins.stage import Shared
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
+from tacpipe.video import files as video_files
 
 RUN_ROWS = 1 << 21  # rows sorted at once
 MAX_CHANNELS = 1 << 14  # a column with more names does not hold channels
@@ -330,6 +333,93 @@ def _convert_block(
         except CellError as error:
             raise TacpipeError(f"{place(error.row)}, column {plain(column.name)} {error}.") from error
     return t_ns, arrays
+
+
+def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = None) -> pa.RecordBatchReader:
+    """Return the frames of a video file or of a folder of images with ``t_ns``, as they are read.
+
+    Stamps are those of ``stamps_path``, where the layout names a file of stamps, else from the rate or the names of images,
+    else the video's own. Raises `TacpipeError` for what is no video or image, for stamps that run backwards, and for
+    another number of stamps than frames.
+    """
+    images = image_paths(path) if stream.camera == "images" else []
+    frames = None if images else video_files.scan(path)
+    count = len(images) if frames is None else len(frames)
+    origin, numbers = None, None if frames is None else frames.counter()
+    if stamps_path is not None:
+        t_ns = rows.stamps_of_file(stamps_path, stream)
+        if len(t_ns) != count:
+            raise TacpipeError(
+                f"{path} has {count} frames, and {plain(stream.time.file)} has {len(t_ns)} stamps. Copy both again."
+            )
+    elif stream.time.rate_hz is not None:
+        offsets_ns = resampling.uniform_offsets(
+            0, count if numbers is None else int(numbers[-1]) + 1, stream.time.rate_hz
+        )
+        t_ns, origin = offsets_ns if numbers is None else offsets_ns[numbers], "from rate"
+    elif frames is not None:
+        t_ns, origin = frames.times_ns(), frames.stamp_origin()
+    else:
+        t_ns = _stamps_of_names(images, stream)
+        order = np.argsort(t_ns, kind="stable")
+        t_ns, images = t_ns[order], [images[index] for index in order.tolist()]
+    backwards = np.flatnonzero(np.diff(t_ns) < 0)
+    if len(backwards):
+        raise TacpipeError(
+            f"{stamps_path or path}, frame {backwards[0] + 2}: the stamp is before that of the frame above. Sort the "
+            f"stamps, or cut the video where its clock was set."
+        )
+    if stream.time.origin == "start":
+        origin = "from the start of the recording"
+    t_ns = t_ns + (_start_ns(stream) if origin else 0)
+    if frames is None:
+        return video_files.read_images(images, t_ns, origin)
+    return video_files.read_stream(path, frames, t_ns, origin)
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """Return the images that lie directly in a folder, by name, numbers in order of their value.
+
+    Raises `TacpipeError` where there is none.
+    """
+    paths = [
+        Path(place, name) for place, _, names in file_system.walk(folder) if Path(place) == folder for name in names
+    ]
+    images = [path for path in paths if path.suffix.lower() in video_files.IMAGE_CODECS]
+    if not images:
+        raise TacpipeError(f"{folder} holds no image. Give a folder with JPEG, PNG or WebP files.")
+    return sorted(
+        images, key=lambda path: [(int(part), "") if part.isdigit() else (-1, part) for part in parts_of(path)]
+    )
+
+
+def parts_of(path: Path) -> list[str]:
+    """Return the name of a file divided before and after each number.
+
+    >>> parts_of(Path("a/frame_12.jpg"))
+    ['frame_', '12', '.jpg']
+    """
+    return [part for part in re.split(r"([0-9]+)", path.name) if part]
+
+
+def _stamps_of_names(images: Sequence[Path], stream: StreamLayout) -> Times:
+    """Return the stamps that the names of images state: the last number of each, in ns (image,)."""
+    numbers = [last_number(path) for path in images]
+    nameless = [path for path, number in zip(images, numbers, strict=True) if number is None]
+    if nameless:
+        raise TacpipeError(f"{nameless[0]} has no number in its name. Give a rate_hz or a file of stamps as its time.")
+    place = lambda row: str(images[row])  # noqa: E731
+    return rows.stamps_of_column(pa.chunked_array([pa.array(numbers).cast(stamps.DECIMAL)]), stream, place)
+
+
+def last_number(path: Path) -> str | None:
+    """Return the last number in the name of an image as text, None where it has none.
+
+    >>> last_number(Path("left_1744849152.25.jpg")), last_number(Path("a.png"))
+    ('1744849152.25', None)
+    """
+    numbers = re.findall(r"[0-9]+(?:[.][0-9]+)?", path.stem)
+    return numbers[-1] if numbers else None
 
 
 def _start_ns(stream: StreamLayout) -> int:

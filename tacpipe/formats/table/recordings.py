@@ -24,11 +24,12 @@ from tacpipe.formats.containers.container import (
 )
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
-from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout
-from tacpipe.formats.table.reading import read_contained_stream, stream_batches
+from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout, extension
+from tacpipe.formats.table.reading import camera_batches, read_contained_stream, stream_batches
 from tacpipe.io import files as file_system
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
+from tacpipe.video.files import IMAGE_CODECS
 
 CONTAINER = "container"  # key of the file that holds all streams of a source
 
@@ -54,7 +55,11 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder. Give the folder that the patterns of the layout start from.")
     candidates = _candidate_paths(layout, folder)
-    matched = {stream.name: _matching_paths(stream, candidates) for stream in layout.streams}
+    image_folders = list(dict.fromkeys(path.parent for path in candidates if extension(path) in IMAGE_CODECS))
+    matched = {
+        stream.name: _matching_paths(stream, image_folders if stream.camera == "images" else candidates)
+        for stream in layout.streams
+    }
     _refuse_idle(layout, matched, candidates, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
@@ -266,7 +271,9 @@ def read_streams(
     for stream in streams:
         if stream.name not in paths:
             continue
-        if stream.contained:
+        if stream.camera:
+            tables[stream.name] = camera_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"))
+        elif stream.contained:
             contained_streams.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
             tables[stream.name] = stream_batches(

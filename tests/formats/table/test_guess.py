@@ -177,6 +177,7 @@ def test_a_generalized_pattern_matches_the_paths_that_it_is_from(names: list[str
 def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) -> None:
     labs.write(tmp_path, 2)
     (tmp_path / "trial_0" / "camera.mp4").write_bytes(b"video")
+    (tmp_path / "trial_0" / "notes.docx").write_bytes(b"notes")
     (tmp_path / "trial_0" / "bag.mcap").write_bytes(b"bag")
     (tmp_path / "trial_1" / "broken.parquet").write_bytes(b"no table")
     (tmp_path / "rig" / "deep" / "down").mkdir(parents=True)
@@ -185,7 +186,8 @@ def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) 
         line for line in guess.guess_layout(tmp_path).splitlines() if line.startswith("#") and "not read" in line
     ]
     for path, reason in (
-        ("trial_0/camera.mp4", "*.csv"),
+        ("trial_0/camera.mp4", "cannot be read as a video"),
+        ("trial_0/notes.docx", "*.csv"),
         ("trial_0/bag.mcap", "tacpipe ingest mcap"),
         ("trial_1/broken.parquet", "is not a Parquet file"),
         ("rig/deep/down/calibration.yaml", "labels"),
