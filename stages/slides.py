@@ -109,7 +109,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.channels import arm
     from tacpipe.channels.streams import finger, without_spikes
-    from tacpipe.datasets.streams import streams_of
+    from tacpipe.datasets.overview import streams_of
     from tacpipe.signals import slides as slide_signals
 
     streams = streams_of(recording)

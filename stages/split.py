@@ -121,12 +121,12 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
     """
     import pyarrow as pa
 
-    from tacpipe.datasets.attributes import OfRecordings
+    from tacpipe.datasets.selection import RecordingAttributes
     from tacpipe.datasets.splits import Scheme, assign, sufficient_val, without_val
 
     values = asdict(params)
     scheme = Scheme(name=values.pop("scheme"), **values)
-    attributes = OfRecordings(recordings)
+    attributes = RecordingAttributes(recordings)
     roles = assign(attributes, scheme, extend or {})
     bare = without_val(roles) if params.val else []
     enough = sufficient_val(attributes, scheme, extend or {}) if bare else None

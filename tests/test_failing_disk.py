@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe.datasets import adoption, manifest
+from tacpipe.datasets import manifest
+from tacpipe.datasets.paths import verified_copy
 from tacpipe.errors import FAILED, StorageError
 from tacpipe.maintenance import checkout, garbage, pushed, repair, unnamed
 from tacpipe.store import layout, location, projects, records
@@ -171,7 +172,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "pushed.lasting": lambda: pushed.lasting(store, root["manifest"]),
         "unnamed.kept": lambda: unnamed.kept(store, [path.name for path in paths], ()),
         "manifest.find": lambda: manifest.find(folder / "data/s"),
-        "adoption.beside": lambda: adoption.verified_copy("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
+        "paths.verified_copy": lambda: verified_copy("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
         "leases.runs": lambda: store.leases.runs(),
     }
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels.streams import of_quantity, signal
-from tacpipe.datasets.streams import streams_of
+from tacpipe.datasets.overview import streams_of
 
 
 @dataclass

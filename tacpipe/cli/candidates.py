@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tacpipe.datasets import replacing
-from tacpipe.datasets.streams import describe_streams
+from tacpipe.datasets.overview import describe_streams
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 

@@ -15,8 +15,8 @@ from tacpipe.channels import streams
 from tacpipe.cli import model_overview
 from tacpipe.cli.show_recording import RATES, StreamFigures, gaps_text, stream_figures
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets.attributes import OfRecordings
 from tacpipe.datasets.dataset import Dataset
+from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
@@ -61,7 +61,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
         "recordings": _figures(opened, sorted(opened.recordings)[:most], None if most is None else READ_BYTES),
         "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
         if most is None
-        else OfRecordings(opened),
+        else RecordingAttributes(opened),
         "excluded": _excluded(opened),
     }
 

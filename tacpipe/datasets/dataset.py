@@ -110,7 +110,7 @@ class Recording:
 
         if stream in self._shards:
             return from_parquet(self._content(stream), columns)
-        from tacpipe.datasets.streams import stored_columns
+        from tacpipe.datasets.overview import stored_columns
 
         stored = self.columns() if self.streams == ("",) else None
         names_by_stream = {} if stored is None else stored_columns(stored.schema)
@@ -239,9 +239,9 @@ class Dataset:
 
         Attributes are what the recordings carry: labels set on them, sensor, sizes of gaps and whatever their stages add.
         """
-        from tacpipe.datasets import frames
+        from tacpipe.datasets import arrays
 
-        return frames.labels(self)
+        return arrays.labels_frame(self)
 
     def only(self, names: Iterable[str]) -> Dataset:
         """Return the dataset with the recordings of these names alone."""
@@ -310,9 +310,9 @@ class Dataset:
             raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
         tables = {recording.name: recording.table(name, columns) for recording in self}
         if labels is not False:
-            from tacpipe.datasets import frames
+            from tacpipe.datasets import arrays
 
-            tables = frames.labelled(self, tables, None if labels is True else labels)
+            tables = arrays.labelled_frame(self, tables, None if labels is True else labels)
         return one_after_another(tables)
 
     to_arrow = table
@@ -329,9 +329,9 @@ class Dataset:
         Integers with nulls, as where only some recordings have the column, are pandas' nullable integers: a column of
         floats would round those beyond 2^53.
         """
-        from tacpipe.datasets import frames
+        from tacpipe.datasets import arrays
 
-        return frames.to_pandas(self.table(stream, columns, labels=labels))
+        return arrays.to_pandas(self.table(stream, columns, labels=labels))
 
     def to_polars(
         self,
@@ -354,10 +354,10 @@ class Dataset:
         Of recordings with one table each that view is named ``data``. Each view begins with a column ``recording``, by which
         it joins ``labels``. All streams are read and verified at once.
         """
-        from tacpipe.datasets import frames
+        from tacpipe.datasets import arrays
 
         with extras.explain_missing("duckdb"):
-            return frames.connected(self)
+            return arrays.connect_duckdb(self)
 
     def windows(
         self,
@@ -411,7 +411,7 @@ class Dataset:
         name = self._only_stream() if stream is None else stream
         order = columns and [*dict.fromkeys(columns)]
         return {
-            recording.name: arrays.of_table(table if order is None else table.select(order))
+            recording.name: arrays.arrays_of_table(table if order is None else table.select(order))
             for recording in self
             for table in [recording.table(name, order)]
         }

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from tacpipe.datasets import adoption, pages, replacing
+from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import NAME, Manifest, find
-from tacpipe.datasets.paths import shard_path
+from tacpipe.datasets.paths import shard_path, verified_copy
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
@@ -151,7 +151,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
 def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
     """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
     for path, name, size in manifest.contents():
-        content = None if store.has(name) else adoption.verified_copy(name, path, (str(directory),), size)
+        content = None if store.has(name) else verified_copy(name, path, (str(directory),), size)
         if content is not None:
             store.put(content, durable=True)
 

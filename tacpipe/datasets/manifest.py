@@ -371,11 +371,11 @@ def check(manifest: Manifest) -> None:
     """
     _check_lineage(manifest)
     pages_of.check_contents(manifest.files.values())
-    paths.check([*manifest.files], ())
+    paths.check_paths([*manifest.files], ())
     if manifest.pages is None:
-        paths.check(pages_of.check_entries(manifest.recordings), manifest.files)
+        paths.check_paths(pages_of.check_entries(manifest.recordings), manifest.files)
     else:
-        paths.check([page.path for page in manifest.pages.pages], manifest.files)
+        paths.check_paths([page.path for page in manifest.pages.pages], manifest.files)
 
 
 def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
@@ -390,7 +390,7 @@ def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
                 content.check()
             in_folders |= any("/" in name for name in content.recordings)
     if in_folders:  # two pages may name one path
-        paths.refuse_shared([path for path, _ in manifest.objects()])
+        paths.refuse_shared_paths([path for path, _ in manifest.objects()])
 
 
 def _check_lineage(manifest: Manifest) -> None:

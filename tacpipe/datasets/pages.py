@@ -16,7 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from tacpipe.datasets import adoption, paths
+from tacpipe.datasets import paths
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, Written, bytes_digest, canonical, digest
@@ -189,7 +189,7 @@ class StoredPages:
         except MissingError as error:
             copy = None
             if self._directory is not None:
-                copy = adoption.verified_copy(page.digest, page.path, (str(self._directory),), page.bytes)
+                copy = paths.verified_copy(page.digest, page.path, (str(self._directory),), page.bytes)
             if copy is None:
                 raise MissingPageError(
                     f"{error} It is the page of the manifest that holds {plain(page.first)} and {page.recordings - 1} "
@@ -558,7 +558,7 @@ def check_entries(recordings: Mapping[str, Entry]) -> list[str]:
     check_contents(shards)
     check_counts([shard["rows"] for shard in shards])
     places = [paths.shard_path(name, stream) for name, entry in recordings.items() for stream in entry["shards"]]
-    paths.check(places, ())
+    paths.check_paths(places, ())
     return places
 
 

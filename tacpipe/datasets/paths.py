@@ -1,9 +1,21 @@
-"""Paths within the directory of a dataset: where its shards and files lie, and what a path may be."""
+"""Check the names of recordings and the paths of their files in a dataset's directory.
+
+A recording's name becomes a file and a folder of each dataset down the chain. So it has no separators and no control
+characters, it leaves room for an extension, and no two names of a dataset differ only in case: some file systems fold it.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+import unicodedata
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+
+from tacpipe.errors import StorageError, UsageError
+from tacpipe.io import regular
+from tacpipe.io.files import unread
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.printable import plain
 
 MANIFEST = "manifest.json"
 NAME_BYTES = 200  # Longest part of a path; file systems allow 255, and drafts add to it
@@ -35,7 +47,7 @@ def safe_path(path: str) -> bool:
     return short and _PATH.fullmatch(path) is not None
 
 
-def check(paths: Sequence[str], taken_paths: Collection[str]) -> None:
+def check_paths(paths: Sequence[str], taken_paths: Collection[str]) -> None:
     """Raise `ValueError` where a path is not safe, or is there twice, or among ``taken_paths``."""
     text = "\n".join(paths)  # hundreds at once: a hit does not wait for a thousand calls
     plain = text and text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
@@ -43,12 +55,84 @@ def check(paths: Sequence[str], taken_paths: Collection[str]) -> None:
         for path in paths:
             if not safe_path(path):
                 raise ValueError(f"the path {path[:80]!r} leads out of the dataset, or no file can have it")
-    refuse_shared(paths)
+    refuse_shared_paths(paths)
     if MANIFEST in paths or (taken_paths and not set(taken_paths).isdisjoint(paths)):
         raise ValueError(_SHARED)
 
 
-def refuse_shared(paths: Sequence[str]) -> None:
+def refuse_shared_paths(paths: Sequence[str]) -> None:
     """Raise `ValueError` where two paths are one."""
     if len(set(paths)) < len(paths):
         raise ValueError(_SHARED)
+
+
+LONGEST_NAME = NAME_BYTES - len(".parquet")  # bytes of UTF-8
+_MARK = 8  # hex digits of the digest that ends a name that was cut
+_ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._-")
+
+
+def valid_name(text: str) -> str:
+    r"""Return text as the name of a recording, in Unicode's form NFC; empty where nothing of it can stand in a name.
+
+    Of ASCII letters, digits, dots, dashes and underscores are kept, of other characters all that are printable. What is
+    left out becomes a dash. A name of more than 192 bytes is cut and ends in a part of its digest.
+
+    >>> valid("cup 1"), valid("木"), valid("../new\nline"), valid(" ")
+    ('cup-1', '木', 'new-line', '')
+    """
+    composed = unicodedata.normalize("NFC", text)
+    printable_text = "".join(c if c in _ASCII or (c.isprintable() and not c.isascii()) else " " for c in composed)
+    name = "-".join(printable_text.split()).strip("-.")
+    if len(name.encode()) <= LONGEST_NAME:
+        return name
+    cut = name.encode()[: LONGEST_NAME - _MARK - 1].decode(errors="ignore")
+    return f"{cut}-{bytes_digest(name.encode())[:_MARK]}"
+
+
+def folded_name(name: str) -> str:
+    """Return what two names share that are one to a file system without case.
+
+    >>> folded("Cup") == folded("cUP"), folded("木") == folded("石")
+    (True, False)
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def refuse_shared_names(recordings: Iterable[tuple[str, Path]]) -> None:
+    """Raise `UsageError` if two recordings, each (name, folder or file), have names that differ at most in case."""
+    by_folded_name: dict[str, tuple[str, Path]] = {}
+    for recording in recordings:
+        earlier = by_folded_name.setdefault(folded_name(recording[0]), recording)
+        if earlier is not recording:
+            first, second = plain(str(earlier[1]), 200), plain(str(recording[1]), 200)
+            name = plain(recording[0])
+            names = name if earlier[0] == recording[0] else f"{plain(earlier[0])} and {name}, which differ only in case"
+            raise UsageError(
+                f"{first} and {second} would both be named {names}. Rename one, or give a folder that holds one alone."
+            )
+
+
+def verified_copy(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
+    """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
+
+    It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.
+    Raises `StorageError` where none has it and one may: the system failed to read what lies there, or memory is short.
+    """
+    failed: StorageError | None = None
+    for directory in directories:
+        file = Path(directory) / path
+        try:
+            content = regular.content(file, size)
+        except (FileNotFoundError, NotADirectoryError, regular.IrregularError):
+            continue
+        except OSError as error:
+            failed = unread(file, error)
+            continue
+        except StorageError as error:
+            failed = error
+            continue
+        if bytes_digest(content) == name:
+            return content
+    if failed is not None:
+        raise failed
+    return None

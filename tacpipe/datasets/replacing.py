@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import pages, recording_names
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
 from tacpipe.datasets.pages import Item
+from tacpipe.datasets.paths import folded_name
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import files, regular
 from tacpipe.io.hashing import digest
@@ -203,7 +204,7 @@ def _refuse_alike(before: Manifest, output: Path, plan: ResultPlan, hint: str) -
     new = [name for name in plan.sources if name not in before.recordings]
     if not new:
         return
-    names = {recording_names.folded(name): name for name in before.recordings}
+    names = {folded_name(name): name for name in before.recordings}
     files = {frozenset(dict(digests).items()): name for name, digests in before.sources.items()}
     for name in new:
         same = files.get(frozenset(dict(plan.sources[name]).items()))
@@ -212,7 +213,7 @@ def _refuse_alike(before: Manifest, output: Path, plan: ResultPlan, hint: str) -
                 f"{output} holds the files of {plain(name)} already, as the recording {plain(same)}. Name the folder as it "
                 f"was, or give -o another directory, {hint}"
             )
-        if (existing := names.get(recording_names.folded(name))) is not None:
+        if (existing := names.get(folded_name(name))) is not None:
             raise UsageError(
                 f"{output} holds the recording {plain(existing)}, which differs from {plain(name)} only in case. Rename the "
                 f"new one, or give -o another directory, {hint}"

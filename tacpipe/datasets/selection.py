@@ -1,19 +1,51 @@
-"""Select recordings of a dataset by their names, their role in a split and their labels."""
+"""Select recordings of a dataset by names, roles and labels, and read several datasets as one.
+
+The attributes of a result state whether its recordings were simulated, or belong to a published set. What a paper printed
+stands next to results on its data only, and a lab's recordings have no such mark.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.streams import TRUTH
-from tacpipe.datasets import roles
+from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain, suggestion
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Wanted
+
+SPLIT_FILE = "split.parquet"
+_RECORDING = "split"  # the name of a split's only recording
+
+
+def split_digest(manifest: Manifest, place: str) -> str:
+    """Return the digest of the table of a split. Raises `UsageError`, which names ``place``, for any other dataset."""
+    if set(manifest.recordings) != {_RECORDING}:
+        raise UsageError(f"{place} is not a split; make one with `tacpipe split`.")
+    shard_digest: str = manifest.recordings[_RECORDING]["shards"][""]["digest"]
+    return shard_digest
+
+
+def read_roles(content: bytes) -> dict[tuple[str, int], str]:
+    """Return (recording, fold) to role from the Parquet bytes of a split."""
+    from tacpipe.io.parquet import from_parquet
+
+    rows = from_parquet(content, ["recording", "fold", "role"]).to_pydict()
+    return dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
+
+
+def roles_in_fold(roles: Mapping[tuple[str, int], str], fold: int, place: str) -> dict[str, str]:
+    """Return recording to role in a fold of the split ``place``. Raises `UsageError` where it has no such fold."""
+    folds = sorted({number for _, number in roles})
+    if fold not in folds:
+        raise UsageError(f"The split {place} has the folds {folds}, not {fold}.")
+    return {recording: role for (recording, number), role in roles.items() if number == fold}
+
 
 _SHOWN, _LABELS = 5, 12  # names or values, and labels, that an error lists
 
@@ -30,11 +62,11 @@ def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, st
             )
         return None
     place = str(split.path or "this dataset")
-    roles.digest(split.source, place)
+    split_digest(split.source, place)
     (only,) = split
     rows = only.table(columns=["recording", "fold", "role"]).to_pydict()
     table = dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
-    return roles.in_fold(table, fold, place)
+    return roles_in_fold(table, fold, place)
 
 
 def chosen(
@@ -93,3 +125,93 @@ def _test(condition: Wanted) -> Callable[[Attribute], Any]:
     is_collection = isinstance(condition, Collection) and not isinstance(condition, str)
     values: Collection[Attribute] = condition if is_collection else (condition,)  # type: ignore[assignment]
     return lambda value: value in values
+
+
+class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
+    """The attributes of each recording by name, in the order of names; of a large dataset each is read when asked for."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._recordings = dataset.recordings
+
+    def __getitem__(self, name: str) -> Mapping[str, Attribute]:
+        return self._recordings[name].attributes
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._recordings)
+
+    def __len__(self) -> int:
+        return len(self._recordings)
+
+
+PUBLISHED, SIMULATED = "published", "simulated"
+
+
+def combine_origins(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
+    """Return the attributes of a result of several recordings: simulated if any is, published if all are.
+
+    >>> combined([{"published": "b"}, {"published": "a"}]), combined([{"published": "a"}, {"simulated": True}])
+    ({'published': 'a,b'}, {'simulated': True})
+    """
+    attributes = list(recordings)
+    origin: dict[str, Attribute] = (
+        {SIMULATED: True} if any(recording.get(SIMULATED) for recording in attributes) else {}
+    )
+    sets = {str(recording.get(PUBLISHED) or "") for recording in attributes}
+    if sets and "" not in sets:
+        origin[PUBLISHED] = ",".join(sorted(sets))
+    return origin
+
+
+def merge_manifests(manifests: Sequence[Manifest]) -> Manifest:
+    """Return several datasets of one kind read as one.
+
+    Raises `UsageError` if two recordings share a name, if the files differ, or if other chains of stages lie behind them.
+    """
+    if len(manifests) == 1:
+        return manifests[0]
+    recordings: dict[str, Entry] = {}
+    files: dict[str, Any] = {}
+    for manifest in manifests:
+        shared = next((name for name in manifest.recordings if name in recordings), None)
+        if shared is not None:
+            raise UsageError(
+                f"Two of the datasets hold a recording named {shared}. Names must be unique; leave one dataset out."
+            )
+        if manifest.chain != manifests[0].chain:
+            raise UsageError(
+                f"These datasets were made in different ways and cannot be read as one: "
+                f"{chain_difference(manifests[0].chain, manifest.chain)}."
+            )
+        recordings.update(manifest.recordings)
+        files.update(manifest.files)
+    first = manifests[0]
+    return Manifest(first.stage, first.version, first.params, {}, first.chain, recordings, files)
+
+
+def chain_difference(expected: Sequence[Mapping[str, Any]], chain: Sequence[Mapping[str, Any]]) -> str:
+    """Describe the first difference between two chains of stages.
+
+    >>> step = {"stage": "synchronize", "version": 1, "params": {"rate_hz": 50.0}, "fitted": None}
+    >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
+    'synchronize has rate_hz 100.0 instead of 50.0'
+    """
+    from tacpipe.plugins import params as params_of
+
+    for ours, theirs in zip(expected, chain, strict=False):
+        if ours["stage"] != theirs["stage"]:
+            return f"{theirs['stage']} is where {ours['stage']} should be"
+        if ours["version"] != theirs["version"]:
+            return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
+        our_params, their_params = (
+            params_of.with_current_names(step["stage"], step["params"]) for step in (ours, theirs)
+        )
+        for name in sorted({*our_params, *their_params}):
+            expected_value, value = our_params.get(name), their_params.get(name)
+            if expected_value != value:
+                return f"{ours['stage']} has {name} {value} instead of {expected_value}"
+        if ours["fitted"] != theirs["fitted"]:
+            return f"{ours['stage']} was fitted on other recordings"
+    if len(expected) != len(chain):
+        longer = expected if len(expected) > len(chain) else chain
+        return f"only one of them went through {longer[min(len(expected), len(chain))]['stage']}"
+    return "they are the same"

@@ -253,7 +253,7 @@ class Windows(torch.utils.data.Dataset[Window]):
     def _decoded(self, recording: Recording) -> _RecordingRows:
         table = recording.table(self.stream)
         t_ns = streams.times(table)
-        read = arrays.of_table(table)
+        read = arrays.arrays_of_table(table)
         inputs, targets = (_matching(patterns, read, recording.name) for patterns in self._patterns)
         if self._channels is None:
             self._channels = inputs, targets

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import merging, pages
+from tacpipe.datasets import pages, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Item
@@ -193,7 +193,7 @@ class ByRecording:
         if list(source.chain) != list(model_chain[: len(source.chain)]):
             raise UsageError(
                 f"The model was trained behind other stages than {dataset_name} went through: "
-                f"{merging.chain_difference(model_chain, source.chain)}. Give the recordings themselves: the model's own "
+                f"{selection.chain_difference(model_chain, source.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
         for step in model_chain[len(source.chain) :]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from tacpipe.datasets import adoption, roles
+from tacpipe.datasets import paths, selection
 from tacpipe.datasets.dataset import Dataset, Reader, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.paths import shard_path
@@ -192,7 +192,7 @@ def reader(
 
 
 def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
-    content = adoption.verified_copy(name, path, beside_of, size)
+    content = paths.verified_copy(name, path, beside_of, size)
     if content is not None:
         with contextlib.suppress(TacpipeError):  # A read-only store stays damaged; the intact copy is used
             store.prepare()
@@ -296,8 +296,8 @@ def _roles(identity: str | Mapping[str, Any] | None, read: Reader) -> dict[tuple
     if identity is None:
         return {}
     if isinstance(identity, str):
-        return roles.read(read(identity, roles.FILE))
-    folds = roles.read(read(identity["roles"], roles.FILE))
+        return selection.read_roles(read(identity, selection.SPLIT_FILE))
+    folds = selection.read_roles(read(identity["roles"], selection.SPLIT_FILE))
     return {(recording, fold): role for (recording, fold), role in folds.items() if fold == identity["fold"]}
 
 

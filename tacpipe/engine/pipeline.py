@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest, replacing, roles
+from tacpipe.datasets import manifest, replacing, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.paths import shard_path
@@ -340,7 +340,7 @@ class _RequestRun:
             if name == "split" and fold:
                 raise UsageError(f"--fold {fold} has no effect without --split.")
             return None
-        table = roles.digest(dataset.manifest, str(dataset.directory))
+        table = selection.split_digest(dataset.manifest, str(dataset.directory))
         if name != "split":
             return table
         if not self.inputs.roles.keys() & self.inputs.merged.included.keys():

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from tacpipe.datasets import manifest, merging, recording_names, roles
+from tacpipe.datasets import manifest, paths, selection
 from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
 from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
@@ -157,7 +157,7 @@ class RequestInputs:
         """The given datasets read as one."""
         if not self.datasets:
             raise UsageError(f"{self.request.name} needs a dataset to read.")
-        return merging.merge([dataset.manifest for dataset in self.datasets])
+        return selection.merge_manifests([dataset.manifest for dataset in self.datasets])
 
     @property
     def model(self) -> Manifest:
@@ -175,8 +175,10 @@ class RequestInputs:
                 f"{self.request.name} must know which recordings to train on: give --split, as made by `tacpipe split`."
             )
         split_path = str(split.directory)
-        content = execution.reader(self.store, (split_path,))(roles.digest(split.manifest, split_path), roles.FILE)
-        return roles.in_fold(roles.read(content), self.request.fold, split_path)
+        content = execution.reader(self.store, (split_path,))(
+            selection.split_digest(split.manifest, split_path), selection.SPLIT_FILE
+        )
+        return selection.roles_in_fold(selection.read_roles(content), self.request.fold, split_path)
 
     def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
         """Return the recordings of ``source`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
@@ -204,7 +206,7 @@ def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
         name: source if isinstance(source, Source) else Source(source)
         for name, source in sorted(stage.discover(request.params, request.source).items())
     }
-    recording_names.refuse_shared(
+    paths.refuse_shared_names(
         (name, next(iter(source.files.values()), request.source)) for name, source in sources.items()
     )
     regular.expect_inside(request.source, (path for source in sources.values() for path in source.files.values()))

@@ -246,7 +246,7 @@ def _labels(recordings: Dataset) -> bytes:
     """Return a table with one row per recording and a column an attribute."""
     import pyarrow as pa
 
-    from tacpipe.datasets import frames
+    from tacpipe.datasets import arrays
     from tacpipe.io.parquet import to_parquet
 
     rows = {recording.name: pa.table({RECORDING: pa.array([recording.name], pa.string())}) for recording in recordings}
@@ -255,7 +255,7 @@ def _labels(recordings: Dataset) -> bytes:
         for name in dict.fromkeys(name for recording in recordings for name in recording.attributes)
         if name != RECORDING
     ]
-    return to_parquet(pa.concat_tables(frames.labelled(recordings, rows, names).values()))
+    return to_parquet(pa.concat_tables(arrays.labelled_frame(recordings, rows, names).values()))
 
 
 def _readme(params: Params, recordings: Dataset, described: Contents, patterns: dict[str, str]) -> bytes:

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from tacpipe.datasets import recording_names
-from tacpipe.datasets.origin import PUBLISHED
+from tacpipe.datasets import paths
+from tacpipe.datasets.selection import PUBLISHED
 from tacpipe.errors import TacpipeError
 from tacpipe.io.files import walk
 from tacpipe.plugins.stage import Attribute, Files
@@ -58,14 +58,14 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         )
     by_name: dict[str, list[Path]] = {}
     for folder in folders:
-        by_name.setdefault(recording_names.folded(valid(folder.name)), []).append(folder)
+        by_name.setdefault(paths.folded_name(valid(folder.name)), []).append(folder)
     named_folders: list[tuple[str, Path]] = []
     for same in by_name.values():
         for folder in same:
             name = valid(folder.name)
             above = folder.relative_to(source).parts[:-1]
             named_folders.append((name if len(same) == 1 else valid("-".join([*above, name])), folder))
-    recording_names.refuse_shared(named_folders)
+    paths.refuse_shared_names(named_folders)
     return {
         name: {file: folder / file for file in names if file in holds[folder]} for name, folder in sorted(named_folders)
     }
@@ -88,8 +88,8 @@ def text(name: str) -> str:
 
 
 def valid(name: str) -> str:
-    """Return a folder's name as that of a recording (`recording_names.valid`), without the prefix of trials."""
-    return recording_names.valid(name.removeprefix(PREFIX) or name) or "trial"
+    """Return a folder's name as that of a recording (`paths.valid_name`), without the prefix of trials."""
+    return paths.valid_name(name.removeprefix(PREFIX) or name) or "trial"
 
 
 MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is known by its layout

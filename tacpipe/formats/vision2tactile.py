@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.datasets import recording_names
+from tacpipe.datasets import paths
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import require, text, valid
 from tacpipe.io import regular
@@ -69,7 +69,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
         name = valid(f"{label}-{time_s}")
         named_folders.append((name, Path(place)))
         files_by_grasp[name] = files
-    recording_names.refuse_shared(named_folders)
+    paths.refuse_shared_names(named_folders)
     if not files_by_grasp:
         raise TacpipeError(
             f"{source} holds no grasp: no folder in it has {', '.join(NAMES)}. Give the folder of the unpacked data set."

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from tacpipe.channels.streams import EVENTS
-from tacpipe.datasets import directory, recording_names
+from tacpipe.datasets import directory, paths
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.datasets.pages import Item
@@ -131,8 +131,8 @@ def refuse_taken(output: Path, names: Sequence[str]) -> None:
     Some file systems do not distinguish case. Raises it also if another command wrote the dataset.
     """
     before = existing(output)
-    existing_names = {} if before is None else {recording_names.folded(name): name for name in before.recordings}
-    folded_names = [recording_names.folded(name) for name in names]
+    existing_names = {} if before is None else {paths.folded_name(name): name for name in before.recordings}
+    folded_names = [paths.folded_name(name) for name in names]
     conflicts = sorted(existing_names[folded] for folded in folded_names if folded in existing_names)
     if conflicts:
         raise UsageError(
@@ -146,8 +146,8 @@ def _free_name(requested: str, existing_names: Iterable[str]) -> str:
 
     Names that differ only in case count as equal, as on some file systems.
     """
-    name, number, folded = requested, 2, {recording_names.folded(existing) for existing in existing_names}
-    while recording_names.folded(name) in folded:
+    name, number, folded = requested, 2, {paths.folded_name(existing) for existing in existing_names}
+    while paths.folded_name(name) in folded:
         name, number = f"{requested}-{number}", number + 1
     return name
 

@@ -14,7 +14,7 @@ import numpy as np
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.comparison.specification import TaskReport
-from tacpipe.datasets.origin import PUBLISHED
+from tacpipe.datasets.selection import PUBLISHED
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts

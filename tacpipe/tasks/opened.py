@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.datasets.merging import chain_difference
+from tacpipe.datasets.selection import chain_difference
 from tacpipe.errors import UsageError
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from tacpipe.arrays import Bytes, Float32s, Floats, Times
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
-from tacpipe.datasets.streams import split_tables
+from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
 from tacpipe.printable import plain
 from tacpipe.signals import contact

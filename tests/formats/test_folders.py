@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.datasets import paths, recording_names
+from tacpipe.datasets import paths
 from tacpipe.engine import computing
 from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import UsageError
@@ -67,7 +67,7 @@ def test_every_name_is_one_that_a_manifest_accepts_and_that_stays(folder: str) -
     assert paths.safe_path(f"{name}/xela1.parquet")
     assert name.isprintable()
     assert unicodedata.is_normalized("NFC", name)
-    assert recording_names.valid(name) == name
+    assert paths.valid_name(name) == name
 
 
 @given(st.text(st.characters(max_codepoint=127), max_size=180))
@@ -79,7 +79,7 @@ def test_names_of_ascii_are_what_they_were(folder: str) -> None:
 def test_long_names_that_begin_alike_stay_apart(tmp_path: Path) -> None:
     first, second = make(tmp_path, *(f"{PREFIX}{'木' * 70}{end}" for end in "ab"))
     assert first != second
-    assert {len(name.encode()) <= recording_names.LONGEST for name in (first, second)} == {True}
+    assert {len(name.encode()) <= paths.LONGEST_NAME for name in (first, second)} == {True}
 
 
 @pytest.mark.parametrize(

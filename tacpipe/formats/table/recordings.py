@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.datasets import recording_names
+from tacpipe.datasets.paths import refuse_shared_names, valid_name
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
 from tacpipe.formats import source_files
 from tacpipe.formats.containers.container import (
@@ -97,7 +97,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
             if rows_path in stamps
         }
         sources += _recordings_in_files(layout, files, dict(zip(shared, key, strict=True)))
-    recording_names.refuse_shared((placeholder.name, next(iter(placeholder.files.values()))) for placeholder in sources)
+    refuse_shared_names((placeholder.name, next(iter(placeholder.files.values()))) for placeholder in sources)
     return sorted(sources, key=lambda placeholder: placeholder.name)
 
 
@@ -118,11 +118,11 @@ def find_contained(layout: Layout, kind: Format, source: Path) -> list[Recording
         for episode in episodes:
             values = {FILE: stem, **({} if episode is None else {"recording": episode})}
             plain_name = stem if episode is None else episode if names_are_complete else f"{stem}-{episode}"
-            name = recording_names.valid(pattern.fill_pattern(layout.name, values) if layout.name else plain_name)
+            name = valid_name(pattern.fill_pattern(layout.name, values) if layout.name else plain_name)
             if not name:
                 raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
             sources.append(RecordingFiles(name, files, {}, episode))
-    recording_names.refuse_shared((stream.name, next(iter(stream.files.values()))) for stream in sources)
+    refuse_shared_names((stream.name, next(iter(stream.files.values()))) for stream in sources)
     return sorted(sources, key=lambda stream: stream.name)
 
 
@@ -232,7 +232,7 @@ def _recording_name(layout: Layout, values: Mapping[str, str], files: Mapping[st
         text = "-".join(f"{name}-{value}" if value.isdigit() else value for name, value in values.items())
     else:
         text = next(iter(files.values())).name.partition(".")[0]
-    name = recording_names.valid(text)
+    name = valid_name(text)
     if not name:
         raise UsageError(f"{plain(text)} cannot be a recording's name. Set name in [recordings].")
     return name

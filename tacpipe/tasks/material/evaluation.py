@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Int64s
-from tacpipe.datasets import model_files, origin
+from tacpipe.datasets import model_files, selection
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline
@@ -168,7 +168,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     table = predictions_table(
         evaluated, classifier, {name: shard_attributes.get("session") for name, shard_attributes in attributes.items()}
     )
-    return Result({PREDICTIONS: RecordingOutput(table, origin.combined(attributes.values()))}, files)
+    return Result({PREDICTIONS: RecordingOutput(table, selection.combine_origins(attributes.values()))}, files)
 
 
 def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:

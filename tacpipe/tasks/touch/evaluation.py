@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
-from tacpipe.datasets import origin
+from tacpipe.datasets import selection
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline, regression
@@ -140,7 +140,7 @@ def _evaluated(
     if predictor.quantiles is not None:
         files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
     streams[GRASPS] = _about(grasps, in_training, is_known)
-    attributes = origin.combined(shard.attributes for shard in recordings.recordings.values())
+    attributes = selection.combine_origins(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
 

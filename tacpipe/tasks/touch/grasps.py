@@ -12,7 +12,7 @@ from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud, require_columns
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.datasets.streams import describe_streams
+from tacpipe.datasets.overview import describe_streams
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
