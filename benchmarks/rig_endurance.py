@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 import tacpipe
-from tacpipe.cli.emulate import SWITCH_S
+from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import tacpipe
 from tacpipe.io.parquet import from_parquet
 from tacpipe.plugins import given_params, registry
-from tacpipe.tasks.calibrated import CalibrationRequest
-from tacpipe.tasks.touch import calibration as touch_calibration
+from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report.uncertainty import Band, measure_bands
@@ -72,7 +72,7 @@ def _evaluated(parts: Mapping[str, Any], seed: int) -> pd.DataFrame:
     params = given_params.build("train.touch", registry.load("train.touch"), options=options)
     with tempfile.TemporaryDirectory() as workspace:
         model = touch_training.train(params, parts["train"], parts["val"], Path(workspace))
-    model = touch_calibration.calibrate(model, ASKED, parts["train"], parts["val"])
+    model = touch_model.calibrate(model, ASKED, parts["train"], parts["val"])
     found: pd.DataFrame = from_parquet(touch_evaluation.evaluate(model, parts["test"]).files[COVERAGE]).to_pandas()
     return found
 

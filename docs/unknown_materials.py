@@ -23,10 +23,10 @@ import numpy as np
 
 import tacpipe
 from tacpipe.plugins import given_params, registry
-from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import evaluation as material_evaluation
-from tacpipe.tasks.material import training as material_training
+from tacpipe.tasks.material import network_training
+from tacpipe.tasks.task import CalibrationRequest
 
 ARCHITECTURES = ("statistics",)  # the distance depends on the slides only, the probability on the architecture
 FOLDS = 5
@@ -97,7 +97,7 @@ def _evaluated(parts: list[Any], about: tuple[int, int, str]) -> list[dict[str, 
     options = {"architecture": architecture, "use_validation": False, "baselines": False}
     params = given_params.build("train.material", registry.load("train.material"), options=options)
     with tempfile.TemporaryDirectory() as workspace:
-        model = material_training.train(params, parts[0], parts[1], Path(workspace))
+        model = network_training.train(params, parts[0], parts[1], Path(workspace))
     model = material_calibration.calibrate(model, ASKED, parts[0], parts[1])
     tree = json.loads(material_evaluation.evaluate(model, parts[2]).files["metrics.json"])
     known = json.loads(model["config.json"])["known"]

@@ -44,7 +44,7 @@ def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None,
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
     from tacpipe.plugins.stage import Result
-    from tacpipe.tasks.calibrated import CalibrationRequest
+    from tacpipe.tasks.task import CalibrationRequest
 
     task = model_files.task(model.files)
     task_calibration = task.calibration

@@ -94,7 +94,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
     from tacpipe.channels import streams as masks
     from tacpipe.io.columns import release
-    from tacpipe.io.mapped import MappedArrays
+    from tacpipe.io.spill import MappedArrays
     from tacpipe.signals.repairs import fresh_rate_hz, mean_rate_hz
     from tacpipe.signals.resampling import default_gap_ns
     from tacpipe.synchronization import streams

@@ -177,6 +177,6 @@ def load(path: str | PathLike[str]) -> Any:
 
     model = open(path)
     with extras.explain_missing("A model"):
-        from tacpipe.tasks.opened import OpenedChain
+        from tacpipe.tasks.recordings import OpenedChain
 
         return model_files.task(model.files, str(path)).load(model.files, OpenedChain(model))

@@ -386,14 +386,14 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
     import torch
 
     from tacpipe.models.recurrent_autoencoder import AutoencoderShape
-    from tacpipe.tasks.material import networks
+    from tacpipe.tasks.material import estimators
     from tacpipe.tasks.touch import members
 
     scores = build_train_params("material", architecture="scores")
-    scores_network = networks.build(scores, AutoencoderShape(channels=4, classes=3))
-    networks.check(scores_network, scores, torch.zeros(5, 8, 4), 3)
+    scores_network = estimators.build_network(scores, AutoencoderShape(channels=4, classes=3))
+    estimators.check_network(scores_network, scores, torch.zeros(5, 8, 4), 3)
     with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
-        networks.check(scores_network, scores, torch.zeros(5, 8, 4), 4)
+        estimators.check_network(scores_network, scores, torch.zeros(5, 8, 4), 4)
     flat = build_train_params("touch", architecture="flat")
     network = members.network(flat, ["pdc_th"])
     read = members.patches(flat)
@@ -402,14 +402,14 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
 
 
 def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(package: Path, tmp_path: Path) -> None:
-    from tacpipe.tasks.material import training
+    from tacpipe.tasks.material import network_training
     from tests.tasks.material import textures
 
     params = build_train_params("material", architecture="majority", baselines=False)
     recordings = textures.dataset(
         *(textures.slide("biotac", material, trial) for material, trial in [(1, 0), (3, 0), (3, 1), (4, 0)])
     )
-    assert training.train(params, recordings, None, tmp_path) == {"biotac.txt": b"3"}
+    assert network_training.train(params, recordings, None, tmp_path) == {"biotac.txt": b"3"}
 
 
 def test_reports_name_an_architecture_as_its_class_states_it_and_others_by_their_choice(package: Path) -> None:

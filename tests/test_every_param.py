@@ -26,7 +26,7 @@ from tacpipe.plugins.constraints import CommaList, Range, Unit
 from tacpipe.simulation.household import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
-from tacpipe.tasks.forward.rows import ACTIONS
+from tacpipe.tasks.forward.networks import ACTIONS
 from tacpipe.tasks.material.losses import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
 from tacpipe.tasks.touch.members import LOSSES

@@ -14,14 +14,14 @@ import pytest
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import StorageError
-from tacpipe.io import mapped
-from tacpipe.io.mapped import MappedArrays
+from tacpipe.io import spill
+from tacpipe.io.spill import MappedArrays
 
 
 def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(mapped, "SEGMENT_BYTES", 1 << 16)
+    monkeypatch.setattr(spill, "SEGMENT_BYTES", 1 << 16)
     rng, mapped_arrays = np.random.default_rng(0), MappedArrays(100)
     arrays: list[AnyArray] = [
         rng.normal(size=(7, 3)).astype(np.float32),
@@ -54,7 +54,7 @@ def test_what_was_read_takes_no_memory_once_it_is_let_go_of() -> None:
     before = resident_bytes()
     array[:] = 1.0
     assert resident_bytes() > before + size // 2
-    mapped_arrays.read(mapped.MOST_READ + 1)
+    mapped_arrays.read(spill.MOST_READ + 1)
     assert resident_bytes() < before + size // 8
     assert array.sum() == len(array)
 

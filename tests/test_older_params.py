@@ -135,7 +135,7 @@ def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
 
 def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     from tacpipe.datasets.selection import chain_difference
-    from tacpipe.tasks import opened
+    from tacpipe.tasks import recordings as opened
 
     stored = params_of.to_json(build_params("compress.pca", components=3, representation="increments"))
     step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}

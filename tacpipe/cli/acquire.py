@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tacpipe.errors import DONE, FAILED, DeviceError, TacpipeError, UsageError
-from tacpipe.io import progress, terminal
+from tacpipe.io import terminal
 
 if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute
@@ -74,7 +74,7 @@ def add(program: typer.Typer, summary: str) -> None:
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
-        progress.set_quiet(quiet)
+        terminal.set_quiet(quiet)
         from tacpipe.recording import rig as rig_of
         from tacpipe.recording import trials as trials_of
         from tacpipe.store.location import locate

@@ -1,14 +1,18 @@
-"""Render ``--help``, with options in panels, and ``-h``, which shows the common options on one screen."""
+"""Render ``--help``, with options in panels, and ``-h`` on one screen; refuse addresses, such as ``s3://``, as paths."""
 
 from __future__ import annotations
 
+import functools
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+from tacpipe.io.files import local
 
 REQUIRED, PARAMS, RUN, OUTPUT, OPTIONS = "Required", "Params", "Run", "Output", "Options"
 PANELS = {  # Panels of the options that commands share. The params of a stage name theirs.
@@ -226,3 +230,25 @@ def apply(program: typer.Typer, *, brief: bool) -> None:
             apply(group.typer_instance, brief=brief)
     for command in program.registered_commands:
         command.cls = BriefCommand if brief else PanelCommand
+
+
+def refuse_addresses(program: typer.Typer) -> None:
+    """Have every command of ``program`` refuse addresses in all its arguments and options that are paths."""
+    for group in program.registered_groups:
+        if group.typer_instance is not None:
+            refuse_addresses(group.typer_instance)
+    for command in program.registered_commands:
+        if command.callback is not None:
+            command.callback = _checked(command.callback)
+
+
+def _checked(callback: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(callback)
+    def call(*args: Any, **options: Any) -> Any:
+        for value in options.values():
+            for path in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(path, Path):
+                    local(path)
+        return callback(*args, **options)
+
+    return call

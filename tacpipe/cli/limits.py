@@ -50,12 +50,11 @@ def limits(
     if output is not None:
         replacing.refuse_foreign(output, HEADER.encode())
     from tacpipe.engine import pipeline
-    from tacpipe.io import progress
     from tacpipe.tasks.touch import grasps as grasps_of
     from tacpipe.tasks.touch import limits as limits_of
 
     dataset = pipeline.open_dataset(grasps)
-    with progress.bar("limits", limits_of.steps(training_sizes, draws)) as advance:
+    with terminal.progress_bar("limits", limits_of.steps(training_sizes, draws)) as advance:
         measured = limits_of.limits(
             grasps_of.read(dataset), sizes=training_sizes, draws=draws, trees=trees, seed=seed, advance=advance
         )

@@ -7,18 +7,43 @@ wait for torch, pyarrow, pandas, scikit-learn or open3d. A command is built afte
 from __future__ import annotations
 
 import io
+import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.cli import addresses, completion
+from tacpipe.cli import help
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.io import memory, terminal, termination
 from tacpipe.io.files import describe
-from tacpipe.plugins import extras, failures
+from tacpipe.plugins import extras
 
 if TYPE_CHECKING:
     import typer
+
+COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # Set by the shell: complete_bash, complete_zsh, complete_fish or source_...
+
+
+def words_to_complete(environment: Mapping[str, str] = os.environ) -> list[str] | None:
+    """Return the words after ``tacpipe`` of the line that the shell completes; None where it completes nothing.
+
+    The word at the cursor is the last one, unless the line ends in a space.
+
+    >>> words_to_complete({"_TACPIPE_COMPLETE": "complete_bash", "COMP_WORDS": "tacpipe train fo"})
+    ['train', 'fo']
+    >>> words_to_complete({"_TACPIPE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "tacpipe store "})
+    ['store']
+    """
+    if COMPLETION_VARIABLE not in environment:
+        return None
+    line = environment.get("COMP_WORDS") or environment.get("_TYPER_COMPLETE_ARGS", "")
+    try:
+        line_words = shlex.split(line)
+    except ValueError:  # The line has an open quotation mark.
+        line_words = line.split()
+    return line_words[1:]
+
 
 HELP = """Record touch, train models on it, and trace every result back to the recorded bytes.
 
@@ -123,7 +148,7 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:
-        explanation = str(memory.shortage(error) or "") or failures.text(error)
+        explanation = str(memory.shortage(error) or "") or extras.failure_text(error)
         if explanation is None and not termination.requested():
             raise
         code, sentence = FAILED, str(explanation)
@@ -148,8 +173,8 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     from tacpipe.cli import help as plain_help
 
     arguments = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
-    program = app(arguments if (completed_words := completion.words()) is None else completed_words)
-    addresses.refuse(program)
+    program = app(arguments if (completed_words := words_to_complete()) is None else completed_words)
+    help.refuse_addresses(program)
     plain_help.apply(program, brief="-h" in arguments)
     try:
         with extras.explain_missing("This command"):

@@ -9,8 +9,9 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from tacpipe.cli import headline_table, identities
+from tacpipe.cli import headline_table
 from tacpipe.datasets.dataset import Dataset
+from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
@@ -54,7 +55,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     """Return the overview of a result: the model against its baselines, the evaluated data and their role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
-    identity = identities.of_manifests(store).get(found.digest, {})
+    identity = identities_of_manifests(store).get(found.digest, {})
     return {
         **_architecture(config),
         "headline": None if headlines is None else [entry.to_json() for entry in headlines],

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tacpipe.cli import addresses, stages
+from tacpipe.cli import help, stages
 from tacpipe.engine import chains
 from tacpipe.engine.chains import Chain, ChainStage
 from tacpipe.errors import DONE, INTERRUPTED
-from tacpipe.io import progress, terminal, termination
+from tacpipe.io import terminal, termination
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Becam
 
 
 def _summary(became: Mapping[str, Became], *, quiet: bool) -> None:
-    progress.set_quiet(quiet)
+    terminal.set_quiet(quiet)
     if not quiet:
         counts = {kind: sum(outcome is kind for outcome in became.values()) for kind in Became}
         terminal.note(", ".join(f"{count} {kind.value}" for kind, count in counts.items() if count))
@@ -236,7 +236,7 @@ def _answered(arguments: Sequence[str]) -> bool:
     program.callback()(stages.nothing)
     try:
         stages.add_group(program, arguments[0], arguments)
-        addresses.refuse(program)
+        help.refuse_addresses(program)
         with stages.answering():
             code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
     except Exception:

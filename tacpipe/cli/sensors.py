@@ -1,4 +1,4 @@
-"""Add the commands of ``tacpipe sensors``."""
+"""Add the commands of ``tacpipe sensors``, which list, probe and emulate sensors."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import dataclasses
 import sys
 from collections.abc import Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tacpipe.errors import DEVICE, TacpipeError
-from tacpipe.io import terminal, toml
+from tacpipe.io import config_text, terminal
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 SCHEMA_VERSION = 1
-EMULATION = "tacpipe.cli.emulate"
+EMULATION = "tacpipe.cli.sensors"
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -29,9 +30,7 @@ def add(program: typer.Typer, summary: str) -> None:
     group.command("list")(list_)
     group.command("probe")(probe)
     if find_spec("tacpipe.simulation.emulation") and find_spec(EMULATION):
-        from tacpipe.cli import emulate
-
-        emulate.add(group)
+        add_emulate(group)
     program.add_typer(group, name="sensors")
 
 
@@ -159,7 +158,7 @@ def _stanza(report: Report) -> list[str]:
         f'name = "{candidate.kind.replace("-", "_")}"',
         f'sensor = "{candidate.kind}"',
         f'transport = "{report.address}"',
-        *(_described(options, notes) if notes else [f"options = {toml.toml_value(options)}"] if options else []),
+        *(_described(options, notes) if notes else [f"options = {config_text.toml_value(options)}"] if options else []),
     ]
 
 
@@ -169,9 +168,9 @@ def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str
     for name, value in options.items():
         note = f"  # {notes[name]}" if name in notes else ""
         if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
-            lines += [f"{name} = [{note}", *(f"    {toml.toml_value(item)}," for item in value), "]"]
+            lines += [f"{name} = [{note}", *(f"    {config_text.toml_value(item)}," for item in value), "]"]
         else:
-            lines.append(f"{name} = {toml.toml_value(value)}{note}")
+            lines.append(f"{name} = {config_text.toml_value(value)}{note}")
     return lines
 
 
@@ -195,3 +194,55 @@ def _json(report: Report) -> dict[str, Any]:
             for finding in report.findings
         ],
     }
+
+
+EMULATE_SUMMARY = "Emulate the streams of a rig without hardware."
+EMULATE_EXAMPLE = (
+    "\n\nEach stream sends its sensor's own bytes at its own rate. FOLDER/rig.toml is the rig file with the emulated "
+    "addresses: give it to `tacpipe acquire`. FOLDER/ledger lists at the end what was sent and which bytes were changed."
+    "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
+)
+EMULATION_MARK = b"\nsimulated = true\n"  # Line that marks the rig file of an emulated rig
+SWITCH_S = 0.0005  # Longest delay of the pacing thread by the planning thread; Python's 5 ms would show at 1 kHz
+
+
+def add_emulate(program: typer.Typer) -> None:
+    """Add the command ``emulate`` to ``program``."""
+    program.command("emulate", help=EMULATE_SUMMARY + EMULATE_EXAMPLE)(emulate)
+
+
+def emulate(
+    rig: Annotated[Path, typer.Argument(help="Rig file.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for rig.toml, pseudo-terminals and the ledger.")
+    ],
+    duration: Annotated[
+        float | None, typer.Option("--duration-s", help="Duration, s; without it, until Ctrl-C.")
+    ] = None,
+    faults: Annotated[str, typer.Option("--faults", help="Faults to add: noise=0.5,cut=0.2,flip=1,drop=0.001 …")] = "",
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the simulated world and of the faults.")] = 0,
+) -> None:
+    """Serve a rig."""
+    from tacpipe.datasets import replacing
+    from tacpipe.io.files import readable_errors, write_whole
+    from tacpipe.io.termination import EndRequest
+    from tacpipe.recording import rig as rig_files
+    from tacpipe.recording.rig import read
+    from tacpipe.simulation.emulation import byte_faults
+    from tacpipe.simulation.emulation.emulator import Emulator
+
+    parsed_rig, parsed_faults, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
+    replacing.refuse_foreign(path, EMULATION_MARK)
+    sys.setswitchinterval(SWITCH_S)
+    with EndRequest() as is_over, readable_errors(output):
+        with Emulator(parsed_rig, seed, parsed_faults, output) as emulator:
+            write_whole(str(path), rig_files.to_toml(emulator.rig).encode(), f"{path}.draft")
+            terminal.result(path)
+            for name, stream in emulator.rig.streams.items():
+                terminal.note(f"{name}: {stream.kind} at {stream.address}")
+            is_over.wait(duration)
+        for ledger in emulator.ledger.values():
+            ledger.write(output / "ledger")
+    for name, ledger in emulator.ledger.items():
+        described = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
+        terminal.note(f"{name}: {described or 'nobody listened'}")

@@ -15,8 +15,7 @@ from tacpipe.io import terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.requirements import Requirements
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Requirements
 from tacpipe.training.devices import Device
 
 PRINT_PARAMS = "--print-params"

@@ -16,7 +16,7 @@ from tacpipe import printable
 from tacpipe.cli import stage_options
 from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
-from tacpipe.io import progress, terminal
+from tacpipe.io import terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
@@ -81,7 +81,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
     answering = _answering.get()
     if answering and any(options.get(look) for look in ("guess", "print_params", "dry_run")):
         raise UnansweredError
-    progress.set_quiet(options["quiet"])
+    terminal.set_quiet(options["quiet"])
     for flag, kind in OPTIONS.items():
         if flag != "fold" and options.get(flag) is not None:  # Some stages lack some of these options.
             fields_of.check(options[flag], kind, f"--{flag}")

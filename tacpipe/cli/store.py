@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tacpipe.errors import DAMAGED, FAILED, UsageError
-from tacpipe.io import progress, terminal
+from tacpipe.io import terminal
 from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
 from tacpipe.store import layout
@@ -164,7 +164,7 @@ def repair(as_json: AsJson = False) -> None:
 def _end_unread(soundness: Soundness) -> None:
     """Exit with 1 if the system failed to read objects, whose state stays unknown."""
     if soundness.unread:
-        progress.report(
+        terminal.report_progress(
             f"{len(soundness.unread)} objects or records could not be read: {next(iter(soundness.unread.values()))}"
         )
         raise typer.Exit(FAILED)

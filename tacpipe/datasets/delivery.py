@@ -8,7 +8,7 @@ from pathlib import Path
 from tacpipe.datasets.manifest import Manifest, parse
 from tacpipe.datasets.pages import StoredPages
 from tacpipe.errors import StorageError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.store import projects
 from tacpipe.store.store import MissingError, Store
@@ -50,7 +50,7 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
     except StorageError as error:
         if not manifest.recorded:
             raise
-        progress.report(
+        terminal.report_progress(
             f"{directory} is kept in {store.root} alone, until the next command that changes it reaches the bucket. {error}"
         )
 

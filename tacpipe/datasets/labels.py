@@ -41,10 +41,10 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
 
 def of_text(text: str) -> Attribute:
     """Return the value of a text that is a number, true, false or null; otherwise the text."""
-    from tacpipe.io import yaml_text
+    from tacpipe.io import config_text
 
     try:
-        value = yaml_text.load(text)
+        value = config_text.load_yaml(text)
     except ValueError:
         return text
     if isinstance(value, float) and not isfinite(value):

@@ -293,3 +293,13 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
         for source in sources:
             lines += _lines(source, depth + 1, described, name)
     return lines
+
+
+def identities_of_manifests(store: Store) -> dict[str, Mapping[str, Any]]:
+    """Return the identity of each recorded run by the digest of the manifest that the run wrote."""
+    identities: dict[str, Mapping[str, Any]] = {}
+    for _, record in store.records():
+        file = record["result"]["files"].get(manifest_of.NAME)
+        if file is not None:
+            identities[file["digest"]] = record["identity"]
+    return identities

@@ -77,7 +77,7 @@ def valid_name(text: str) -> str:
     Of ASCII letters, digits, dots, dashes and underscores are kept, of other characters all that are printable. What is
     left out becomes a dash. A name of more than 192 bytes is cut and ends in a part of its digest.
 
-    >>> valid("cup 1"), valid("木"), valid("../new\nline"), valid(" ")
+    >>> valid_name("cup 1"), valid_name("木"), valid_name("../new\nline"), valid_name(" ")
     ('cup-1', '木', 'new-line', '')
     """
     composed = unicodedata.normalize("NFC", text)
@@ -92,7 +92,7 @@ def valid_name(text: str) -> str:
 def folded_name(name: str) -> str:
     """Return what two names share that are one to a file system without case.
 
-    >>> folded("Cup") == folded("cUP"), folded("木") == folded("石")
+    >>> folded_name("Cup") == folded_name("cUP"), folded_name("木") == folded_name("石")
     (True, False)
     """
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())

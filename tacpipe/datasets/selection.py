@@ -149,7 +149,7 @@ PUBLISHED, SIMULATED = "published", "simulated"
 def combine_origins(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
     """Return the attributes of a result of several recordings: simulated if any is, published if all are.
 
-    >>> combined([{"published": "b"}, {"published": "a"}]), combined([{"published": "a"}, {"simulated": True}])
+    >>> combine_origins([{"published": "b"}, {"published": "a"}]), combine_origins([{"published": "a"}, {"simulated": True}])
     ({'published': 'a,b'}, {'simulated': True})
     """
     attributes = list(recordings)

@@ -18,7 +18,7 @@ from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request
 from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.plugins import registry
 from tacpipe.store import records
@@ -221,7 +221,7 @@ class ByRecording:
         executor = self.chosen.opened()
         module = registry.stages()[registry.stage_name(name)].partition(":")[0]
         preload = ["tacpipe.io.parquet", "tacpipe.engine.computing", module]
-        with progress.bar(registry.stage_name(name), len(tasks)) as advance:
+        with terminal.progress_bar(registry.stage_name(name), len(tasks)) as advance:
             for result in executor.run(computing.compute, tasks, preload):
                 advance(note=result.recording)
                 if result.record is None:

@@ -13,7 +13,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import pipeline
 from tacpipe.engine.request import OPTIONS, Request
 from tacpipe.errors import ResultWarning, UsageError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import AUTO, Device
@@ -80,7 +80,7 @@ def call(
         track=tuple(options.track),
         **paths,
     )
-    with progress.showing_progress(options.progress):
+    with terminal.showing_progress(options.progress):
         outcome = pipeline.run(request)
     for note in outcome.notes:
         warnings.warn(note, ResultWarning, stacklevel=_STACK)

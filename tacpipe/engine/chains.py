@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import UsageError
-from tacpipe.io import regular, yaml_text
+from tacpipe.io import config_text, regular
 from tacpipe.printable import excerpt, listed, plain
 
 _FIELD = re.compile(r"(?<!\\)\$\{(?P<name>.*?)\}")
@@ -303,7 +303,7 @@ def _merged(before: Values, over: Values) -> dict[str, Any]:
 def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
     """Return what a YAML file holds; nothing of one that may be ``missing`` and is."""
     try:
-        value = yaml_text.load(regular.content(file, yaml_text.MAX_CHARACTERS))
+        value = config_text.load_yaml(regular.content(file, config_text.MAX_CHARACTERS))
     except FileNotFoundError:
         if missing:
             return {}

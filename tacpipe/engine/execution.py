@@ -23,7 +23,7 @@ from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_
 from tacpipe.io import files, memory, regular
 from tacpipe.io.files import Draft, Hashed, move, present, write_whole
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
-from tacpipe.plugins import extras, failures, registry
+from tacpipe.plugins import extras, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
@@ -99,7 +99,7 @@ def execute(
                 returned = _result(task.name, stage, stage(params, **arguments))
                 result = _stored(returned, sink, durable=stage.source)  # Batches are read here
         except Exception as error:
-            failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
+            extras.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
     notes = [*returned.notes, *(note for output in returned.recordings.values() for note in output.notes)]
     return result, notes

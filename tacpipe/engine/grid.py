@@ -17,7 +17,7 @@ from tacpipe.engine.executors.local import Local
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request, RequestInputs
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.store.location import locate
 from tacpipe.training import display, following
@@ -73,7 +73,7 @@ def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outco
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(requests)]
     pool = Local(jobs, pool_from=2)
     at_once = min(pool.jobs, len(tasks))
-    with processor.shared_by(at_once), progress.bar(f"{requests[0].name}, folds", len(requests)) as advance:
+    with processor.shared_by(at_once), terminal.progress_bar(f"{requests[0].name}, folds", len(requests)) as advance:
         for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
             advance(note=str(requests[position].output))
             yield requests[position], became
@@ -81,7 +81,7 @@ def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outco
 
 def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:
     position, request = task
-    with progress.showing_progress(False):
+    with terminal.showing_progress(False):
         try:
             return position, pipeline.run(request)
         except TacpipeError as error:
@@ -116,7 +116,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
 
     There is no estimate if nothing is missing, if no network is trained, and if the first training fails.
     """
-    with progress.showing_progress(False):
+    with terminal.showing_progress(False):
         try:
             missing = [request for request in requests if _is_missing(request)]
             each_s = _timed(missing[0]) if missing else None

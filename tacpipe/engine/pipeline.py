@@ -23,7 +23,7 @@ from tacpipe.engine.output import Unread
 from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request, RequestInputs
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
@@ -31,8 +31,8 @@ from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.store import MissingError, Store
-from tacpipe.trackers import tracker, tracking
-from tacpipe.trackers.tracker import Tracker
+from tacpipe.trackers import tracking
+from tacpipe.trackers.tracking import Tracker
 from tacpipe.training import following
 
 _NOTHING: Entry = {"attributes": {}, "shards": {}}  # Entry of a recording whose part returns only files
@@ -100,11 +100,11 @@ def _tracked(
         yield lambda result: None
         return
     params = {**params_of.to_json(request.params), "stage": request.name, "fold": request.fold}
-    tracked = tracking.Tracking(trackers, tracking.name_of(request.output, outcome.key), tracker.params(params))
+    tracked = tracking.Tracking(trackers, tracking.name_of(request.output, outcome.key), tracking.flat_params(params))
 
     def end(result: Manifest) -> None:
         tracked.finish(request.output, tracking.files(result, store))
-        outcome.notes += tracked.failures if progress.is_quiet() else []
+        outcome.notes += tracked.failures if terminal.is_quiet() else []
 
     try:
         with following.tracked([tracked]):

@@ -1,4 +1,4 @@
-"""Print results on stdout and all else on stderr, without control characters that files hold.
+"""Print results on stdout, notes and progress on stderr, without control characters that files hold.
 
 A label, a name or a header may come from anybody, and a terminal obeys escape sequences. So all that is printed passes
 through here, where a character that is not printable is shown as Python's repr shows it.
@@ -15,8 +15,8 @@ import os
 import select
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
@@ -199,3 +199,64 @@ def _cells(text: str) -> int:
     """
     padded = printable.padded(text, 4 * len(text))
     return 4 * len(text) - (len(padded) - len(text))
+
+
+_quiet = False
+
+
+def set_quiet(quiet: bool) -> None:
+    """Show no bar from now on, even on a terminal, or show them again."""
+    global _quiet
+    _quiet = quiet
+
+
+@contextmanager
+def showing_progress(visible: bool) -> Iterator[None]:
+    """Show bars and sentences within the block, or neither, whatever was set before."""
+    before = _quiet
+    set_quiet(not visible)
+    try:
+        yield
+    finally:
+        set_quiet(before)
+
+
+def is_quiet() -> bool:
+    """Return whether nothing is to be shown but errors and results."""
+    return _quiet
+
+
+def is_visible() -> bool:
+    """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
+    return sys.stderr.isatty() and not _quiet
+
+
+def report_progress(sentence: str) -> None:
+    """Report on stderr what a user should know while it happens, unless quiet was asked for."""
+    if not _quiet:
+        note(f"tacpipe: {sentence}")
+
+
+@contextmanager
+def progress_bar(description: str, total: int) -> Iterator[Callable[..., None]]:
+    """Yield ``advance(steps=1, note="")``, which moves a bar of ``total`` steps and shows ``note`` behind it."""
+    if not is_visible():
+        yield lambda steps=1, note="": None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(description, total=total, note="")
+
+        def advance(steps: int = 1, note: str = "") -> None:
+            progress.update(task, advance=steps, note=printable.shown(note))
+
+        yield advance

@@ -10,7 +10,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError
-from tacpipe.io import progress, threads
+from tacpipe.io import terminal, threads
 from tacpipe.maintenance import garbage
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
@@ -148,7 +148,7 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
     failed = []
     total = sum(sizes[name] for name in names)
     sent_bytes = 0
-    with progress.bar("copying", len(names)) as advance:
+    with terminal.progress_bar("copying", len(names)) as advance:
         for name, error in threads.map_in_threads(send, names, max(source.at_once, target.at_once)):
             failed += [] if error is None else [(name, error)]
             sent_bytes += sizes[name]

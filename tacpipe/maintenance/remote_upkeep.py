@@ -20,7 +20,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import progress, threads
+from tacpipe.io import terminal, threads
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
 from tacpipe.maintenance.garbage import GRACE_DAYS, Collected, ancestors
@@ -56,7 +56,7 @@ def verify(store: RemoteStore) -> Soundness:
     entries = list(store.files.list("objects"))
     names = [Path(entry.name).name for entry in entries if _is_object(entry.name)]
     soundness.foreign = sorted(entry.name for entry in entries if not _is_object(entry.name))
-    with progress.bar("verifying", len(names)) as advance:
+    with terminal.progress_bar("verifying", len(names)) as advance:
         for name, error_type in threads.map_in_threads(lambda name: (name, _read_error(store, name)), names, AT_ONCE):
             soundness.objects += error_type is not AbsentError
             if error_type is MissingError:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import regular, yaml_text
+from tacpipe.io import config_text, regular
 from tacpipe.plugins import architectures
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
@@ -143,7 +143,7 @@ def _from_set(name: str, text: str) -> _Setting:
 
 def _parse(text: str) -> Any:
     try:
-        return yaml_text.load(text)
+        return config_text.load_yaml(text)
     except ValueError:
         return text
 
@@ -155,7 +155,7 @@ def _from_file(path: Path, block: str, *, required: bool) -> list[_Setting]:
 
 def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
     try:
-        content = yaml_text.load(regular.content(path)) or {}
+        content = config_text.load_yaml(regular.content(path)) or {}
     except FileNotFoundError:
         raise UsageError(f"There is no file {path} to read params from.") from None
     except OSError as error:

@@ -20,7 +20,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
 from tacpipe.io.files import listed
 from tacpipe.io.hashing import digest, file_digest
-from tacpipe.plugins import extras, failures
+from tacpipe.plugins import extras
 from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
@@ -307,7 +307,7 @@ def trackers() -> dict[str, str]:
 
 
 def load_tracker(name: str) -> Any:
-    """Return what makes the tracker of this name, a `tacpipe.trackers.tracker.Tracker`, from the place to write to.
+    """Return what makes the tracker of this name, a `tacpipe.trackers.tracking.Tracker`, from the place to write to.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -367,7 +367,7 @@ def _import(name: str, target: str) -> Any:
     except TacpipeError:
         raise
     except Exception as error:  # a mistake in a plug-in's module
-        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {failures.line(error)}") from error
+        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {extras.failure_line(error)}") from error
     try:
         return operator.attrgetter(attribute)(loaded) if attribute else loaded
     except AttributeError as error:

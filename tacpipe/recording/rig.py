@@ -24,7 +24,7 @@ from typing import Any
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import regular, toml
+from tacpipe.io import config_text, regular
 from tacpipe.links import link
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute
@@ -154,21 +154,26 @@ def _refuse_unknown(table: Mapping[str, Any], keys: tuple[str, ...], source: str
 
 def to_toml(rig: Rig) -> str:
     """Return the TOML of a rig that differs from its file, as one of the emulator or one that its devices complete."""
-    parts = [f"master = {toml.toml_value(rig.master)}\n"]
+    parts = [f"master = {config_text.toml_value(rig.master)}\n"]
     if rig.labels:
         parts.append(
             "[labels]\n"
-            + "".join(f"{toml.toml_key(name)} = {toml.toml_value(value)}\n" for name, value in rig.labels.items())
+            + "".join(
+                f"{config_text.toml_key(name)} = {config_text.toml_value(value)}\n"
+                for name, value in rig.labels.items()
+            )
         )
     if rig.live:
         parts.append(
             "[live]\n"
-            + "".join(f"{toml.toml_key(name)} = {toml.toml_value(value)}\n" for name, value in rig.live.items())
+            + "".join(
+                f"{config_text.toml_key(name)} = {config_text.toml_value(value)}\n" for name, value in rig.live.items()
+            )
         )
     for stream in rig.streams.values():
         lines = {"name": stream.name, "sensor": stream.kind, "transport": str(stream.address)}
-        table = "".join(f"{name} = {toml.toml_value(value)}\n" for name, value in lines.items())
+        table = "".join(f"{name} = {config_text.toml_value(value)}\n" for name, value in lines.items())
         if stream.options:
-            table += f"options = {toml.toml_value(stream.options)}\n"
+            table += f"options = {config_text.toml_value(stream.options)}\n"
         parts.append("[[stream]]\n" + table)
     return "\n".join(parts)

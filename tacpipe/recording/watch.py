@@ -14,7 +14,7 @@ import numpy as np
 from tacpipe import printable
 from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress, terminal
+from tacpipe.io import terminal
 from tacpipe.recording import clock
 from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.recording.rig import RigStream
@@ -142,7 +142,7 @@ class RigView:
     @contextlib.contextmanager
     def open(self) -> Iterator[RigView]:
         """Show the view on the terminal in the block, where there is a terminal."""
-        if self._quiet or not progress.is_visible():
+        if self._quiet or not terminal.is_visible():
             yield self
             return
         from rich.console import Console

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import StorageError, TacpipeError
-from tacpipe.io import progress, threads
+from tacpipe.io import terminal, threads
 from tacpipe.io.files import Draft, present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
@@ -261,7 +261,7 @@ class CachedStore(Store):
 
     def _bar(self, description: str, total: int) -> contextlib.AbstractContextManager[Callable[..., None]]:
         """Do as `progress.bar`, but in a task: there is one for all of these."""
-        return progress.bar(description, total) if self._work is not None else contextlib.nullcontext(_no_bar)
+        return terminal.progress_bar(description, total) if self._work is not None else contextlib.nullcontext(_no_bar)
 
     def read_here(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Yield the blocks of an object that lies here; raises as `Store.blocks`."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import LockedError, TacpipeError
-from tacpipe.io import progress, regular
+from tacpipe.io import regular, terminal
 from tacpipe.io.files import read_json, readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
@@ -230,7 +230,7 @@ def _wait(path: Path, work: str, timeout_s: float) -> int:
             )
         if not reported and waited_s >= REPORT_AFTER_S:
             reported = True
-            progress.report(f"waiting for {_holder(path, 'another process')}, which is at work on {work}.")
+            terminal.report_progress(f"waiting for {_holder(path, 'another process')}, which is at work on {work}.")
         time.sleep(_POLL_S)
         handle = _try_lock(path)
         if handle is not None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from tacpipe.errors import UsageError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.files import present, unread
 from tacpipe.store import addresses, layout
 from tacpipe.store.layout import BESIDE_NAME
@@ -102,7 +102,7 @@ def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
 @functools.cache
 def _report_holder(root: Path, dataset: Path) -> None:
     """Report once that a store outside of the project is used."""
-    progress.report(
+    terminal.report_progress(
         f"the store {root} is used: it holds {dataset}, though no project is marked from there to here. If all below "
         f"{root.parent} is one project, run `tacpipe store init` there."
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import files, memory, progress, regular
+from tacpipe.io import files, memory, regular, terminal
 from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
@@ -91,7 +91,7 @@ class Store:
             self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
             sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
         if self.root.name == layout.BESIDE_NAME:  # a store that was not named
-            progress.report(f"created the store {self._root}")
+            terminal.report_progress(f"created the store {self._root}")
 
     # ---- runs
 

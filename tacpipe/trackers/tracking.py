@@ -1,25 +1,99 @@
-"""The trackers of a command: what ``--track`` names, each started with the first epoch and failing alone."""
+"""Send params, epochs and figures to trackers of experiments, during training or from stored results."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import json
+import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from tacpipe.datasets import manifest
+from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.errors import TacpipeError
-from tacpipe.io import progress
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import terminal
+from tacpipe.io.hashing import digest
 from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
+from tacpipe.store.location import locate
 from tacpipe.store.store import Store
-from tacpipe.trackers import tracker
-from tacpipe.trackers.tracker import Scalar, Tracker
 from tacpipe.training.schedule import learning_rate
+
+Scalar = str | int | float | bool
+_LABELS = ("target", "network")  # labels in the lines of several networks
+
+
+class Tracker(Protocol):
+    """A run of one tracker. It is made with the place behind the colon of ``--track NAME:PLACE``, empty for its own.
+
+    Whatever a method raises is reported once, and the tracker is not called again: it ends no training.
+    """
+
+    def start(self, name: str, params: Mapping[str, Scalar]) -> str:
+        """Begin the run ``name``, which is unique to a result, or resume it; return where it can be seen.
+
+        A run that is resumed is given all its epochs again.
+        """
+
+    def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
+        """Add the metrics of an epoch, from 1: losses, learning rate, and what else is validated."""
+
+    def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
+        """End the run: its model or results are at ``path``, with these figures; None where they were not made."""
+
+
+def flat_params(nested: Mapping[str, Any]) -> dict[str, Scalar]:
+    """Return params by dotted name; lists as text.
+
+    >>> flat_params({"epochs": 2, "sweep": {"kind": "pca", "widths": [2, 4]}, "init": None})
+    {'epochs': 2, 'sweep.kind': 'pca', 'sweep.widths': '2, 4', 'init': 'none'}
+    """
+    return dict(_leaves(nested, "."))
+
+
+def flat_figures(nested: Mapping[str, Any], under: str = "") -> dict[str, float]:
+    """Return the numbers in nested values by their path; what is not a finite number is left out.
+
+    >>> flat_figures({"val_loss": 0.5, "best": True, "val": {"biotac": {"accuracy": 0.25}}, "note": "x"}, "a/")
+    {'a/val_loss': 0.5, 'a/val/biotac/accuracy': 0.25}
+    """
+    return {f"{under}{name}": float(value) for name, value in _leaves(nested, "/") if _is_number(value)}
+
+
+def flat_metrics(line: Mapping[str, Any], *, labelled: bool) -> dict[str, float]:
+    """Return the metrics of a line of a history, below its labels if ``labelled``: where there are several networks.
+
+    >>> flat_metrics({"epoch": 3, "val_loss": 0.5, "target": "pdc_th", "network": 1}, labelled=True)
+    {'pdc_th/1/val_loss': 0.5}
+    """
+    under = "".join(f"{line[name]}/" for name in _LABELS if name in line) if labelled else ""
+    return flat_figures({name: value for name, value in line.items() if name not in ("epoch", *_LABELS)}, under)
+
+
+def has_several_networks(lines: Iterable[Mapping[str, Any]]) -> bool:
+    """Return whether the lines of a history are of several networks."""
+    return len({tuple(line.get(name) for name in _LABELS) for line in lines}) > 1
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _leaves(value: Mapping[str, Any], between: str, name: str = "") -> Iterable[tuple[str, Scalar]]:
+    for key, entry in value.items():
+        path = f"{name}{between}{key}" if name else str(key)
+        if isinstance(entry, Mapping):
+            yield from _leaves(entry, between, path)
+        elif isinstance(entry, Sequence) and not isinstance(entry, str):
+            yield path, ", ".join(map(str, entry))
+        else:
+            yield path, "none" if entry is None else entry
+
 
 CONFIG, HISTORY = "config.json", "history.jsonl"
 LEARNING_RATE = "learning_rate"
@@ -94,7 +168,7 @@ class Tracking:
             for option, tracker_client in list(self.trackers.items()):
                 place = self._call(option, functools.partial(tracker_client.start, self.name, self.params))
                 if place is not None:
-                    progress.report(f"tracked by {option.partition(':')[0]}: {place}")
+                    terminal.report_progress(f"tracked by {option.partition(':')[0]}: {place}")
 
     def finish(self, path: Path, files: Mapping[str, bytes]) -> None:
         """End the run of a dataset at ``path``, some of whose files are given.
@@ -104,20 +178,20 @@ class Tracking:
         """
         config = _tree(files.get(CONFIG, b"{}"))
         if not self._started:  # nothing was trained: a stored model, or a result, whose params are its model's
-            self.params = {**tracker.params(config.get("params", {})), **self.params}
+            self.params = {**flat_params(config.get("params", {})), **self.params}
         self.start()
         self.replay(files.get(HISTORY, b""), config.get("params", {}))
-        values = tracker.figures(config.get("validation") or {}, "best/")
+        values = flat_figures(config.get("validation") or {}, "best/")
         if headline.FILE in files:  # a result: those of an older version have no summary
             stored = _tree(files.get(headline.SUMMARY, b"{}"))
-            values = tracker.figures(stored or headline.summarize(headline.read(files[headline.FILE])))
+            values = flat_figures(stored or headline.summarize(headline.read(files[headline.FILE])))
         for option, tracker_client in list(self.trackers.items()):
             self._call(option, functools.partial(tracker_client.end, path, values))
 
     def replay(self, history: bytes, model_params: Mapping[str, Any]) -> None:
         """Add the epochs of a stored history that were not added yet; ``model_params`` state the learning rate."""
         lines = [json.loads(line) for line in history.splitlines() if line.strip()]
-        self._labelled = tracker.has_several_networks(lines)
+        self._labelled = has_several_networks(lines)
         for line in lines[self._lines :]:
             self._add(line, _rate(model_params, line["epoch"]))
 
@@ -129,7 +203,7 @@ class Tracking:
 
     def _add(self, line: Line, additions: Mapping[str, float]) -> None:
         self._lines += 1
-        values = tracker.metrics({**line, **additions}, labelled=self._labelled)
+        values = flat_metrics({**line, **additions}, labelled=self._labelled)
         for option, tracker_client in list(self.trackers.items()):
             self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), values))
 
@@ -143,7 +217,7 @@ class Tracking:
             text = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
             first = text.strip().splitlines()[0] if text.strip() else type(error).__name__
             sentence = f"the tracker {option} failed and is left out ({first[:300]})"
-            progress.report(f"{sentence}; the command continues.")
+            terminal.report_progress(f"{sentence}; the command continues.")
             self.failures.append(f"{sentence}.")
             return None
 
@@ -159,3 +233,24 @@ def _rate(model_params: Mapping[str, Any], epoch: int) -> dict[str, float]:
 def _tree(content: bytes) -> dict[str, Any]:
     value = json.loads(content)
     return value if isinstance(value, dict) else {}
+
+
+def track_stored(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
+    """Give each dataset's params, epochs and figures to ``trackers``; return the names of the runs.
+
+    A run has the name that ``--track`` gives it, so that what was tracked as it was trained is the same run. Raises
+    `UsageError` for a dataset without epochs and figures, and for an unknown tracker.
+    """
+    stored = [manifest.find(path) for path in paths]
+    for path, entry in zip(paths, stored, strict=True):
+        if not {CONFIG, HISTORY} & set(entry.manifest.files):
+            raise UsageError(f"{path} was made by {entry.manifest.stage}; give a model or a result.")
+    names, identities_of = [], functools.cache(identities_of_manifests)
+    for path, entry in zip(paths, stored, strict=True):
+        store = locate(entry.directory)
+        identity, run_manifest = identities_of(store).get(entry.digest, {}), entry.manifest
+        params = {**run_manifest.params, "stage": run_manifest.stage, "fold": identity.get("fold", 0)}
+        name = name_of(path, digest(identity) if identity else entry.digest)
+        Tracking(open_trackers(trackers), name, flat_params(params)).finish(path, files(run_manifest, store))
+        names.append(name)
+    return names

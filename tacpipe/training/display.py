@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tacpipe.io import progress, terminal
+from tacpipe.io import terminal
 from tacpipe.training.following import HISTORY, Follower, Line, TrainedNetwork
 
 REDRAW_S = 0.1  # least time between two readings of the loss: each waits for the device
@@ -23,9 +23,9 @@ def on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
 
     On a terminal a bar moves from here to the end of the block, also before the first epoch and after the last.
     """
-    if progress.is_quiet():
+    if terminal.is_quiet():
         yield []
-    elif not progress.is_visible():
+    elif not terminal.is_visible():
         yield [EpochLines(workspace)]
     else:
         bar = Bar(stage, workspace)

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from tacpipe.io import progress, termination
+from tacpipe.io import terminal, termination
 
 HISTORY = "history.jsonl"
 Line = dict[str, Any]  # one line of the history: the results of an epoch, as JSON holds them
@@ -168,7 +168,9 @@ class _HistoryFile:
             yield
         except OSError as error:
             if not self._failed:
-                progress.report(f"{self._path} cannot be written ({error.strerror}); training continues without it.")
+                terminal.report_progress(
+                    f"{self._path} cannot be written ({error.strerror}); training continues without it."
+                )
             self._failed = True
 
 

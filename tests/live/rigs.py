@@ -13,10 +13,10 @@ from tacpipe.channels import schema
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
+from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 from tests.stage_params import fitting
 

@@ -23,10 +23,8 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import SlideRig, simulate_trial
-from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
-from tacpipe.tasks.material import sensor_calibration
-from tacpipe.tasks.material import training as material_training
+from tacpipe.tasks.material import network_training, sensor_calibration
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.live import slide as material_replay
 from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
@@ -34,6 +32,7 @@ from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, Materi
 from tacpipe.tasks.material.live.slide import UNLIKE
 from tacpipe.tasks.material.live.task import MaterialLive, MaterialSettings
 from tacpipe.tasks.material.model import predictions
+from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
 from tests.sensors import made
@@ -73,7 +72,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
     for kind, params in KINDS.items():
         train_params = fitting("train.material", params)
         loaded[kind] = Opened(
-            material_training.train(train_params, parts[0], parts[1], tmp_path_factory.mktemp(kind), None)
+            network_training.train(train_params, parts[0], parts[1], tmp_path_factory.mktemp(kind), None)
         )
     return loaded
 
@@ -366,7 +365,7 @@ def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -
         for chosen_trials in (range(2), [2])
     ]
     model: Any = Opened(
-        material_training.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
+        network_training.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
     )
     sensors = {"finger": rigs_of.build_sensor("biotac", {}, "finger")}
     with pytest.raises(UsageError, match="--sensor"):

@@ -24,7 +24,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
 from tacpipe.sensors.live import Live
 from tacpipe.tasks.touch import model as touch_prediction
-from tacpipe.tasks.touch.live import requests as touch_ranking
+from tacpipe.tasks.touch.live import engine as touch_engine
 from tacpipe.tasks.touch.live.engine import WAITING, TouchEngine
 from tacpipe.tasks.touch.live.messages import COLUMNS, TouchMessage
 from tacpipe.tasks.touch.predictor import Predictor
@@ -71,7 +71,7 @@ class Session:
 
     def __init__(self, files: Files, rank: str = "contact", folder: Path | None = None) -> None:
         self.sensor = rigs_of.build_sensor("grasps", {} if folder is None else {"folder": str(folder)}, "requests")
-        self.engine = TouchEngine({"requests": self.sensor}, Predictor.load(files), touch_ranking.criterion(rank))
+        self.engine = TouchEngine({"requests": self.sensor}, Predictor.load(files), touch_engine.criterion(rank))
         self.t_ns = 0
         self.engine.take("", StreamNote(0, "", wire.BEGIN, str(OFFSET_NS)))
         self.engine.take("requests", StreamNote(0, "requests", BEGAN))
@@ -231,9 +231,9 @@ def test_the_sessions_stream_has_a_row_a_candidate(models: dict[str, Files]) -> 
 def test_a_rig_without_requests_and_a_criterion_that_cannot_be_are_refused(models: dict[str, Files]) -> None:
     sensors = {"range": rigs_of.build_sensor("tfmini", {}, "range")}
     with pytest.raises(TacpipeError, match="sensor grasps"):
-        TouchEngine(sensors, Predictor.load(models["tree-ensemble"]), touch_ranking.criterion("contact"))
+        TouchEngine(sensors, Predictor.load(models["tree-ensemble"]), touch_engine.criterion("contact"))
     with pytest.raises(TacpipeError, match="both fingers"):
         Session(models["pointnet"], "balance")  # this model predicts the thumb's pressure alone
     for text in ("", "best", "level", "level:x", "level:nan", "contact:1"):
         with pytest.raises(UsageError, match="--rank"):
-            touch_ranking.criterion(text)
+            touch_engine.criterion(text)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import yaml_text
+from tacpipe.io import config_text
 from tacpipe.links import opening
 from tacpipe.plugins import given_params, registry
 from tacpipe.recording import rig
@@ -223,14 +223,14 @@ def test_a_value_of_set_is_read_as_carefully(tmp_path: Path, case: str, monkeypa
 def test_anchors_that_a_person_writes_are_read() -> None:
     text = "base: &base {rate_hz: 50, axes: [x, y]}\nother:\n  <<: *base\n  rate_hz: 100\nlist: [*base, *base]\n"
     base = {"rate_hz": 50, "axes": ["x", "y"]}
-    assert yaml_text.load(text) == {"base": base, "other": {**base, "rate_hz": 100}, "list": [base, base]}
+    assert config_text.load_yaml(text) == {"base": base, "other": {**base, "rate_hz": 100}, "list": [base, base]}
 
 
 def test_what_aliases_stand_for_is_counted_by_what_they_name() -> None:
     thousand = "a: &a [" + ", ".join("1" * 1 for _ in range(999)) + "]\n"
-    assert len(yaml_text.load(thousand + "b: [" + ", ".join(["*a"] * 90) + "]")["b"]) == 90  # 90,000 values
+    assert len(config_text.load_yaml(thousand + "b: [" + ", ".join(["*a"] * 90) + "]")["b"]) == 90  # 90,000 values
     with pytest.raises(ValueError, match="100000"):
-        yaml_text.load(thousand + "b: [" + ", ".join(["*a"] * 110) + "]")
+        config_text.load_yaml(thousand + "b: [" + ", ".join(["*a"] * 110) + "]")
 
 
 def test_a_sentence_stays_one_line_whatever_untrusted_text_is_in_it() -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import tacpipe
-from tacpipe.cli.emulate import SWITCH_S
+from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.testing import matching

@@ -18,7 +18,7 @@ from tacpipe.arrays import Floats
 from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
 from tacpipe.tasks.material import evaluation as material_evaluation
-from tacpipe.tasks.material import training as material_training
+from tacpipe.tasks.material import network_training
 from tests.fake_recordings import FakeRecording
 from tests.stage_params import fitting
 from tests.tasks.material.textures import Slide, dataset
@@ -58,7 +58,7 @@ def zero_shot_accuracies(spectra: str) -> dict[str, Floats]:
     for seed, held_out in product(SEEDS, HELD):
         hold_out = "roboskin=" + ",".join(map(str, held_out))
         params = fitting("train.material", {}, architecture="spectra", hold_out=hold_out, baselines=False)
-        files = material_training.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
+        files = network_training.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
         for number in held_out:
             new = [sample for sample in slides(seed, NEW, spectra) if sample.attributes["material"] == number]
             zero: dict[str, Any] = json.loads(material_evaluation.evaluate(files, dataset(*new)).files["metrics.json"])[
@@ -94,7 +94,7 @@ def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> Non
 @pytest.mark.parametrize("spectra", SPECTRA)
 def test_each_sensor_names_what_it_was_told_whatever_the_other_feels(spectra: str) -> None:
     params = fitting("train.material", {}, architecture="spectra", baselines=False)
-    files = material_training.train(params, dataset(*slides(0, KNOWN, spectra)), None, Path())
+    files = network_training.train(params, dataset(*slides(0, KNOWN, spectra)), None, Path())
     metrics = json.loads(material_evaluation.evaluate(files, dataset(*slides(0, NEW, spectra))).files["metrics.json"])
     assert metrics["model"]["accuracy"]["biotac"] >= 0.95
     assert metrics["model"]["accuracy"]["roboskin"] >= 0.8

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
@@ -44,7 +44,7 @@ def test_an_evaluation_moves_a_bar_to_its_end(
         bars.append((description, total, steps))
         yield lambda by=1, note="": steps.append(by)
 
-    monkeypatch.setattr(progress, "bar", followed)
+    monkeypatch.setattr(terminal, "progress_bar", followed)
     evaluate()
     ((description, total, steps),) = bars
     assert description == "evaluate" and sum(steps) == total

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress, termination
+from tacpipe.io import terminal, termination
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, TrainedNetwork
 from tacpipe.training.loop import Loss, Trained, WindowSet, WindowTraining, train
@@ -194,7 +194,7 @@ def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with progress.showing_progress(False), display.on_stderr("train", tmp_path) as displays:
+    with terminal.showing_progress(False), display.on_stderr("train", tmp_path) as displays:
         followed(tmp_path, *displays)
     assert capsys.readouterr().err == ""
 
@@ -202,7 +202,7 @@ def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remaining_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "is_visible", lambda: True)
+    monkeypatch.setattr(terminal, "is_visible", lambda: True)
     monkeypatch.setattr(display, "REDRAW_S", 0.0)
     drawn: list[tuple[str, float, str]] = []
     with display.on_stderr("train", tmp_path) as displays:

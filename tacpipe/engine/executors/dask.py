@@ -29,7 +29,7 @@ from tacpipe.engine import execution, processor, provenance
 from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks
 from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import progress, termination
+from tacpipe.io import terminal, termination
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras, registry
 from tacpipe.store import records
@@ -341,7 +341,7 @@ def _work(
     worker = get_worker()
     name = str(worker.name)
     senders = [following.Sender(functools.partial(worker.log_event, topic))] if topic else []
-    with _one_at_a_time, progress.showing_progress(False), provenance.worker(name), following.tracked(senders):
+    with _one_at_a_time, terminal.showing_progress(False), provenance.worker(name), following.tracked(senders):
         try:
             _check(name, versions, tasks[0])
             lease = _lease(tasks[0])

@@ -25,8 +25,8 @@ from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Reco
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
 from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.io import config_text, regular
 from tacpipe.io import files as file_system
-from tacpipe.io import regular, yaml_text
 from tacpipe.io.spill import Spill, unpack
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
@@ -198,7 +198,9 @@ def _file_ending(path: Path) -> str:
 
 def _bag_description(path: Path) -> dict[str, Any]:
     try:
-        value = yaml_text.load(regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode())
+        value = config_text.load_yaml(
+            regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode()
+        )
         about = value["rosbag2_bagfile_information"]
         return dict(about)
     except (ValueError, KeyError, TypeError, RecursionError) as error:

@@ -14,7 +14,7 @@ from tacpipe.formats.table import label_table, pattern
 from tacpipe.formats.table.label_table import plain_value, read_rows, read_text
 from tacpipe.formats.table.layout import TREES, LabelSource, Layout
 from tacpipe.formats.table.recordings import RecordingFiles
-from tacpipe.io import yaml_text
+from tacpipe.io import config_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
@@ -117,7 +117,7 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
         return _read_single_row(path)
     text = read_text(path)
     try:
-        values = source_files.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
+        values = source_files.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     if not isinstance(values, dict):

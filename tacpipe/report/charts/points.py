@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Ints
-from tacpipe.report.charts.grammar import (
+from tacpipe.report.charts.curves import (
     BETTER,
     INK,
     MARGIN,

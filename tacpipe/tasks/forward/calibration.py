@@ -9,20 +9,20 @@ import numpy as np
 
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import check_levels
-from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
 from tacpipe.tasks.forward.uncertainty import FILE, Uncertainty, WindowErrors, fewer
+from tacpipe.tasks.recordings import add_calibration, trained_on_datasets
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.calibrated import CalibrationRequest
+    from tacpipe.tasks.task import CalibrationRequest
 
 FITTED = 5000  # windows that quantiles are fitted on, evenly spread over training recordings
 CORRECTED = 400  # windows of each calibration recording
@@ -51,9 +51,7 @@ def calibrate(
         "recordings": {"fitted": len(np.unique(training_errors.recordings)), "corrected": count},
         "most_promised": quantiles.most_promised(count),
     }
-    config["trained_on"] = trained_on.add_calibration(
-        config["trained_on"], trained_on.of_datasets(training, calibration)
-    )
+    config["trained_on"] = add_calibration(config["trained_on"], trained_on_datasets(training, calibration))
     return {
         **model,
         CONFIG: model_files.to_json(config),
@@ -76,7 +74,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Window
     """Return the model's errors on at most ``limit`` windows of each recording, evenly spread."""
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
-    with progress.bar("calibrate", len(recordings.recordings)) as advance:
+    with terminal.progress_bar("calibrate", len(recordings.recordings)) as advance:
         for number, (name, shard) in enumerate(sorted(recordings.recordings.items())):
             track = forecaster.track(shard)
             check_rate(track, forecaster)

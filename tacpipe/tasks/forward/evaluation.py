@@ -14,7 +14,7 @@ from tacpipe.arrays import AnyFloats, Float32s, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.metrics import headline, quantiles
@@ -202,7 +202,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), QuantileSums(forecaster)
     slipping = SlipAlarms.of(forecaster)
     by_situation, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
-    with progress.bar("evaluate", len(recordings.recordings)) as advance:
+    with terminal.progress_bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = forecaster.track(shard)
             check_rate(track, forecaster)

@@ -25,13 +25,13 @@ from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
-from tacpipe.tasks import calibrated
 from tacpipe.tasks.forward import networks, tracks
+from tacpipe.tasks.forward.networks import acted
 from tacpipe.tasks.forward.params import ForwardConfig, Params
-from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
 from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
-from tacpipe.tasks.opened import OpenedChain
+from tacpipe.tasks.recordings import OpenedChain
+from tacpipe.tasks.task import quantiles_of
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -236,8 +236,8 @@ class Forecaster:
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
-        """Return `tacpipe.tasks.calibrated.quantiles_of` of the model."""
-        return calibrated.quantiles_of(self.uncertainty, percents)
+        """Return `tacpipe.tasks.task.quantiles_of` of the model."""
+        return quantiles_of(self.uncertainty, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
         """Return quantiles of counts above rest of arrays; `prediction.ForwardModel.predict` describes all three."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired
 from tacpipe.channels import arm
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
-from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Channels, Label, Requirements
 from tacpipe.training.devices import Precision
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
 from tacpipe.tasks.forward.uncertainty import CHUNK
-from tacpipe.tasks.opened import opened
+from tacpipe.tasks.recordings import open_for_model
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -181,7 +181,7 @@ class ForwardModel(Forecaster):
         if plan is not None:
             window = cast("AnyFloats", data)
             return self.predict_quantiles(window, plan, quantiles) if quantiles else self.predict_windows(window, plan)
-        recordings = opened(cast("Dataset | Recording", data), self.chain)
+        recordings = open_for_model(cast("Dataset | Recording", data), self.chain)
         return one_after_another(tables(self, recordings, sorted(set(steps)), sorted(set(quantiles))))
 
     def windows(self, recording: Recording) -> WindowArrays:
@@ -189,4 +189,4 @@ class ForwardModel(Forecaster):
 
         Rows in gaps are in none of them. The recorded motion serves as the plan. Raises as `predict`.
         """
-        return inputs(self, opened(recording.alone, self.chain))
+        return inputs(self, open_for_model(recording.alone, self.chain))

@@ -15,7 +15,7 @@ from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
-from tacpipe.tasks.forward.rows import rows
+from tacpipe.tasks.forward.networks import rows_of_tracks
 from tacpipe.tasks.forward.tracks import Track
 
 CHUNK = 2048  # windows predicted at once
@@ -70,7 +70,7 @@ def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowFor
     context, horizon = forecaster.context, forecaster.horizon
     past, future = (starts[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
     block = track.between(int(starts[0]), int(starts[-1]) + context + horizon)
-    block_rows = rows([block], [starts - starts[0]], context, horizon)
+    block_rows = rows_of_tracks([block], [starts - starts[0]], context, horizon)
     windows = block_rows.pick(block_rows.starts)[0]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.forward.prediction import ForwardModel
-    from tacpipe.tasks.opened import OpenedChain
+    from tacpipe.tasks.recordings import OpenedChain
 
 
 class ForwardTask(Task):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
-    from tacpipe.io.mapped import MappedArrays
+    from tacpipe.io.spill import MappedArrays
 
 BLOCK_ROWS = 1 << 14  # looked at at once
 _EXACT_BITS = 16  # bits of an integer that float32 holds exactly

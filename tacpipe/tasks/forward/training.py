@@ -22,13 +22,12 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.io.mapped import MappedArrays
+from tacpipe.io.spill import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.forecasts import Shrunk, persistence_weights
 from tacpipe.models.linear import FittedBaselines
 from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import headline, networks, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
@@ -42,6 +41,7 @@ from tacpipe.tasks.forward.forecaster import (
     layout,
 )
 from tacpipe.tasks.forward.headline import look_ahead_notes
+from tacpipe.tasks.forward.networks import Rows, acted, rows_of_tracks
 from tacpipe.tasks.forward.params import (
     AlarmLevels,
     CodecDescription,
@@ -52,8 +52,8 @@ from tacpipe.tasks.forward.params import (
     Params,
 )
 from tacpipe.tasks.forward.predictors import predicted
-from tacpipe.tasks.forward.rows import Rows, acted, rows
 from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
 
 if TYPE_CHECKING:
@@ -131,8 +131,8 @@ def train(
         "scaling": _scaling(parts[0], mapped),
         "largest_level": max(largest_level(track.tactile[usable]) for track, usable in _usable(parts[0], mapped)),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
-        "trained_on": trained_on.add_earlier(
-            trained_on.of_datasets(training, validation), start.config["trained_on"] if start else {}
+        "trained_on": add_earlier(
+            trained_on_datasets(training, validation), start.config["trained_on"] if start else {}
         ),
         "objects": sorted({track.object for track in parts[0] if track.object is not None}),
         "counts": {
@@ -260,7 +260,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str, ma
     starts = [
         (track.starts if params.windows == "all" else track.contact_starts)(context, horizon, stride) for track in part
     ]
-    return rows(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
+    return rows_of_tracks(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:

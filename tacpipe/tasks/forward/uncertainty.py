@@ -15,7 +15,7 @@ from tacpipe.metrics.quantiles import conformal_quantile, most_promised
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
 from tacpipe.models.windows import POSE, ForecastWindows, without_plan
-from tacpipe.tasks import calibrated
+from tacpipe.tasks import task
 
 SIGNS = 13  # features beside the predicted change at each step
 LATEST = 3  # rows whose change is looked at beside that of the whole context
@@ -81,7 +81,7 @@ class Uncertainty:
     @property
     def percents(self) -> tuple[int, ...]:
         """The levels of the quantiles in percent, ascending."""
-        return calibrated.percents(self.errors.levels)
+        return task.percents(self.errors.levels)
 
     def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
         """Return quantiles in counts above rest (window, step, channel, level), ascending.

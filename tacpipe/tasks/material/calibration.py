@@ -28,8 +28,8 @@ from tacpipe.tasks.material.slides import Slides
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.calibrated import CalibrationRequest
     from tacpipe.tasks.material.slides import BySensor, Slides
+    from tacpipe.tasks.task import CalibrationRequest
 
 
 def calibrate(

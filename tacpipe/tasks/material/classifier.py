@@ -22,15 +22,15 @@ from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
-from tacpipe.tasks.material import estimators, networks
+from tacpipe.tasks.material import estimators
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import FittedEstimator
+from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
-from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Estimator, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import SlideLayout, Slides, difference
-from tacpipe.tasks.opened import OpenedChain
+from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.training.scaling import Affine
 
 TASK = "material"
@@ -361,7 +361,7 @@ class Classifier:
         for name in self.layouts:
             shape = AutoencoderShape(**self.config["shapes"][name])
             weights = under(f"{name}.", tensors)
-            network = model_files.filled(functools.partial(networks.build, self.params, shape), weights)
+            network = model_files.filled(functools.partial(estimators.build_network, self.params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers

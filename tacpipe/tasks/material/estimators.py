@@ -1,4 +1,4 @@
-"""Fitted estimators of scikit-learn as bytes, without pickle: skops, and types of known packages alone.
+"""Check the estimators and networks that architectures build, and store fitted estimators of scikit-learn without pickle.
 
 A file of skops is a zip of a description, JSON, and of arrays. It is written so that the same estimator has the same bytes,
 and read only where each type in it is one that skops validates (most of scikit-learn, numpy and scipy), or of the package
@@ -13,15 +13,19 @@ import pkgutil
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
+import torch
+from torch import Tensor, nn
 
 from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.models.recurrent_autoencoder import AutoencoderShape, PlainClassifier
 from tacpipe.plugins import extras
 from tacpipe.printable import listed, plain
-from tacpipe.tasks.material.params import Estimator
+from tacpipe.tasks.material.losses import Network
+from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
 
 SCHEMA = "schema.json"
 WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all members of a zip
@@ -190,3 +194,31 @@ def _member(name: str, numbers: dict[Any, int]) -> str:
     """Return the name of a member, which skops makes of an address."""
     stem, dot, ending = name.partition(".")
     return f"{numbers.setdefault(int(stem), len(numbers) + 1)}{dot}{ending}" if stem.isdigit() else name
+
+
+def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Network:
+    """Return the network that ``params`` build for a sensor, of random weights; a plain one wrapped, to be called as others.
+
+    Raises `TacpipeError` where they build something else.
+    """
+    network = params.build(shape) if isinstance(params, NetworkParams) else None
+    if not isinstance(network, nn.Module):
+        raise TacpipeError(
+            f"The architecture {params.architecture} built {type(network).__name__}; it must build a torch.nn.Module."
+        )
+    return cast(Network, network if hasattr(network, "classify") else PlainClassifier(network))
+
+
+@torch.no_grad()
+def check_network(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
+    """Raise `TacpipeError` where a network returns something else than scores for ``slides`` (slide, time, channel)."""
+    training = network.training
+    output = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
+    network.train(training)
+    scores, shape = getattr(output, "scores", None), (len(slides[:TRIED]), classes)
+    if not isinstance(scores, Tensor) or tuple(scores.shape) != shape:
+        returned = str(tuple(scores.shape)) if isinstance(scores, Tensor) else type(scores).__name__
+        raise TacpipeError(
+            f"The network of the architecture {params.architecture} returns {returned} for {shape[0]} slides; it must "
+            f"return scores (slide, class), here {shape}."
+        )

@@ -14,13 +14,12 @@ import pyarrow as pa
 from tacpipe.arrays import Bools, Float32s, Int64s
 from tacpipe.datasets import model_files, selection
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
-from tacpipe.tasks.material import naming
 from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
 from tacpipe.tasks.material.network_training import HISTORY
@@ -128,9 +127,12 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     key = classifier.naming.key
     answers = Answers(
         classifier,
-        {name: naming.text(recording.attributes.get(key, "")) for name, recording in recordings.recordings.items()},
+        {
+            name: headlines.label_text(recording.attributes.get(key, ""))
+            for name, recording in recordings.recordings.items()
+        },
     )
-    with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
+    with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
         for sensor, slides in _read(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
             if is_learned.any() or not classifier.calibrations:
@@ -321,7 +323,9 @@ def predictions_table(
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), [name for result in evaluated.values() for name in result.slides.names]),
         (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
-        naming.field("material", names_for(_joined(result.slides.materials for result in evaluated.values())), "label"),
+        headlines.label_field(
+            "material", names_for(_joined(result.slides.materials for result in evaluated.values())), "label"
+        ),
         (pa.field("seen", pa.bool_()), _joined(result.in_training for result in evaluated.values())),
     ]
     session_values = [(sessions or {}).get(name) for result in evaluated.values() for name in result.slides.names]
@@ -330,9 +334,9 @@ def predictions_table(
     )
     for name in sorted({name for result in evaluated.values() for name in result.predicted}):
         values = [
-            result.predicted.get(name, np.full(len(result.slides), naming.UNKNOWN)) for result in evaluated.values()
+            result.predicted.get(name, np.full(len(result.slides), headlines.UNKNOWN)) for result in evaluated.values()
         ]
-        columns.append(naming.field(name, names_for(_joined(values)), "prediction"))
+        columns.append(headlines.label_field(name, names_for(_joined(values)), "prediction"))
     columns += score_columns(classifier, _joined(result.output.scores for result in evaluated.values()))
     latents = [result.output.latents for result in evaluated.values() if result.output.latents is not None]
     if latents:

@@ -18,7 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.recurrent_autoencoder import NetworkOutput, RecurrentAutoencoder, RecurrentClassifier
+from tacpipe.models.recurrent_autoencoder import (
+    NetworkOutput,
+    RecurrentAutoencoder,
+    RecurrentClassifier,
+)
 from tacpipe.training.loop import Line, precise
 
 NONE = -1  # stands where a sensor has no slide in a row of a batch, and for the class of a slide without label

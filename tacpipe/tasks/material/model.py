@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from tacpipe.arrays import Float32s
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.material import naming
+from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS, latent_columns, score_columns
-from tacpipe.tasks.opened import opened
+from tacpipe.tasks.recordings import open_for_model
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -54,7 +54,7 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), names),
         (pa.field("sensor", pa.string()), sensors),
-        naming.field("material", classifier.naming.names_for(classifier.best_classes(scores)), "prediction"),
+        headline.label_field("material", classifier.naming.names_for(classifier.best_classes(scores)), "prediction"),
         *score_columns(classifier, scores),
     ]
     if probabilities:
@@ -112,7 +112,7 @@ class MaterialModel(Classifier):
         that are not finite.
         """
         if isinstance(slides, Dataset | Recording):
-            return predictions(self, opened(slides, self.chain), probabilities=probabilities)
+            return predictions(self, open_for_model(slides, self.chain), probabilities=probabilities)
         return self.naming.names_for(self.best_classes(self.scores(slides, sensor)))
 
     def frames(self, recording: Recording) -> tuple[Float32s, str]:
@@ -120,5 +120,5 @@ class MaterialModel(Classifier):
 
         The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.
         """
-        ((sensor, slides),) = self.read(opened(recording, self.chain)).items()
+        ((sensor, slides),) = self.read(open_for_model(recording, self.chain)).items()
         return slides.frames[0], sensor

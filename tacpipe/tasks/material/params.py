@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Float32s
     from tacpipe.models.recurrent_autoencoder import AutoencoderShape
     from tacpipe.tasks.material.losses import Weights
-    from tacpipe.tasks.material.training import TrainingSlides
+    from tacpipe.tasks.material.network_training import TrainingSlides
 
 KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]

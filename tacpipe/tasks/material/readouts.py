@@ -28,7 +28,7 @@ from tacpipe.tasks.material.classifier import (
 )
 from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.estimators import packed as packed_estimators
-from tacpipe.tasks.material.naming import Naming
+from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra, Statistics
 from tacpipe.tasks.material.slides import BySensor, Slides
 

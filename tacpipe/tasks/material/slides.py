@@ -14,7 +14,7 @@ from tacpipe.channels.streams import absent
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed
-from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
+from tacpipe.tasks.material.headline import NUMBERS, UNKNOWN, Naming
 
 if TYPE_CHECKING:
     import pyarrow as pa

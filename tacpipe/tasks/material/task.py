@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.requirements import Channels, Label, Requirements
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Channels, Label, Requirements, stage
 from tacpipe.tasks.material.params import KEY, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
-    from tacpipe.tasks.opened import OpenedChain
+    from tacpipe.tasks.recordings import OpenedChain
 
 MATERIALS, SLIDES = 6, 240  # slides of each sensor on each material
 
@@ -100,9 +99,9 @@ class MaterialTask(Task):
         Example: tacpipe train material data/slides --split data/slides-split -o models/material
         """
         from tacpipe.plugins.stage import Result
-        from tacpipe.tasks.material import training
+        from tacpipe.tasks.material import network_training
 
-        return Result(files=training.train(params, train, val, workspace, init.files if init else None))
+        return Result(files=network_training.train(params, train, val, workspace, init.files if init else None))
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
         """Return how often materials are named right; raises as `tacpipe.tasks.material.evaluation`."""

@@ -15,7 +15,7 @@ from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import selection
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
@@ -97,7 +97,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
     """
     predictor = Predictor.load(model)
-    with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each grasp is read, then predicted
+    with terminal.progress_bar(
+        "evaluate", 2 * len(recordings.recordings)
+    ) as advance:  # each grasp is read, then predicted
         return _evaluated(model, predictor, grasps_of.read(recordings, advance=advance), recordings, advance)
 
 

@@ -1,26 +1,32 @@
-"""The loaded model of the task ``touch``, which predicts for recordings, or for a cloud and a grasp."""
+"""Predict with a loaded model of touch, for recordings or for a cloud and a grasp, and calibrate its quantiles."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, overload
 
+import numpy as np
 import pyarrow as pa
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.metrics.quantiles import check_levels
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.opened import opened
+from tacpipe.tasks import recordings
+from tacpipe.tasks.recordings import open_for_model
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.evaluation import readings_table, simulated
 from tacpipe.tasks.touch.headline import PREDICTIONS
-from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
+from tacpipe.tasks.touch.predictor import CONFIG, PredictedReading, Predictor
+from tacpipe.tasks.touch.quantiles import FILE, ReadingQuantiles
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.tasks.task import CalibrationRequest
 
 
 def predict(
@@ -83,7 +89,7 @@ class TouchModel(Predictor):
                     "A cloud needs a grasp: the place where the fingers close. Give predict(cloud, grasp)."
                 )
             return self.predict_all(recordings, [grasp])[0]
-        return predictions(self, opened(recordings, self.chain), sorted(set(quantiles)))
+        return predictions(self, open_for_model(recordings, self.chain), sorted(set(quantiles)))
 
 
 def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, float]:
@@ -94,3 +100,42 @@ def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, flo
         values[f"pdc_{finger}_counts"] = round(float(pressure), 1)
         values |= {f"e_{finger}_{n:02d}_counts": round(float(value), 1) for n, value in enumerate(electrodes, 1)}
     return values
+
+
+def calibrate(
+    model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, validation: Dataset
+) -> dict[str, bytes]:
+    """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
+
+    Raises `TacpipeError` where the model learned from these validation grasps, and where there are none.
+    """
+    check_levels(request.quantiles)
+    predictor = Predictor.load(model)
+    training_grasps, validation_grasps = grasps_of.read(training), grasps_of.read(validation)
+    if not len(validation_grasps):
+        raise TacpipeError(
+            "No grasp has the role val to calibrate on. Make a split with some: `tacpipe split --val 0.2`."
+        )
+    seen_digests = set(predictor.config["trained_on"].values())
+    if predictor.config["counts"]["val"] == 0 and any(digest in seen_digests for digest in validation_grasps.digests):
+        raise UsageError(
+            "The model learned from these validation grasps too, so that they state nothing of its errors. Train it with "
+            "--no-use-validation."
+        )
+    levels = np.array(request.quantiles) / 100
+    predicted = predictor.predict_grasps(validation_grasps)
+    reading_quantiles = ReadingQuantiles.fit(
+        levels, training_grasps, validation_grasps, predicted, promised=request.promise
+    )
+    calibrated_on = recordings.merge_trained_on(zip(validation_grasps.names, validation_grasps.digests, strict=True))
+    description = {
+        "levels": list(request.quantiles),
+        "method": "promised" if request.promise else "pooled",
+        "grasps": len(validation_grasps),
+    }
+    config = {
+        **predictor.config,
+        "quantiles": description,
+        "trained_on": recordings.add_calibration(predictor.config["trained_on"], calibrated_on),
+    }
+    return {**model, CONFIG: model_files.to_json(config), FILE: reading_quantiles.to_bytes()}

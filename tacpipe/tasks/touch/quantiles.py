@@ -23,7 +23,7 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import Sums
 from tacpipe.models.tensors import under
-from tacpipe.tasks import calibrated
+from tacpipe.tasks import task
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 
@@ -45,7 +45,7 @@ class ReadingQuantiles:
     @property
     def percents(self) -> tuple[int, ...]:
         """The levels of the quantiles in percent, ascending."""
-        return calibrated.percents(self.levels)
+        return task.percents(self.levels)
 
     def quantiles(self, predicted: Readings, predictor: str = MODEL) -> dict[str, Floats]:
         """Return quantiles by target (grasp, value, level), device counts, of what a predictor predicts."""

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.requirements import Channels, Label, Requirements
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Channels, Label, Requirements, stage
 from tacpipe.tasks.task import Calibration, Demo, Files, GraspPredictor, PredictionRequest, Task
 from tacpipe.tasks.touch.params import Params
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
-    from tacpipe.tasks.opened import OpenedChain
+    from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
 OBJECTS, GRASPS = 1, 90  # objects of each of six families, grasps of each object
@@ -132,7 +131,7 @@ class TouchTask(Task):
     @property
     def calibration(self) -> Calibration:
         """Quantiles of each value of a reading."""
-        from tacpipe.tasks.touch.calibration import calibrate
+        from tacpipe.tasks.touch.model import calibrate
 
         return Calibration("quantiles", calibrate)
 

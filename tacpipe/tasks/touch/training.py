@@ -23,15 +23,24 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
-from tacpipe.tasks import trained_on
-from tacpipe.tasks.touch import baselines, members
+from tacpipe.tasks import recordings
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch.baselines import Baselines
+from tacpipe.tasks.touch import members, predictor
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import require_colours
 from tacpipe.tasks.touch.members import Drawn, NetworkParams, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.params import Params, Trees
-from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, SHRINKAGE, TASK, WEIGHTS
+from tacpipe.tasks.touch.predictor import (
+    BASELINES,
+    CONFIG,
+    FOREST,
+    HISTORY,
+    NETWORK,
+    SHRINKAGE,
+    TASK,
+    WEIGHTS,
+    Baselines,
+)
 from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
 
@@ -118,7 +127,7 @@ def _config(params: Params, targets: Sequence[str], training: Grasps, validation
         "targets": list(targets),
         "objects": sorted(set(training.objects) - {""}),
         "counts": {"train": len(training), "val": len(validation) if validation else 0},
-        "trained_on": trained_on.merge(
+        "trained_on": recordings.merge_trained_on(
             *(zip(grasps.names, grasps.digests, strict=True) for grasps in (training, validation) if grasps)
         ),
         "members": [],
@@ -154,7 +163,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
             grown, _ = _forests(params, rows[in_training], training_readings, groups)
             return members.averaged((group, forest.predict(rows[~in_training])) for group, forest in grown)
 
-        shrunk = baselines.fit_shrinkage(readings, training.objects, predict)
+        shrunk = predictor.fit_shrinkage(readings, training.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
         model.tensors.update(
             {f"{SHRINKAGE}{name}": torch.from_numpy(array) for name, array in shrunk.tensors().items()}

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.forward.rows import ACTIONS, Rows, acted, rows
+from tacpipe.tasks.forward.networks import ACTIONS, Rows, acted, rows_of_tracks
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import CONTEXT, HORIZON, LENGTH, track
 
@@ -16,7 +16,7 @@ STARTS = [recorded.starts(CONTEXT, HORIZON) for recorded in TRACKS]
 
 
 def joined(actions: str = "planned") -> Rows:
-    return rows(TRACKS, STARTS, CONTEXT, HORIZON, actions=actions)
+    return rows_of_tracks(TRACKS, STARTS, CONTEXT, HORIZON, actions=actions)
 
 
 def test_windows_are_rows_of_one_recording_each() -> None:
@@ -41,8 +41,8 @@ def test_some_are_spread_evenly_and_no_more_than_asked_for() -> None:
 
 
 def test_no_recordings_and_no_windows_make_no_rows() -> None:
-    assert rows([], [], CONTEXT, HORIZON).part.count == 0
-    assert rows(TRACKS[1:2], STARTS[1:2], CONTEXT, HORIZON).part.count == 0
+    assert rows_of_tracks([], [], CONTEXT, HORIZON).part.count == 0
+    assert rows_of_tracks(TRACKS[1:2], STARTS[1:2], CONTEXT, HORIZON).part.count == 0
 
 
 def test_a_model_is_told_the_plan_that_its_actions_say() -> None:

@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io import mapped
+from tacpipe.io import spill
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import training
@@ -70,8 +70,8 @@ def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
     in_memory = model("in-memory")
     monkeypatch.setattr(training, "IN_MEMORY", 0)
     monkeypatch.setattr(training, "BLOCK_ROWS", 7)
-    monkeypatch.setattr(mapped, "SEGMENT_BYTES", 1 << 14)
-    monkeypatch.setattr(mapped, "MOST_READ", 0)
+    monkeypatch.setattr(spill, "SEGMENT_BYTES", 1 << 14)
+    monkeypatch.setattr(spill, "MOST_READ", 0)
     assert model("on-disk") == in_memory
 
 

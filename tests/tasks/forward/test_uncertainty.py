@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import prediction as forward_prediction
 from tacpipe.tasks.forward.prediction import ForwardModel
+from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import dataset
 from tests.stages.learning_fakes import CHANNELS, motion
 from tests.tasks.forward.trials import ENSEMBLE, HORIZON, asked, compressed, evaluated, predicted_windows, trained

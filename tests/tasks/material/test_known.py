@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
+from tacpipe.tasks.task import CalibrationRequest
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 FOREIGN = 9  # a material that no model here learns

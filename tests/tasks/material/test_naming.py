@@ -10,8 +10,8 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.material import model as material_prediction
+from tacpipe.tasks.material.headline import UNKNOWN, Naming
 from tacpipe.tasks.material.model import MaterialModel
-from tacpipe.tasks.material.naming import UNKNOWN, Naming
 from tacpipe.tasks.material.report import figures, predictions
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts

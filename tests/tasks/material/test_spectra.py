@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.material import training as material_training
+from tacpipe.tasks.material import network_training
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, WEIGHTS
 from tacpipe.tasks.material.model import MaterialModel
 from tests.tasks.material.textures import Slide, dataset, evaluated, params
@@ -52,7 +52,7 @@ def slides(first: int, count: int, **attributes: Any) -> Any:
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
     spectra_params = params(**{**SPECTRA, **changed})
-    return material_training.train(spectra_params, training or slides(0, 5), validation or dataset(), folder)
+    return network_training.train(spectra_params, training or slides(0, 5), validation or dataset(), folder)
 
 
 def predictions(result: Any) -> dict[str, list[Any]]:

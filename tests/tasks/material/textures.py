@@ -13,7 +13,7 @@ import pyarrow as pa
 from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.material import evaluation as material_evaluation
-from tacpipe.tasks.material import training as material_training
+from tacpipe.tasks.material import network_training
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.stage_params import fitting
 
@@ -73,7 +73,7 @@ def trained(
     folder: Path, training: Any = None, validation: Any = None, init: Any = None, **changed: Any
 ) -> dict[str, bytes]:
     """The files of a small model."""
-    return material_training.train(
+    return network_training.train(
         params(**changed), training or slides(0, 6), slides(6, 2) if validation is None else validation, folder, init
     )
 

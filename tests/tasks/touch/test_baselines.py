@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from safetensors.numpy import load, save
 
-from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.predictor import Baselines
 from tests.tasks.touch.handmade import grasps
 
 FELT = {"pdc_th": np.array([[10.0], [20.0], [40.0], [90.0]]), "e_th": np.arange(96.0).reshape(4, 24)}

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.calibrated import CalibrationRequest
-from tacpipe.tasks.touch import calibration as touch_calibration
+from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import model as touch_prediction
 from tacpipe.tasks.touch.model import TouchModel
 from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
@@ -35,7 +35,7 @@ def watched() -> Any:
 
 @pytest.fixture(scope="module")
 def model(plain: dict[str, bytes], watched: Any) -> dict[str, bytes]:
-    return touch_calibration.calibrate(plain, ASKED, recordings(), watched)
+    return touch_model.calibrate(plain, ASKED, recordings(), watched)
 
 
 def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
@@ -98,10 +98,10 @@ def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(p
 def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched: Any) -> None:
     files = trained(tmp_path, recordings(), watched, **FAST)
     with pytest.raises(TacpipeError, match="--no-use-validation"):
-        touch_calibration.calibrate(files, ASKED, recordings(), watched)
+        touch_model.calibrate(files, ASKED, recordings(), watched)
 
 
 def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
     request = CalibrationRequest(PERCENTS, True, 0.05, 0)
     with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
-        touch_calibration.calibrate(plain, request, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
+        touch_model.calibrate(plain, request, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))

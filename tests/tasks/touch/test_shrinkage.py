@@ -12,7 +12,7 @@ import pytest
 from tacpipe.arrays import Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.errors import UsageError
-from tacpipe.tasks.touch import baselines
+from tacpipe.tasks.touch import predictor
 from tacpipe.tasks.touch.predictor import Predictor
 from tests.tasks.touch.handmade import dataset, grasps, recording, recordings, trained
 
@@ -33,7 +33,7 @@ def beyond(truth: Floats, fraction: float) -> Callable[[Bools], Mapping[str, Flo
 )
 def test_what_is_kept_is_what_makes_the_predictions_for_left_out_objects_right(fraction: float, kept: float) -> None:
     truth = np.random.default_rng(0).normal(size=(30, 1))
-    fitted = baselines.fit_shrinkage({"pdc_th": truth}, OBJECTS, beyond(truth, fraction))
+    fitted = predictor.fit_shrinkage({"pdc_th": truth}, OBJECTS, beyond(truth, fraction))
     assert fitted.factor["pdc_th"] == pytest.approx(kept)
     np.testing.assert_allclose(fitted.constant["pdc_th"], truth.mean(axis=0))
 
@@ -45,13 +45,13 @@ def test_no_model_of_an_object_sees_its_grasps() -> None:
         trained_objects.append(set(np.asarray(OBJECTS)[in_training]))
         return {"pdc_th": np.zeros((int((~in_training).sum()), 1))}
 
-    baselines.fit_shrinkage({"pdc_th": np.ones((30, 1))}, OBJECTS, predict)
+    predictor.fit_shrinkage({"pdc_th": np.ones((30, 1))}, OBJECTS, predict)
     assert trained_objects == [{"jar", "tin"}, {"cup", "tin"}, {"cup", "jar"}]
 
 
 def test_too_few_objects_are_refused() -> None:
     with pytest.raises(UsageError):
-        baselines.fit_shrinkage({"pdc_th": np.ones((20, 1))}, OBJECTS[:20], beyond(np.ones((20, 1)), 1))
+        predictor.fit_shrinkage({"pdc_th": np.ones((20, 1))}, OBJECTS[:20], beyond(np.ones((20, 1)), 1))
 
 
 def test_grasps_of_novel_objects_alone_are_shrunk(tmp_path: Path) -> None:

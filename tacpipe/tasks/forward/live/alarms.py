@@ -139,12 +139,12 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.forward.headline import MODEL
     from tacpipe.tasks.forward.slips import SlipAlarms
-    from tacpipe.tasks.opened import OpenedChain as Stages
-    from tacpipe.tasks.opened import opened
+    from tacpipe.tasks.recordings import OpenedChain as Stages
+    from tacpipe.tasks.recordings import open_for_model
 
     forecaster = Forecaster.load(model.files)
     changes, slipping = Loads(forecaster.codec.layout, forecaster.horizon), SlipAlarms.of(forecaster)
-    for shard in opened(recordings, Stages(model)).recordings.values():
+    for shard in open_for_model(recordings, Stages(model)).recordings.values():
         track = forecaster.track(shard)
         changes.begin(track)
         slipping.begin(track)

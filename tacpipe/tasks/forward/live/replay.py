@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io import progress
+from tacpipe.io import terminal
 from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
@@ -43,7 +43,7 @@ def predict(
         forecaster.quantiles_of(quantiles)
     outputs: dict[str, RecordingOutput] = {}
     without, unplanned, row_count = [], 0, 0
-    with progress.bar("predict", len(recordings.recordings)) as advance:
+    with terminal.progress_bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
                 outputs[name], causes = _predicted(

@@ -82,7 +82,7 @@ class ForwardLive(LiveTask):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans where plans come."""
         from tacpipe.datasets import model_files
-        from tacpipe.tasks import calibrated
+        from tacpipe.tasks import task
         from tacpipe.tasks.forward.live import plans
         from tacpipe.tasks.forward.live.alarms import NAMES
         from tacpipe.tasks.forward.live.stages import refuse_look_ahead
@@ -97,7 +97,7 @@ class ForwardLive(LiveTask):
         levels = tuple(sorted(set(own_settings.quantiles)))
         if levels:
             with settings.naming("quantiles"):
-                _refuse_absent_quantiles(config, levels, calibrated.quantiles_of)
+                _refuse_absent_quantiles(config, levels, task.quantiles_of)
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
         unit = str(config["inputs"].get("unit", "count"))

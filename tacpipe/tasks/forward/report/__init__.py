@@ -19,7 +19,7 @@ from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
-from tacpipe.tasks.forward.report import bands, events, figures, methods, representations, skill
+from tacpipe.tasks.forward.report import events, figures, methods, representations, skill
 from tacpipe.tasks.forward.report.methods import ACTIONS, shown_steps
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def folds(context: Context) -> list[Fold]:
         *_ahead(context),
         *_channels(context),
         *_ablations(context),
-        *bands.band_folds(context),
+        *skill.band_folds(context),
         *events.anticipation_folds(context),
         *events.slip_folds(context),
         *skill.situation_folds(context),

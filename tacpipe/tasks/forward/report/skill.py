@@ -1,25 +1,31 @@
-"""Compute the skill of forecasts over persistence, by step and by situation."""
+"""Compute the skill of forecasts over persistence, by step and by situation, and the coverage of their quantiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import ComparisonRow
 from tacpipe.comparison.runs import MODEL, Method
+from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.intervals import Interval
-from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint, fold, interval, number, table
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, fold, interval, number, table
+from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context
-from tacpipe.tasks.forward.headline import BASELINE, Parts
+from tacpipe.tasks.forward import headline
+from tacpipe.tasks.forward.headline import BASELINE, PARTS, Parts
 from tacpipe.tasks.forward.report import methods
 from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
 
 if TYPE_CHECKING:
+    from tacpipe.arrays import AnyFloats
+    from tacpipe.comparison.runs import ComparedRun
     from tacpipe.metrics.pairing import Sums
 
 
@@ -134,3 +140,119 @@ def skill_in_situation(method: Method, situation: str) -> dict[str, float] | Non
         "low": float(ends.get("low", np.nan)),
         "high": float(ends.get("high", np.nan)),
     }
+
+
+COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
+NAMES = {
+    "model": "quantiles of the model",
+    "model_unconditional": "model, one band for all moments",
+    "persistence": "persistence, quantiles of its errors",
+}
+SHOWN = (1, 5, 10)  # steps of the table
+EXPLAINED = (
+    "A band holds as often as it states if its coverage lies on the dashed line; shaded: 95 % over recordings. The "
+    "narrowest band of the right coverage is best, which the pinball loss measures (lower is better)."
+)
+
+
+def band_folds(context: Context) -> list[Fold]:
+    """Return how good quantiles are, of the results of calibrated models; nothing without any."""
+    runs = [run for run in context.runs if COVERAGE in run.details.dataset.files]
+    if not runs:
+        return []
+    levels = sorted({tuple(run.details.metrics["quantiles"]["levels"]) for run in runs})[0]
+    level = (levels[-1] - levels[0]) / 100
+    methods = sorted({run.method for run in runs})
+    drawn: list[Chart] = []
+    rows: list[Sequence[Any]] = []
+    for method in methods:
+        sums = _band_sums([run for run in runs if run.method == method])
+        for known_objects in (True, False):
+            part_sums = {name: by_part[known_objects] for name, by_part in sums.items() if by_part.get(known_objects)}
+            if part_sums:
+                title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known_objects])))
+                drawn.append(_coverage_chart(title, part_sums, level))
+                rows += _coverage_rows(title, part_sums)
+    heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")
+    title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
+    return fold(
+        "Uncertainty",
+        Charts(drawn),
+        blocks.notes(EXPLAINED),
+        table(title, heads, rows),
+        *([Charts(_example_charts(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []),
+    )
+
+
+BandSums = Mapping[str, dict[str, "AnyFloats"]]  # recording -> covered, width, pinball and values, each (step,)
+
+
+def _band_sums(runs: Sequence[ComparedRun]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
+    """Return the sums of recordings that were not seen, by predictor, whether the object is known, and recording."""
+    sums: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
+    for run in runs:
+        read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
+        read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
+        for (name, is_known, recording), group in read[~read.seen].groupby(["predictor", "known", "unit"]):
+            by_step = group.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
+            added = {key: by_step[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
+            predictor_sums = sums.setdefault(str(name), {}).setdefault(bool(is_known), {})
+            before = predictor_sums.get(str(recording))
+            predictor_sums[str(recording)] = (
+                added if before is None else {key: before[key] + added[key] for key in added}
+            )
+    return sums
+
+
+def _sums_for(sums: Mapping[str, Mapping[str, AnyFloats]], key: str) -> AnyFloats:
+    """Return one kind of sums (recording, step)."""
+    return np.stack([recording_sums[key] for recording_sums in sums.values()])
+
+
+def _coverage_chart(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]], level: float) -> Chart:
+    """Return coverage by step of each predictor, with its interval over recordings."""
+    lines = []
+    for name in (predictor for predictor in NAMES if predictor in sums):
+        interval = intervals.share_interval(_sums_for(sums[name], "covered"), _sums_for(sums[name], "values"))
+        low, high = (np.where(np.isnan(ends), interval.mean, ends) for ends in (interval.low, interval.high))
+        steps = np.arange(1.0, len(low) + 1)
+        lines.append(Curve(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
+    spec = charts.lines(lines, "rows ahead", "coverage", level=("asked for", level))
+    return Chart(f"Coverage: {title}", spec)
+
+
+def _coverage_rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]]) -> list[Sequence[Any]]:
+    """Return the rows of the table: a predictor and step each."""
+    persistence = _sums_for(sums["persistence"], "pinball").sum(axis=0)
+    rows: list[Sequence[Any]] = []
+    for name in (totals for totals in NAMES if totals in sums):
+        totals = {key: _sums_for(sums[name], key).sum(axis=0) for key in ("covered", "width", "pinball", "values")}
+        for step in (shown_step for shown_step in SHOWN if shown_step <= len(persistence)):
+            at, values = step - 1, totals["values"][step - 1]
+            gain = 100 * (1 - totals["pinball"][at] / persistence[at]) if persistence[at] else float("nan")
+            measured = (
+                totals["covered"][at] / values,
+                totals["width"][at] / values,
+                totals["pinball"][at] / values,
+                gain,
+            )
+            rows.append([f"{title}: {NAMES[name]}", f"t+{step}", str(len(sums[name])), *map(number, measured)])
+    return rows
+
+
+def _example_charts(run: ComparedRun) -> list[Chart]:
+    """Return a forecast with its band of each recording that the evaluation kept, next to what was measured."""
+    drawn = []
+    for example in json.loads(run.details.dataset.files[EXAMPLES]):
+        levels = sorted((int(name[1:]), name) for name in example if name.startswith("q"))
+        low, middle, high = (example[levels[at][1]] for at in (0, len(levels) // 2, -1))
+        time_s = np.array(example["t_s"]) - example["t_s"][0]
+        lines = [
+            Curve("measured", time_s, example["measured"]),
+            Curve(f"predicted {example['step']} rows before", time_s, middle, low, high, dashed=True),
+        ]
+        spec = charts.lines(
+            lines, "time (s)", f"{headline.unit_of_model(run.details.config)} above rest", points=False, height=190
+        )
+        drawn.append(Chart(f"{example['recording']}: {example['channel']}", spec, wide=True))
+    return drawn

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.tasks.material.naming import NUMBERS, Naming
+from tacpipe.tasks.material.headline import NUMBERS, Naming
 
 if TYPE_CHECKING:
     import pyarrow as pa

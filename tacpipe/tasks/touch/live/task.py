@@ -37,9 +37,8 @@ class TouchLive(LiveTask):
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> TouchEngine:
         """Return the engine, which ranks the candidates of each request. Raises `UsageError` for an unknown criterion."""
-        from tacpipe.tasks.touch.live import requests
-        from tacpipe.tasks.touch.live.engine import TouchEngine
+        from tacpipe.tasks.touch.live.engine import TouchEngine, criterion
         from tacpipe.tasks.touch.predictor import Predictor
 
         assert isinstance(settings.task, TouchSettings)
-        return TouchEngine(sensors, Predictor.load(model.files), requests.criterion(settings.task.rank))
+        return TouchEngine(sensors, Predictor.load(model.files), criterion(settings.task.rank))

@@ -1,4 +1,4 @@
-"""Read untrusted YAML: plain values only, and no more of them than a person writes.
+"""Read untrusted YAML, plain values only and of limited size, and write values as TOML.
 
 A few lines of YAML can represent any amount of data, by aliases of aliases and merged mappings, and brackets within
 brackets end the parser's stack. So the text's events are counted first, each alias as what it represents.
@@ -6,6 +6,8 @@ brackets end the parser's stack. So the text's events are counted first, each al
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any
 
 from tacpipe.printable import plain
@@ -15,7 +17,7 @@ MAX_VALUES = 100_000  # values, with those that aliases represent
 MAX_CHARACTERS = 10_000_000  # characters
 
 
-def load(content: str | bytes) -> Any:
+def load_yaml(content: str | bytes) -> Any:
     """Return the value of a YAML document.
 
     Raises `ValueError`, with a line that states why, for text that is not YAML or is too large.
@@ -80,3 +82,23 @@ def _refuse_large(events: Any) -> None:
             sizes[anchor] = size
         if total > MAX_VALUES:
             raise ValueError(f"it represents more than {MAX_VALUES} values, by aliases or as written")
+
+
+def toml_value(item: Any) -> str:
+    """Return a value on one line.
+
+    >>> toml_value({"name": "taxel", "count": 3, "rate_hz": 1e3})
+    '{ name = "taxel", count = 3, rate_hz = 1000.0 }'
+    """
+    if isinstance(item, Mapping):
+        return "{ " + ", ".join(f"{toml_key(name)} = {toml_value(inner)}" for name, inner in item.items()) + " }"
+    if isinstance(item, list | tuple):
+        return "[" + ", ".join(map(toml_value, item)) + "]"
+    if isinstance(item, float):
+        return repr(item)  # TOML wants a digit on both sides of the point, which repr gives, and knows inf and nan
+    return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")  # texts, whole numbers, true and false
+
+
+def toml_key(name: str) -> str:
+    """Return a key, in quotes where it needs them."""
+    return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else json.dumps(name)

@@ -1,14 +1,21 @@
-"""Recordings that a model is to predict: opened datasets, behind the stages that the model was trained behind."""
+"""Open the recordings that a model is to predict, and list those that it was trained on.
+
+Opened datasets go through the stages that the model was trained behind. ``trained_on`` of a configuration holds digests by
+name: evaluation reports these recordings separately, and calibration refuses them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.selection import chain_difference
 from tacpipe.errors import UsageError
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
 
 
 @dataclass(frozen=True)
@@ -23,7 +30,7 @@ class OpenedChain:
         return self.model.source.chain
 
 
-def opened(recordings: Dataset | Recording, chain: OpenedChain | None) -> Dataset:
+def open_for_model(recordings: Dataset | Recording, chain: OpenedChain | None) -> Dataset:
     """Return a dataset, or the one of a recording alone, after the stages of ``chain``; None: as it is.
 
     Those stages that it has not been through yet are run, as ``tacpipe predict`` does. Raises `UsageError` for anything
@@ -70,3 +77,40 @@ def _command(step: Mapping[str, Any]) -> str:
             option = name.replace("_", "-")
             words.append(f"--{'' if value else 'no-'}{option}" if isinstance(value, bool) else f"--{option} {value}")
     return " ".join(words)
+
+
+def merge_trained_on(*parts: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return the digests of recordings by name; each part holds pairs of name and digest."""
+    return {name: digest for part in parts for name, digest in part}
+
+
+def trained_on_datasets(*parts: Dataset) -> dict[str, str]:
+    """Return the digests of the recordings of several datasets by name."""
+    return merge_trained_on(*(((shard.name, shard.digest) for shard in part.recordings.values()) for part in parts))
+
+
+def add_earlier(digests: Mapping[str, str], earlier: Mapping[str, str]) -> dict[str, str]:
+    """Return the digests of a training by name, and those of the model that it began from under marked names.
+
+    >>> add_earlier({"a": "1"}, {"a": "1", "b": "2"})
+    {'b of the model before': '2', 'a': '1'}
+    """
+    current = set(digests.values())
+    marked = {f"{name} of the model before": digest for name, digest in earlier.items() if digest not in current}
+    return {**marked, **digests}
+
+
+def add_calibration(digests: Mapping[str, str], calibration: Mapping[str, str]) -> dict[str, str]:
+    """Return the digests of a training by name, and those that the model was calibrated on.
+
+    A calibration recording whose name belongs to another recording of the training gets a marked name.
+
+    >>> add_calibration({"a": "1"}, {"a": "2", "b": "3", "c": "1"})
+    {'a': '1', 'a of calibration': '2', 'b': '3'}
+    """
+    current = set(digests.values())
+    further = {name: digest for name, digest in calibration.items() if digest not in current}
+    return {
+        **digests,
+        **{f"{name} of calibration" if name in digests else name: digest for name, digest in further.items()},
+    }

@@ -1,0 +1,194 @@
+"""Record runs with MLflow, TensorBoard and Weights & Biases.
+
+MLflow: the server of ``--track mlflow:URI`` or of ``MLFLOW_TRACKING_URI``, else ``mlflow.db`` in the working directory. The
+experiment is that of ``MLFLOW_EXPERIMENT_NAME``, else ``tacpipe``.
+
+TensorBoard: event files in ``runs/NAME``, or below the folder of ``--track tensorboard:FOLDER``.
+
+Weights & Biases: offline in ``wandb/``, or below the folder of ``--track wandb:FOLDER``; ``wandb sync`` sends a run.
+``WANDB_MODE=online`` sends it while it runs; ``WANDB_PROJECT`` is ``tacpipe`` unless it is set.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import TacpipeError
+
+if TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
+
+    from tacpipe.trackers.tracking import Scalar
+
+
+MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow refuses its store of files
+MLFLOW_EXPERIMENT = "tacpipe"
+MLFLOW_TAG = "tacpipe.run"
+LONGEST_PARAM = 500  # letters of a param that every release stores
+_DEFAULTS = {  # defaults where a user has not set these
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # attempts, 7 by default: each waits longer, and training with it
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+}
+
+
+class MLflow:
+    """A run of MLflow; one of the same name is resumed, without the steps that it has."""
+
+    def __init__(self, place: str) -> None:
+        for name, value in _DEFAULTS.items():
+            os.environ.setdefault(name, value)
+        from mlflow import MlflowClient
+
+        self._uri = place or os.environ.get("MLFLOW_TRACKING_URI") or MLFLOW_DATABASE
+        if self._uri.startswith("sqlite:") and importlib.util.find_spec("sqlalchemy") is None:
+            raise TacpipeError(
+                f"MLflow needs the package mlflow to write {self._uri}, and mlflow-skinny is installed. Install mlflow, or "
+                f"give a server, as --track mlflow:http://127.0.0.1:5000."
+            )
+        self._client = MlflowClient(self._uri)
+        self._run = ""
+        self._steps: dict[str, int] = {}  # the last of each metric of a run that is resumed
+
+    def start(self, name: str, params: Mapping[str, Scalar]) -> str:
+        """Create the run, or resume that of this name."""
+        from mlflow.entities import Param
+
+        experiment_name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or MLFLOW_EXPERIMENT
+        stored_experiment = self._client.get_experiment_by_name(experiment_name)
+        experiment = (
+            stored_experiment.experiment_id if stored_experiment else self._client.create_experiment(experiment_name)
+        )
+        runs = self._client.search_runs([experiment], f"tags.`{MLFLOW_TAG}` = '{name}'", max_results=1)
+        if runs:
+            self._run = runs[0].info.run_id
+            self._client.update_run(self._run, status="RUNNING")
+            for metric in runs[0].data.metrics:
+                self._steps[metric] = max(
+                    measurement.step for measurement in self._client.get_metric_history(self._run, metric)
+                )
+        else:
+            self._run = self._client.create_run(experiment, run_name=name, tags={MLFLOW_TAG: name}).info.run_id
+            logged_params = [Param(key, str(value)[:LONGEST_PARAM]) for key, value in params.items()]
+            self._client.log_batch(self._run, params=logged_params)
+        return f"run {name} of experiment {experiment_name} at {self._uri}"
+
+    def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
+        """Add the metrics that the run does not have of this epoch."""
+        self._log({name: value for name, value in metrics.items() if self._steps.get(name, 0) < epoch}, epoch)
+
+    def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
+        """Add the figures and the path as a tag, and end the run: finished, or killed where nothing was made."""
+        if path is not None:
+            self._log({name: value for name, value in figures.items() if name not in self._steps}, 0)
+            self._client.set_tag(self._run, "tacpipe.path", str(path))
+        self._client.set_terminated(self._run, "FINISHED" if path is not None else "KILLED")
+
+    def _log(self, metrics: Mapping[str, float], step: int) -> None:
+        from mlflow.entities import Metric
+
+        now_ms = time.time_ns() // 1_000_000
+        if metrics:
+            logged = [Metric(name, value, now_ms, step) for name, value in metrics.items()]
+            self._client.log_batch(self._run, metrics=logged)
+
+
+TENSORBOARD_FOLDER = "runs"
+
+
+class TensorBoard:
+    """A run as scalars by epoch, with params as text and as the row of TensorBoard's table of hyperparameters."""
+
+    def __init__(self, place: str) -> None:
+        import tensorboardX  # noqa: F401  (a module that is missing is reported before anything is computed)
+
+        self._folder = Path(place or TENSORBOARD_FOLDER)
+        self._writer: SummaryWriter | None = None
+        self._params: Mapping[str, Scalar] = {}
+        self._epoch = 0
+
+    def start(self, name: str, params: Mapping[str, Scalar]) -> str:
+        """Begin the run's event file; what older files of this run hold is superseded."""
+        from tensorboardX import SummaryWriter
+
+        folder, self._params = self._folder / name, params
+        resumes = folder.is_dir() and any(folder.iterdir())
+        self._writer = SummaryWriter(str(folder), purge_step=0 if resumes else None)
+        rows = "\n".join(f"| {key} | {value} |" for key, value in params.items())
+        self._writer.add_text("params", f"| param | value |\n|---|---|\n{rows}", 0)
+        self._writer.flush()
+        return f"{folder} (tensorboard --logdir {self._folder})"
+
+    def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
+        """Add a scalar a metric, and flush them."""
+        assert self._writer is not None
+        self._epoch = epoch
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, epoch)
+        self._writer.flush()
+
+    def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
+        """Add the figures, the row of hyperparameters and the path."""
+        from tensorboardX.summary import hparams
+
+        assert self._writer is not None
+        if path is not None:
+            for name, value in figures.items():
+                self._writer.add_scalar(name, value, self._epoch)
+            self._writer.add_text("path", str(path), self._epoch)
+            if figures:
+                for summary in hparams(dict(self._params), dict(figures)):
+                    self._writer.file_writer.add_summary(summary)
+        self._writer.close()
+
+
+WANDB_PROJECT = "tacpipe"
+WANDB_STEP = "epoch"
+
+
+class Wandb:
+    """A run of Weights & Biases, named by its result, so that one which was interrupted is the same run."""
+
+    def __init__(self, place: str) -> None:
+        os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        import wandb  # noqa: F401  (a module that is missing is reported before anything is computed)
+
+        self._place = place
+        self._run: Any = None
+
+    def start(self, name: str, params: Mapping[str, Scalar]) -> str:
+        """Begin the run, or add to that of this name."""
+        import wandb
+
+        mode: Any = os.environ.get("WANDB_MODE") or "offline"
+        if self._place:
+            Path(self._place).mkdir(parents=True, exist_ok=True)
+        self._run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT") or WANDB_PROJECT,
+            id=re.sub(r"[^\w.-]", "-", name)[-128:],
+            name=name,
+            config=dict(params),
+            resume="allow" if mode == "online" else None,
+            mode=mode,
+            dir=self._place or None,
+            settings=wandb.Settings(silent=True, console="off"),
+        )
+        self._run.define_metric("*", step_metric=WANDB_STEP)
+        return str(self._run.url if mode == "online" else Path(self._run.dir).parent)
+
+    def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
+        """Add the metrics with their epoch."""
+        self._run.log({WANDB_STEP: epoch, **metrics})
+
+    def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
+        """Put the figures and the path into the run's summary, and end it."""
+        if path is not None:
+            self._run.summary.update({**figures, "path": str(path)})
+        self._run.finish(exit_code=0 if path is not None else 1)
