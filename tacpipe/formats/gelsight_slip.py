@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.datasets import recording_names
+from tacpipe.datasets import paths
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import published_attribute, require, text, valid
 from tacpipe.io.files import walk
@@ -54,7 +54,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
         name = valid(f"{label}-{trial.removeprefix('exp_num_')}")
         named_folders.append((name, Path(place)))
         files_by_trial[name] = {f"{label}/{trial}/{file}": Path(place, file) for file in present_names}
-    recording_names.refuse_shared(named_folders)
+    paths.refuse_shared_names(named_folders)
     if not files_by_trial:
         raise TacpipeError(
             f"{source} holds no trial: no folder in it has {', '.join(VIDEOS)}. Give the folder of the unpacked data set."
