@@ -367,6 +367,7 @@ PARSED = {  # beginnings of examples of the help that are parsed and not run, an
     "acquire": "needs the devices of a rig",
     "candidates": "names a published grasp",
     "demo": "runs for minutes, and the examples here do the same",
+    "extract": "needs the recording of a camera; tests/stages/test_extract.py has such recordings",
     "ingest": "needs files of other programs; tests/formats reads such files",
     "limits": "runs for minutes",
     "live": "needs the devices of a rig",

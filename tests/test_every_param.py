@@ -70,7 +70,7 @@ FREE = {  # params that are any text, and why
     "export.zarr.master": "the name of a stream",
 }
 
-SELECTING = [name for name in STAGES if name.startswith(("ingest.", "segment.", "synchronize"))]
+SELECTING = [name for name in STAGES if name.startswith(("extract.", "ingest.", "segment.", "synchronize"))]
 FREE |= {f"{name}.{field}": "names of streams" for name in SELECTING for field in ("streams", "without")}
 
 

@@ -95,6 +95,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest gelsight-slip gels -o {o}": "video",
+    "extract difference data/gels -o {o}": "video",
     "ingest table workbooks --guess": "xlsx",
     "ingest mcap bags -o {o}": "ros",
     "ingest rosbag bags -o {o}": "ros",
@@ -156,6 +157,7 @@ def prepare(folder: Path) -> None:
     slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
     video_files.write_gelsight(folder / "gels")
+    run_all(folder, ("ingest gelsight-slip gels -o data/gels",))
     points_m = shapes.visible_half(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
     split = "tacpipe split data/segments -o data/split-again"

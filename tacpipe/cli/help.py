@@ -44,7 +44,7 @@ TYPES = {"integer": "INTEGER", "int": "INTEGER", "float": "NUMBER", "path": "PAT
 SECTIONS = {  # Commands in the order in which ``tacpipe --help`` lists them. Stages of other packages follow.
     "Record": ("acquire", "live", "sensors"),
     "Import and export": ("ingest", "simulate", "export"),
-    "Prepare": ("synchronize", "segment", "split", "compress", "label"),
+    "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
     "Train and evaluate": ("train", "calibrate", "evaluate", "predict", "compare", "report", "track"),
     "Look": ("show", "view", "explain", "candidates", "limits"),
     "Manage": ("run", "store", "demo", "version"),

@@ -242,6 +242,12 @@ STAGES = (
     *_cases_of_chain("material", {3: "train.material"}),
     *_cases_of_chain("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
     *_cases_of_chain("touch", {3: "train.touch"}),
+    Case(
+        "extract.difference",
+        "extract difference data/gels -o data/d",
+        ("ingest gelsight-slip src -o data/gels",),
+        sources=lambda lab: _publish("gelsight-slip", lab / "src"),
+    ),
     Case("segment.slips", "segment slips data/c -o data/slips", CHAINS["two forward"][:3]),
     Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
     Case(

@@ -1,0 +1,114 @@
+"""Channels of cameras: the brightness of a gel on a coarse grid, next to what numpy gives of the decoded images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import tacpipe
+from tacpipe.channels.places import of_taxels
+from tacpipe.channels.streams import of_quantity
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins.registry import load
+from tests.conftest import Lab
+from tests.fake_recordings import FakeRecording
+from tests.formats import video_files
+from tests.stage_params import build_params
+from tests.video import videos
+from tests.video.test_video_files import columns_of
+
+
+def differences(frames: pa.Table, **params: int) -> pa.Table:
+    """Return the channels of a stream of frames."""
+    return extract({"gel": frames}, **params)["gel"]
+
+
+def extract(tables: dict[str, pa.Table], **params: int) -> dict[str, pa.Table]:
+    """Return what the stage makes of a recording of some streams."""
+    stage = load("extract.difference")
+    output = stage.function(build_params("extract.difference", **params), FakeRecording(tables))
+    return {name: table.read_all() for name, table in output.streams.items()}
+
+
+def frames_of(path: Path) -> pa.Table:
+    """Return the stream of frames of a file."""
+    columns = columns_of(path)
+    return columns.read(columns.column_names)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return videos.write(tmp_path_factory.mktemp("gel") / "gel.mkv", "libx264", 150)
+
+
+def test_cells_are_the_mean_change_of_the_images_since_the_first_ones(video: Path) -> None:
+    images = np.array(videos.decoded(video), np.float64)  # (time, height, width, colour)
+    table = differences(frames_of(video), rows=5, columns=4, reference_frames=3)
+    assert table.num_rows == len(images)
+    for row, (top, bottom) in enumerate(((0, 9), (9, 19), (19, 28), (28, 38), (38, 48)), start=1):
+        for column in range(1, 5):
+            cells = images[:, top:bottom, (column - 1) * 16 : column * 16].mean(axis=(1, 2))  # (time, colour)
+            reference = np.array([cells[: min(frame + 1, 3)].mean(axis=0) for frame in range(len(cells))])
+            for colour, name in enumerate(("red", "green", "blue")):
+                values = table.column(f"taxel{row:02d}{column:02d}_{name}").to_numpy()
+                assert np.allclose(values, (cells - reference)[:, colour], atol=1e-4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(stop=st.integers(1, 150), reference_frames=st.integers(1, 20))
+def test_rows_do_not_change_when_later_frames_are_cut_off(video: Path, stop: int, reference_frames: int) -> None:
+    frames = frames_of(video)
+    dts = frames.column("dts").to_numpy()
+    complete = differences(frames, reference_frames=reference_frames)
+    if (dts[:stop].max() > dts[stop:]).any():
+        return  # Frames before the cut need one after it to be decoded.
+    assert differences(frames.slice(0, stop), reference_frames=reference_frames).equals(complete.slice(0, stop))
+
+
+def test_other_streams_stay_and_taxels_lie_on_the_grid(lab: Lab) -> None:
+    video_files.write_gelsight(lab.folder / "gels")
+    assert lab.call("ingest gelsight-slip gels -o data/gels").code == 0
+    assert lab.call("extract difference data/gels -o data/difference --columns 4 --rows 3").code == 0
+    recording = tacpipe.open(lab.folder / "data/difference")["lemon-1"]
+    assert recording.attributes["object"] == "lemon"
+    assert list(recording.streams) == ["gel0", "gel2"]
+    table = recording.table("gel0")
+    assert len(of_quantity(table, "tactile")) == 3 * 4 * 3
+    places, unit = of_taxels(
+        [table.schema.field(f"taxel0{row}0{column}_red") for row in (1, 2, 3) for column in (1, 4)]
+    )
+    assert unit == "grid"
+    assert places.tolist() == [[1, -1], [4, -1], [1, -2], [4, -2], [1, -3], [4, -3]]
+    skin = pa.table({"t_ns": [0, 10], "x": [1.0, 2.0]})
+    frames = tacpipe.open(lab.folder / "data/gels")["lemon-1"].table("gel0")
+    assert extract({"skin": skin, "gel": frames})["skin"].equals(skin)
+
+
+def test_the_channels_are_synchronized_and_segmented_like_those_of_any_skin(lab: Lab) -> None:
+    video_files.write_gelsight(lab.folder / "gels")
+    for command in (
+        "ingest gelsight-slip gels -o data/gels",
+        "extract difference data/gels -o data/difference",
+        "synchronize data/difference -o data/synced",
+        "segment contacts data/synced -o data/segments --pad-s 0.1",
+    ):
+        result = lab.call(command)
+        assert result.code == 0, result.err
+    synced = tacpipe.open(lab.folder / "data/synced")["lemon-1"].table()
+    assert {"gel0_taxel0101_red", "gel2_taxel0608_blue"} <= set(synced.column_names)
+
+
+def test_a_recording_without_frames_and_a_grid_that_is_too_fine_are_refused(lab: Lab, video: Path) -> None:
+    skin = pa.table({"t_ns": [0], "x": [1.0]})
+    with pytest.raises(TacpipeError, match="Recording trial has no stream of frames; its streams are skin"):
+        extract({"skin": skin})
+    with pytest.raises(TacpipeError, match="64 x 48 pixels, and the grid 8 x 49 cells"):
+        differences(frames_of(video), rows=49)
+    refused = lab.call("extract difference data/gels -o data/d --rows 200 --columns 200")
+    assert refused.code == 2
+    assert "more than 10,000" in refused.err
