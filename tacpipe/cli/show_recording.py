@@ -16,6 +16,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
+from tacpipe.video.stream import read_format
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,6 +48,12 @@ class StreamFigures(TypedDict, total=False):
     gap_shares: dict[str, float]
     held_share: float
     saturated: int
+    codec: str  # of a stream of frames, as the five that follow
+    width_px: int
+    height_px: int
+    pixel_format: str
+    nominal_rate_hz: float | None
+    missing_frames: int | None
 
 
 @dataclass(frozen=True)
@@ -213,11 +220,26 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
         figures["gaps"] = len(clocks.gap_starts_ns)
     if shares := gap_shares(columns):
         figures["gap_shares"] = {stream: round(share, 4) for stream, share in shares.items()}
+    video_format = read_format(columns)
+    if video_format is not None:
+        figures["codec"], figures["pixel_format"] = video_format.codec, video_format.pixel_format
+        figures["width_px"], figures["height_px"] = video_format.width_px, video_format.height_px
+        rate_hz = video_format.nominal_rate_hz
+        figures["nominal_rate_hz"] = None if rate_hz is None else round(float(rate_hz), 3)
+        figures["missing_frames"] = _missing_frames(columns)
     tactile = [field.name for field in columns.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
     integers = [name for name in tactile if pa.types.is_integer(columns.schema.field(name).type)]
     if integers and columns.num_rows > 1:
         figures["held_share"], figures["saturated"] = _repeated_and_saturated(columns, integers)
     return figures
+
+
+def _missing_frames(columns: Columns) -> int | None:
+    """Return how many frames are missing by the counter ``seq``, None where the stream has none."""
+    if "seq" not in columns.column_names or not columns.num_rows:
+        return None
+    seq = columns.column("seq").to_numpy()
+    return int(seq[-1] - seq[0] + 1 - len(seq))
 
 
 def gaps_text(figures: StreamFigures) -> str:
@@ -264,6 +286,7 @@ def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
     sections = [
         ", ".join(head),
         _streams_text(recording),
+        _videos_text(recording.streams),
         _columns_table(recording.columns, full).text(),
         _gaps_text(recording, full),
         _intervals_text(recording.label_spans, full),
@@ -287,6 +310,21 @@ def _streams_text(recording: RecordingOverview) -> str:
     if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
         notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")
     return TerminalTable(heads, [RowGroup("", rows)], caption=" ".join(notes)).text()
+
+
+def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
+    """Return one line per stream of frames: codec, size, rate and the number of missing frames."""
+    lines = []
+    for stream, figures in streams_figures.items():
+        if "codec" not in figures:
+            continue
+        rate, missing = figures["nominal_rate_hz"], figures["missing_frames"]
+        parts = [f"{plain(figures['codec'])}, {figures['width_px']} x {figures['height_px']} pixels"]
+        parts += [f"{plain(figures['pixel_format'])}"] * bool(figures["pixel_format"])
+        parts.append("no common rate" if rate is None else f"{rate:g} frames/s")
+        parts.append("missing frames unknown" if missing is None else f"{counted(missing, 'missing frames')}")
+        lines.append(f"  {shown(stream) or '-'}: {', '.join(parts)}")
+    return "\n".join(["video", *lines]) if lines else ""
 
 
 def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable:

@@ -24,6 +24,8 @@ from tacpipe.traces.paths import Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
+from tacpipe.video.decoding import read_frames
+from tacpipe.video.stream import PACKET, read_format
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -36,6 +38,7 @@ StageChain = Sequence[Mapping[str, Any]]  # the chain of a manifest: stages with
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 MOST_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
+STRIP_FRAMES = 8
 STRETCHES = 1200  # the image of all taxels has as many bins
 
 
@@ -60,6 +63,16 @@ class Frames:
 
 
 @dataclass(frozen=True)
+class FrameStrip:
+    """Some decoded frames of a camera, in order of time."""
+
+    stream: str
+    t_ns: Times  # (frame,)
+    images: list[Bytes]  # (row, column, rgb) of each frame
+    ends_ns: Times  # (2,), times of the first and the last frame of the stream
+
+
+@dataclass(frozen=True)
 class DrawnContents:
     """The contents of a recording that are drawn."""
 
@@ -78,6 +91,7 @@ class DrawnContents:
     forecasts: list[DrawnForecast] = field(default_factory=list)
     predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
     classification: Classification | None = None  # class that it predicted for the whole recording
+    strips: list[FrameStrip] = field(default_factory=list)
 
     @cached_property
     def ends_ns(self) -> tuple[int, int]:
@@ -85,13 +99,14 @@ class DrawnContents:
         timed: list[Curves | Taxels | Path | Frames]
         timed = [*self.curves, *self.truth, *self.taxels, *self.paths, *self.frames]
         stamps = [member.t_ns for member in timed if len(member.t_ns)]
+        stamps += [strip.ends_ns for strip in self.strips if strip.images]
         stamps += [np.array([points.t_ns]) for points in self.clouds if points.t_ns is not None]
         return (min(int(t_ns[0]) for t_ns in stamps), max(int(t_ns[-1]) for t_ns in stamps)) if stamps else (0, 0)
 
     @property
     def empty(self) -> bool:
         """True without anything to draw."""
-        return not (self.curves or self.taxels or self.paths or self.clouds or self.frames)
+        return not (self.curves or self.taxels or self.paths or self.clouds or self.frames or self.strips)
 
     @property
     def labels(self) -> dict[str, Attribute]:
@@ -132,18 +147,38 @@ def for_picture(recording: Recording, *, chain: StageChain = ()) -> DrawnContent
     """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
 
     These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
-    and those at which a label or a mask changes. Memory does not grow with the length of the recording.
+    and those at which a label or a mask changes. Of a video it shows `STRIP_FRAMES` frames. Memory does not grow with the
+    length of the recording.
     """
     columns = {stream: recording.columns(stream) for stream in recording.streams}
+    strips = [_strip(stream, stored) for stream, stored in columns.items() if read_format(stored) is not None]
+    for strip in strips:
+        names = [name for name in columns[strip.stream].column_names if name != PACKET]
+        columns[strip.stream] = columns[strip.stream].select(names)
+    return replace(_for_picture(recording, columns, chain), strips=strips)
+
+
+def _strip(stream: str, stored: Columns) -> FrameStrip:
+    """Return the frames in the middle of `STRIP_FRAMES` equal stretches of time, each frame once."""
+    t_ns = stored.column(TIME).to_numpy()
+    if not len(t_ns):
+        return FrameStrip(stream, t_ns, [], t_ns)
+    centres_ns = t_ns[0] + (np.arange(STRIP_FRAMES) + 0.5) * (t_ns[-1] - t_ns[0]) / STRIP_FRAMES
+    rows = np.unique(np.clip(np.searchsorted(t_ns, centres_ns), 0, len(t_ns) - 1)).tolist()
+    images = read_frames(stored, rows)
+    decoded_rows = sorted(images)
+    return FrameStrip(stream, t_ns[decoded_rows], [images[row] for row in decoded_rows], t_ns[[0, -1]])
+
+
+def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: StageChain) -> DrawnContents:
     long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MOST_VALUES}
-    if not long:
-        return of(recording, chain=chain)
     tables = {
-        stream: _thinned(stored) if stream in long else recording.table(stream) for stream, stored in columns.items()
+        stream: _thinned(stored) if stream in long else stored.read(stored.column_names)
+        for stream, stored in columns.items()
     }
     contents = _of_tables(recording.name, recording.attributes, tables)
     contents = _split_contacts(contents, chain)
-    if set(tables) == {""}:  # a mask marks its gaps
+    if not long or set(tables) == {""}:  # a mask marks its gaps
         return contents
     gaps = [gap for gap in contents.gaps if gap.lane not in long]
     for stream in sorted(long):

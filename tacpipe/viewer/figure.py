@@ -18,10 +18,11 @@ from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
 from tacpipe.traces.spans import CONTACT, PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
-from tacpipe.viewer.contents import DrawnContents
+from tacpipe.viewer.contents import STRIP_FRAMES, DrawnContents, FrameStrip
 
 ENDINGS = (".png", ".svg", ".pdf")
 WIDTH_IN, DPI = 11.0, 110
+STRIP_PX = 320  # width of a drawn frame, at least
 POINTS = 2400  # points of a line: two per pixel
 BINS = 1200  # bins of the image of all taxels
 PANELS, NAMED = 9, 8  # sets of curves that are drawn, and lines that a legend names
@@ -62,12 +63,13 @@ def draw(contents: DrawnContents, path: Path) -> None:
     if path.suffix.lower() not in ENDINGS:
         raise UsageError(f"{path} is not a name for a picture; it must end in one of {', '.join(ENDINGS)}.")
     lines = panels(contents)
-    if not lines and not contents.taxels:
+    strips = [strip for strip in contents.strips if strip.images]
+    if not lines and not contents.taxels and not strips:
         raise UsageError(f"Recording {contents.name} has no stream with times, so there is nothing to plot.")
     with extras.explain_missing("A picture"):
         import matplotlib
     with matplotlib.rc_context({"svg.hashsalt": "recording", "font.size": 9, "axes.titlesize": 9, "text.color": TEXT}):
-        figure = _over_time(contents, lines) if lines else _at_once(contents)
+        figure = _over_time(contents, lines, strips) if lines or strips else _at_once(contents)
         content, kind = io.BytesIO(), path.suffix.lower()[1:]
         bare = {"png": ("Software",), "svg": ("Date", "Creator"), "pdf": ("CreationDate", "Creator", "Producer")}[kind]
         figure.savefig(content, format=kind, metadata=dict.fromkeys(bare))  # the same recording gives the same bytes
@@ -75,30 +77,33 @@ def draw(contents: DrawnContents, path: Path) -> None:
         write_whole(str(path), content.getvalue(), f"{path}.draft")
 
 
-def _over_time(contents: DrawnContents, lines: Sequence[Panel]) -> Any:
+def _over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence[FrameStrip]) -> Any:
     from matplotlib.figure import Figure
 
     start_ns, stop_ns = contents.ends_ns
     lanes = _lanes(contents)
     touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
-    heights = [1.9, *[0.28 * len(lanes) + 0.1] * bool(lanes), *[1.1] * len(touched), *[1.15] * (len(lines) - 1)]
+    heights = [*[1.9] * bool(lines), *[0.28 * len(lanes) + 0.1] * bool(lanes), *map(_strip_height, strips)]
+    heights += [*[1.1] * len(touched), *[1.15] * len(lines[1:])]
     figure = Figure(figsize=(WIDTH_IN, sum(heights) + 0.42 * len(heights) + 0.5), dpi=DPI, layout="constrained")
     figure.suptitle(_title(contents), x=0.01, ha="left", fontsize=11)
     axes: list[Any] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     )
-    first, further_panels = lines[0], lines[1:]
-    main = axes.pop(0)
-    _plot(main, first, start_ns)
-    for span in contents.spans:
-        if span.lane == CONTACT:
-            look = _look(span, drawing.DISTINCT[0])
-            main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **look)
+    if lines:
+        main = axes.pop(0)
+        _plot(main, lines[0], start_ns)
+        for span in contents.spans:
+            if span.lane == CONTACT:
+                look = _look(span, drawing.DISTINCT[0])
+                main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **look)
     if lanes:
         _diagram(axes.pop(0), lanes, start_ns)
+    for strip in strips:
+        _draw_strip(axes.pop(0), strip, start_ns)
     for finger in touched:
         _image(axes.pop(0), finger, start_ns, stop_ns)
-    for panel in further_panels:
+    for panel in lines[1:]:
         _plot(axes.pop(0), panel, start_ns)
     bottom = figure.axes[-1]
     bottom.set_xlabel("time since the start of the recording (s)")
@@ -107,6 +112,27 @@ def _over_time(contents: DrawnContents, lines: Sequence[Panel]) -> Any:
         for event in contents.events:
             axis_of_figure.axvline(_s(event.t_ns, start_ns), color=drawing.FAULT, linewidth=0.8, alpha=0.8)
     return figure
+
+
+def _strip_height(strip: FrameStrip) -> float:
+    """Return the height in inches at which frames keep their proportions."""
+    height, width = strip.images[0].shape[:2]
+    return float(min(0.95 * WIDTH_IN / STRIP_FRAMES * height / width, 3.0))
+
+
+def _draw_strip(axes: Any, strip: FrameStrip, start_ns: int) -> None:
+    """Draw frames side by side, each in the stretch of time that it was taken from."""
+    first_s, last_s = _s(strip.ends_ns, start_ns).tolist()
+    step_s = max(last_s - first_s, 1e-3) / STRIP_FRAMES
+    for t_ns, image in zip(strip.t_ns.tolist(), strip.images, strict=True):
+        place = min(int((_s(t_ns, start_ns) - first_s) / step_s), STRIP_FRAMES - 1)
+        left = first_s + place * step_s
+        every = max(1, image.shape[1] // STRIP_PX)
+        axes.imshow(image[::every, ::every], aspect="auto", extent=(left, left + 0.98 * step_s, 0, 1))
+    axes.set_ylim(0, 1)
+    axes.set_yticks([])
+    height, width = strip.images[0].shape[:2]
+    axes.set_title(f"{plain(strip.stream)}: frames of {width} x {height} pixels", loc="left")
 
 
 def _title(contents: DrawnContents) -> str:

@@ -78,7 +78,7 @@ def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStre
             fields[column.name] = pa.field(name, column.type, metadata=dict(metadata))
         elif column.name == stream.time.column:
             fields[column.name] = pa.field(HEADER, column.type, metadata=dict(exported.time))
-        elif column.name != LOG:  # exported log times equal the header stamps
+        elif column.name not in (LOG, HEADER):  # exported log times equal the header stamps, 0 of which count as unset
             fields[column.name] = column
     schema = pa.schema(list(fields.values()))
 
