@@ -126,9 +126,9 @@ def _draw_strip(axes: Any, strip: FrameStrip, start_ns: int) -> None:
     step_s = max(last_s - first_s, 1e-3) / STRIP_FRAMES
     for t_ns, image in zip(strip.t_ns.tolist(), strip.images, strict=True):
         place = min(int((_s(t_ns, start_ns) - first_s) / step_s), STRIP_FRAMES - 1)
-        left = first_s + place * step_s
-        every = max(1, image.shape[1] // STRIP_PX)
-        axes.imshow(image[::every, ::every], aspect="auto", extent=(left, left + 0.98 * step_s, 0, 1))
+        left_s = first_s + place * step_s
+        pixel_step = max(1, image.shape[1] // STRIP_PX)
+        axes.imshow(image[::pixel_step, ::pixel_step], aspect="auto", extent=(left_s, left_s + 0.98 * step_s, 0, 1))
     axes.set_ylim(0, 1)
     axes.set_yticks([])
     height, width = strip.images[0].shape[:2]
