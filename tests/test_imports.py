@@ -45,6 +45,10 @@ def test_help_imports_nothing_heavy(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) & HEAVY == set()
 
 
+def test_help_of_live_sessions_imports_no_torch_which_the_computer_of_a_rig_may_lack(tmp_path: Path) -> None:
+    assert "torch" not in imported(tmp_path, "live --help")
+
+
 def test_help_of_a_stage_imports_none_of_what_runs_stages(tmp_path: Path) -> None:
     running = {f"tacpipe.engine.{name}" for name in ("pipeline", "by_recording", "grid")}
     assert imported_modules(tmp_path, "synchronize --help") & running == set()

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,8 +36,10 @@ from tacpipe.signals import repairs
 from tacpipe.signals.runs import latched, runs
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.params import AlarmLevels
-from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.forward.predictors import Predicted, Prediction
 
 ON_SD, OFF_SD = 3.0, 1.5  # differences at which a change begins and ends, in standard deviations
 ONSET_FRACTION = 0.05  # fraction of a change up to which it has not begun
