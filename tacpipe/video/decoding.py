@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.arrays import AnyArray, Bytes
@@ -54,6 +55,20 @@ def decode_samples(video_format: VideoFormat, batches: Iterable[pa.Table]) -> It
             yield row, frame.to_ndarray(format="gray16le")
         else:
             yield row, frame.to_ndarray(format=GREY if video_format.pixel_format == GREY else RGB)
+
+
+def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, bytes]]:
+    """Yield row number and JPEG of each frame as `decode_frames` does, for viewers: decoded, and encoded with some loss."""
+    with extras.explain_missing(NEEDED_BY):
+        import av
+    encoder: Any = av.CodecContext.create("mjpeg", "w")
+    encoder.width, encoder.height = video_format.width_px, video_format.height_px
+    encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 1000)
+    encoder.options = {"qmin": "2", "qmax": "2"}  # best quality
+    for row, frame in _decode(video_format, batches):
+        image = frame.reformat(format="yuvj420p")
+        image.pts, image.time_base = row, encoder.time_base
+        yield row, b"".join(bytes(packet) for packet in encoder.encode(image))
 
 
 def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> Iterator[pa.Table]:

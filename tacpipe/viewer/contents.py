@@ -24,8 +24,8 @@ from tacpipe.traces.paths import Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
-from tacpipe.video.decoding import read_frames
-from tacpipe.video.stream import PACKET, read_format
+from tacpipe.video.decoding import jpeg_images, read_frames
+from tacpipe.video.stream import BATCH_ROWS, PACKET, read_format
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -322,8 +322,10 @@ def _points(stream: str, table: pa.Table) -> list[Points]:
 
 
 def _frames(stream: str, table: pa.Table) -> list[Frames]:
+    """Return the images of a stream as they were encoded, and the frames of a video as JPEG."""
     if TIME not in table.column_names:
         return []
+    t_ns = table.column(TIME).to_numpy()
     frames = []
     for column in table.schema:
         if not str(column.type).endswith("binary"):
@@ -331,7 +333,12 @@ def _frames(stream: str, table: pa.Table) -> list[Frames]:
         content = [bytes(picture or b"") for picture in table.column(column.name).to_pylist()]
         kind = next(filter(None, map(picture_encoding, content)), "")
         if kind:
-            frames.append(Frames(stream, table.column(TIME).to_numpy(), content, f"image/{kind}"))
+            frames.append(Frames(stream, t_ns, content, f"image/{kind}"))
+    video_format = read_format(table)
+    if video_format is not None and not frames:
+        batches = (table.slice(start, BATCH_ROWS) for start in range(0, table.num_rows, BATCH_ROWS))
+        images = dict(jpeg_images(video_format, batches))
+        frames.append(Frames(stream, t_ns[list(images)], list(images.values()), "image/jpeg"))
     return frames
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -82,6 +83,19 @@ def test_show_states_the_format_of_a_video_and_its_missing_frames(mixed: Lab) ->
     assert (figures["codec"], figures["width_px"], figures["height_px"]) == ("h264", videos.WIDTH, videos.HEIGHT)
     assert (figures["nominal_rate_hz"], figures["missing_frames"]) == (25.0, 2)
     assert "gel: h264, 64 x 48 pixels, yuv420p, 25 frames/s, 2 missing frames" in mixed.run("show data/r a").out
+
+
+def test_the_viewer_has_an_image_for_each_frame_of_a_video(mixed: Lab) -> None:
+    recording = tacpipe.open(mixed.folder / "data/r")["a"]
+    (frames,) = contents.of(recording).frames
+    expected = videos.decoded(mixed.folder / "lab/a/gel.mp4")
+    assert frames.media_type == "image/jpeg"
+    assert frames.t_ns.tolist() == recording.table("gel")["t_ns"].to_pylist()
+    assert len(frames.content) == len(expected) == 73
+    for content, image in zip(frames.content, expected, strict=True):
+        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+        assert bgr is not None
+        assert np.abs(bgr[..., ::-1].astype(int) - image).mean() < 3
 
 
 def test_a_picture_has_frames_in_the_middle_of_equal_stretches(mixed: Lab) -> None:
