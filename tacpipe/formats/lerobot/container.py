@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,8 @@ from tacpipe.io import parquet, regular
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
+from tacpipe.video.files import VideoScan, packet_stream, read_packets, scan
+from tacpipe.video.stream import cut_rows
 
 NATIVE = "tacpipe"  # the folder with the streams that a dataset was exported from, a folder a recording
 TOLERANCE_S = 1e-4  # LeRobot's own tolerance
@@ -40,6 +43,12 @@ SHARED_STREAMS = ("next", NATIVE)  # features that begin so are one stream, as n
 EXACT = f"{NATIVE}.t_ns"  # the feature with the stamps in ns, of datasets that tacpipe exported
 CLOCK = Time(column="t_ns", unit="ns", origin="start")
 FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
+
+
+@functools.lru_cache(maxsize=4)  # the episodes of a video are read one after another
+def _scan_video(path: Path, changed_ns: int) -> VideoScan:
+    """Return the frames of a video, for as long as the file has this time of change."""
+    return scan(path)
 
 
 class LeRobotContainer:
@@ -69,7 +78,9 @@ class LeRobotContainer:
         """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
         entry = self._find_episode(episode)
         about = self._about
-        paths = [regular.inside(self.path, entry.file), *self._native(entry).values()]
+        native = self._native(entry)
+        paths = [regular.inside(self.path, entry.file), *native.values()]
+        paths += [] if native else [regular.inside(self.path, video) for video in entry.videos.values()]
         with regular.failing(self.path):
             files = {path.relative_to(self.path).as_posix(): path for path in paths if file_system.present(path)}
         values = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": entry.index}
@@ -121,7 +132,11 @@ class LeRobotContainer:
             attributes["task"] = "; ".join(episode.tasks)
         if self._about.robot:
             attributes["robot_type"] = self._about.robot
-        skipped = {key: f"is a video, {path}, which is not read" for key, path in episode.videos.items()}
+        skipped = {
+            key: f"is a video, {path}, which does not exist"
+            for key, path in episode.videos.items()
+            if not file_system.present(regular.inside(self.path, path))
+        }
         attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
         streams = self._streams(episode, sources, rows=rows)
         return EpisodeContents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
@@ -147,7 +162,12 @@ class LeRobotContainer:
             if feature.key not in (*COUNTING_FEATURES, EXACT) and feature.dtype != "video":
                 first = feature.key.partition(".")[0]
                 by_source.setdefault(first if first in SHARED_STREAMS else feature.key, []).append(feature)
-        names = container.identifiers([_stream_stem(source) for source in by_source])
+        videos = [
+            key
+            for key, video in episode.videos.items()
+            if _is_selected(key, sources) and file_system.present(regular.inside(self.path, video))
+        ]
+        names = container.identifiers([_stream_stem(source) for source in [*by_source, *episode.videos]])
         chosen = {source: features for source, features in by_source.items() if _is_selected(source, sources)}
         exact = [EXACT] if EXACT in self._about.features else []
         frames = self._frames(episode, [*exact, *(feature.key for features in chosen.values() for feature in features)])
@@ -158,7 +178,8 @@ class LeRobotContainer:
             time_metadata = {"made": stamp_source}
         clock = pa.field(CLOCK.column, pa.int64(), metadata=time_metadata)
         frames = frames if rows else frames.slice(0, 0)
-        streams = []
+        streams = [self._video_stream(episode, key, names[_stream_stem(key)], t_ns, clock) for key in videos]
+        streams = [replace(stream, time=replace(CLOCK, origin="unix")) if exact else stream for stream in streams]
         for source, features in chosen.items():
             columns = [(clock, pa.array(t_ns[: frames.num_rows]))]
             for feature in features:
@@ -167,6 +188,42 @@ class LeRobotContainer:
             time = replace(CLOCK, origin="unix") if exact else CLOCK
             streams.append(SourceStream(source, names[_stream_stem(source)], time, table, episode.length))
         return streams
+
+    def _video_stream(
+        self, episode: EpisodeDescription, key: str, name: str, t_ns: Int64s, clock: pa.Field
+    ) -> SourceStream:
+        """Return the frames of an episode in its video, with the stamps ``t_ns`` (frame,) of its rows.
+
+        Raises `TacpipeError` where the video cannot be read, ends before the episode, or cannot be cut at its ends.
+        """
+        path = regular.inside(self.path, episode.videos[key])
+        frames = _scan_video(path, path.stat().st_mtime_ns)
+        half_step_s = 0.5 / self._about.fps
+        start_s = episode.video_starts_s.get(key, 0.0)
+        start = int(np.searchsorted(frames.times_ns() / 1e9, start_s - half_step_s))
+        stop = start + len(t_ns)
+        if stop > len(frames):
+            raise TacpipeError(
+                f"{path} has {len(frames)} frames, and episode {episode.index} is its frames {start} to {stop}. Copy the "
+                f"dataset again."
+            )
+        if cut_rows(frames.dts, frames.key_frame, start, stop) != (start, stop):
+            raise TacpipeError(
+                f"{path}: the frames {start} to {stop} of episode {episode.index} cannot be cut out at key frames. Write "
+                f"the episode to a video of its own."
+            )
+        counter = frames.counter()
+        seq = None if counter is None else counter[start:stop] - counter[start]
+        clocks = (frames.pts[start:stop], frames.dts[start:stop], frames.key_frame[start:stop])
+
+        def read() -> Iterator[pa.Table]:
+            packets = itertools.islice(read_packets(path, frames), start, stop)
+            for batch in packet_stream(frames.video_format, packets, clocks, t_ns, seq, None):
+                yield pa.Table.from_batches([batch]).cast(schema)
+
+        fields = list(frames.video_format.schema(counted=seq is not None))
+        schema = pa.schema([clock, *fields[1:]])
+        return SourceStream(key, name, CLOCK, Batched(schema, len(t_ns), read), episode.length)
 
     def _frames(self, episode: EpisodeDescription, keys: Sequence[str]) -> pa.Table:
         """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""

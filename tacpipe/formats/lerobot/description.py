@@ -74,6 +74,7 @@ class EpisodeDescription:
     videos: Mapping[str, str] = field(default_factory=dict)  # path within the dataset by feature
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     original: Mapping[str, Attribute] | None = None
+    video_starts_s: Mapping[str, float] = field(default_factory=dict)  # start within the video by feature; else 0
 
 
 @dataclass(frozen=True)
@@ -145,10 +146,13 @@ class LeRobotDescription:
             if key not in ("episode_index", "length", "tasks") and not key.startswith(LOCATION_PREFIXES)
         }
         videos = {}
+        starts_s = {}
         for key in self._videos:
             at = {name: row.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
             if None not in at.values():
                 videos[key] = self._place("video_path", "", {**at, "video_key": key})
+                start_s = row.get(f"videos/{key}/from_timestamp")
+                starts_s[key] = float(start_s) if isinstance(start_s, int | float) else 0.0
         file = self._place("data_path", DATA_PATHS["v3"], values)
         tasks = tuple(map(str, row.get("tasks") or ()))
         original = _original_attributes(path, row.get(ATTRIBUTES))
@@ -161,6 +165,7 @@ class LeRobotDescription:
             videos,
             _plain_attributes(extra_values),
             original,
+            starts_s,
         )
 
     @property

@@ -11,6 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from tests.video import videos
+
 FPS = 30
 LENGTHS = (12, 7, 9)
 TASKS = ("grasp the cup", "grasp the box")
@@ -88,6 +90,7 @@ def write_v3(root: Path, files: Sequence[Sequence[int]] = ((0, 1), (2,)), **info
                 row = {"episode_index": episode, "tasks": [TASKS[episode % 2]], "length": table.num_rows}
                 row |= {"data/chunk_index": 0, "data/file_index": number, "stats/action/max": [1.0]}
                 row |= {"videos/observation.images.top/chunk_index": 0, "videos/observation.images.top/file_index": 4}
+                row["videos/observation.images.top/from_timestamp"] = start / videos.RATE_HZ
                 rows.append({**row, "dataset_from_index": start, "dataset_to_index": start + table.num_rows})
                 start += table.num_rows
     data = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

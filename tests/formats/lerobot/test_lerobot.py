@@ -20,8 +20,10 @@ from tacpipe.formats.container_commands import LEROBOT, lerobot
 from tacpipe.formats.table.contained import Params
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.video import decoding, stream
 from tests.conftest import Lab
 from tests.formats.lerobot import files
+from tests.video import videos
 
 NONE = Params()
 EPISODE = "pick-episode_00000{}"
@@ -66,11 +68,54 @@ def test_both_versions_give_the_same_recordings(tmp_path: Path, write: Callable[
         (files.write_v3, "videos/observation.images.top/chunk-000/file-004.mp4"),
     ],
 )
-def test_a_video_is_named_with_its_path_and_not_read(tmp_path: Path, write: Callable[[Path], None], path: str) -> None:
+def test_a_video_that_does_not_exist_is_named_with_its_path(
+    tmp_path: Path, write: Callable[[Path], None], path: str
+) -> None:
     write(tmp_path / "pick")
     result = read(tmp_path)[EPISODE.format(1)]
     assert result.attributes["video.observation.images.top"] == path
     assert path in " ".join(result.notes)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_frames_of_an_episode_are_those_of_its_part_of_the_video(tmp_path: Path, version: str) -> None:
+    root, lengths = tmp_path / "pick", files.LENGTHS
+    starts = [0, 0, 0] if version == "v2.1" else [0, lengths[0], lengths[0] + lengths[1]]
+    (files.write_v2 if version == "v2.1" else files.write_v3)(root)
+    folder = (
+        root
+        / "videos"
+        / ("chunk-000/observation.images.top" if version == "v2.1" else "observation.images.top/chunk-000")
+    )
+    folder.mkdir(parents=True)
+    if version == "v2.1":
+        paths = [folder / f"episode_{episode:06d}.mp4" for episode in range(3)]
+        for path, length in zip(paths, lengths, strict=True):
+            videos.write(path, "libx264", length)
+    else:
+        paths = [videos.write(folder / "file-004.mp4", "mjpeg", sum(lengths))] * 3
+    for episode, (path, start) in enumerate(zip(paths, starts, strict=True)):
+        result = read(tmp_path)[EPISODE.format(episode)]
+        table = result.streams["top"].read_all()
+        assert sorted(table["packet"].to_pylist()) == sorted(videos.packets(path)[start : start + lengths[episode]])
+        video_format = stream.read_format(table)
+        assert video_format is not None
+        images = dict(decoding.decode_frames(video_format, [table]))
+        expected = videos.decoded(path)[start : start + lengths[episode]]
+        assert all(np.array_equal(images[row], image) for row, image in enumerate(expected))
+        assert table["t_ns"].to_pylist() == result.streams["state"]["t_ns"].to_pylist()
+
+
+def test_an_episode_that_cannot_be_cut_out_and_a_video_that_is_too_short_are_one_sentence(tmp_path: Path) -> None:
+    files.write_v3(tmp_path / "pick")
+    folder = tmp_path / "pick/videos/observation.images.top/chunk-000"
+    folder.mkdir(parents=True)
+    videos.write(folder / "file-004.mp4", "mpeg4", sum(files.LENGTHS))
+    with pytest.raises(TacpipeError, match="cannot be cut out at key frames"):
+        read(tmp_path)
+    videos.write(folder / "file-004.mp4", "mjpeg", files.LENGTHS[0] + 3)
+    with pytest.raises(TacpipeError, match="has 15 frames"):
+        read(tmp_path)
 
 
 def test_quantities_and_units_follow_the_names(tmp_path: Path) -> None:
