@@ -16,7 +16,6 @@ from tacpipe.errors import UsageError
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
-from tacpipe.video.stream import read_format
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -211,6 +210,8 @@ def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
 def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFigures:
     """Return the figures of a stream with these clocks."""
     import pyarrow as pa
+
+    from tacpipe.video.stream import read_format
 
     figures: StreamFigures = {"rows": columns.num_rows, "columns": len(columns.column_names)}
     if clocks is not None:
