@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.quantiles import conformal_quantile, most_promised
+from tacpipe.metrics.calibration import conformal_quantile, most_promised
 
 SCORES = st.floats(-1e6, 1e6, allow_nan=False)
 GROUPS = st.lists(st.lists(SCORES, min_size=1, max_size=6), min_size=2, max_size=8)

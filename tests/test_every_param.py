@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pytest
 
-from tacpipe.clouds.normalisation import NORMALISATIONS
+from tacpipe.clouds.geometry import NORMALISATIONS
 from tacpipe.codecs.autoencoder_fit import FRAMES, MOST
 from tacpipe.datasets.splits import SCHEMES
 from tacpipe.errors import UsageError
@@ -23,7 +23,7 @@ from tacpipe.models.recurrent_autoencoder import DECODERS
 from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList, Range, Unit
-from tacpipe.simulation.household import FAMILIES, MODULI_PA
+from tacpipe.simulation.grasp_scene import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
 from tacpipe.tasks.forward.networks import ACTIONS

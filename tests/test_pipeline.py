@@ -12,7 +12,7 @@ import tacpipe
 from tacpipe.datasets import directory
 from tacpipe.datasets.dataset import Recording
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.engine import processor, provenance
+from tacpipe.engine import provenance
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.store.records import digests
@@ -301,9 +301,9 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
 @pytest.mark.parametrize(
     ("module", "function", "value", "difference"),
     [
-        (processor, "threads", 977, r"threads: \d+, now 977"),
+        (provenance, "threads", 977, r"threads: \d+, now 977"),
         (
-            processor,
+            provenance,
             "_processor",
             {"model": "Zen 9", "instructions": ["sve"]},
             r"instructions: .*, now sve; model: .*9",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.engine import processor, provenance
+from tacpipe.engine import provenance
 from tacpipe.errors import UsageError
 from tests.conftest import run_python
 
@@ -23,21 +23,21 @@ model name\t: another
 
 @pytest.fixture(autouse=True)
 def _forget() -> None:
-    processor._processor.cache_clear()
+    provenance._processor.cache_clear()
 
 
 def test_the_first_core_says_model_and_instructions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "cpuinfo").write_text(CPUINFO)
-    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(provenance, "_CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
-    described = processor.describe()
+    described = provenance.describe_processor()
     assert described["model"] == "Zen 4" and described["instructions"] == ["avx", "avx2", "fma", "avx512f"]
     assert described["chosen"] == {"OPENBLAS_CORETYPE": "Haswell"}
 
 
 def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
-    assert processor.describe()["model"] and processor.describe()["instructions"] == []
+    monkeypatch.setattr(provenance, "_CPUINFO", tmp_path / "none")
+    assert provenance.describe_processor()["model"] and provenance.describe_processor()["instructions"] == []
 
 
 @pytest.mark.long
@@ -52,8 +52,8 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
 
 
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
-    stored = provenance.describe(1.0)
-    assert provenance.unlike(stored, provenance.describe(2.0)) == []
+    stored = provenance.describe_provenance(1.0)
+    assert provenance.unlike(stored, provenance.describe_provenance(2.0)) == []
     other_computer = {
         **stored,
         "device": "cuda",
@@ -70,46 +70,46 @@ def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(subprocess, "run", hangs)
     provenance._environment.cache_clear()
-    assert provenance.describe(0.0)["git_commit"] is None
+    assert provenance.describe_provenance(0.0)["git_commit"] is None
     provenance._environment.cache_clear()
 
 
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
-    assert provenance.unlike({"threads": 2}, provenance.describe(0.0)) == []
+    assert provenance.unlike({"threads": 2}, provenance.describe_provenance(0.0)) == []
 
 
 def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
-    for name in processor.THREADS:
+    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
+    for name in provenance.THREADS:
         monkeypatch.delenv(name, raising=False)
-    before = [{name: os.environ.get(name)} for name in processor.THREADS]
-    assert processor.each_of(2) == dict.fromkeys(processor.THREADS, "4")
-    assert processor.each_of(16) == dict.fromkeys(processor.THREADS, "1")
-    with processor.shared_by(3):
-        assert [os.environ[name] for name in processor.THREADS] == ["2", "2", "2"]
-    assert [{name: os.environ.get(name)} for name in processor.THREADS] == before
+    before = [{name: os.environ.get(name)} for name in provenance.THREADS]
+    assert provenance.each_of(2) == dict.fromkeys(provenance.THREADS, "4")
+    assert provenance.each_of(16) == dict.fromkeys(provenance.THREADS, "1")
+    with provenance.shared_by(3):
+        assert [os.environ[name] for name in provenance.THREADS] == ["2", "2", "2"]
+    assert [{name: os.environ.get(name)} for name in provenance.THREADS] == before
 
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert processor.each_of(2) == {}
+    assert provenance.each_of(2) == {}
 
 
 def test_a_command_starts_as_many_processes_as_the_environment_states_else_one_a_core(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
-    monkeypatch.delenv(processor.JOBS, raising=False)
-    assert processor.jobs() == 8
-    assert [processor.jobs_of(commands) for commands in (1, 3, 16)] == [{processor.JOBS: n} for n in ("8", "2", "1")]
+    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
+    monkeypatch.delenv(provenance.JOBS, raising=False)
+    assert provenance.jobs() == 8
+    assert [provenance.jobs_of(commands) for commands in (1, 3, 16)] == [{provenance.JOBS: n} for n in ("8", "2", "1")]
 
-    monkeypatch.setenv(processor.JOBS, "3")
-    assert processor.jobs() == 3
-    assert processor.jobs_of(2) == {}
+    monkeypatch.setenv(provenance.JOBS, "3")
+    assert provenance.jobs() == 3
+    assert provenance.jobs_of(2) == {}
 
 
 @pytest.mark.parametrize("jobs", ["0", "-1", "two", "1.5"])
 def test_a_number_of_processes_that_is_none_is_refused(jobs: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(processor.JOBS, jobs)
+    monkeypatch.setenv(provenance.JOBS, jobs)
     with pytest.raises(UsageError, match=f"TACPIPE_JOBS is '{jobs}'"):
-        processor.jobs()
+        provenance.jobs()

@@ -9,7 +9,7 @@ from sklearn.linear_model import QuantileRegressor
 from sklearn.metrics import mean_pinball_loss
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import quantiles
+from tacpipe.metrics import calibration
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 
 LEVELS = np.array([0.1, 0.5, 0.9])
@@ -35,7 +35,7 @@ def true_quantiles(feature: np.ndarray) -> np.ndarray:
 def test_pinball_is_that_of_scikit_learn() -> None:
     rng = np.random.default_rng(1)
     truth, predicted = rng.normal(size=(50, 2)), np.sort(rng.normal(size=(50, 2, 3)), axis=-1)
-    sums = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
+    sums = calibration.Sums.from_predictions(truth, predicted, LEVELS)
     for step in range(2):
         for at, level in enumerate(LEVELS):
             expected = mean_pinball_loss(truth[:, step], predicted[:, step, at], alpha=level)
@@ -45,7 +45,7 @@ def test_pinball_is_that_of_scikit_learn() -> None:
 def test_coverage_and_width_are_those_counted_by_hand() -> None:
     truth = np.array([[0.0], [1.0], [5.0], [-3.0]])
     predicted = np.broadcast_to([-1.0, 0.0, 1.0], (4, 1, 3))
-    tree = quantiles.tree([quantiles.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
+    tree = calibration.tree([calibration.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
     assert tree["coverage"] == {"t1": 0.5, "mean": 0.5}
     assert tree["width"]["t1"] == 2.0
     assert [tree[f"below_q{level}"]["t1"] for level in (10, 50, 90)] == [0.25, 0.5, 0.75]
@@ -55,11 +55,11 @@ def test_coverage_and_width_are_those_counted_by_hand() -> None:
 def test_sums_of_two_parts_are_those_of_the_whole() -> None:
     rng = np.random.default_rng(2)
     truth, predicted = rng.normal(size=(20, 3)), np.sort(rng.normal(size=(20, 3, 3)), axis=-1)
-    total = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
+    total = calibration.Sums.from_predictions(truth, predicted, LEVELS)
     parts = [
-        quantiles.Sums.from_predictions(truth[rows], predicted[rows], LEVELS) for rows in (slice(0, 7), slice(7, 20))
+        calibration.Sums.from_predictions(truth[rows], predicted[rows], LEVELS) for rows in (slice(0, 7), slice(7, 20))
     ]
-    total_tree, two = quantiles.tree([total], (10, 50, 90)), quantiles.tree([parts[0] + parts[1]], (10, 50, 90))
+    total_tree, two = calibration.tree([total], (10, 50, 90)), calibration.tree([parts[0] + parts[1]], (10, 50, 90))
     assert total_tree == two
 
 
@@ -105,4 +105,4 @@ def test_too_few_values_are_refused() -> None:
 @pytest.mark.parametrize("percents", [(10, 90), (10, 50, 80), (50,), (90, 50, 10), (0, 50, 100)])
 def test_levels_that_are_not_symmetric_about_the_median_are_refused(percents: tuple[int, ...]) -> None:
     with pytest.raises(TacpipeError, match="symmetrically about 50"):
-        quantiles.check_levels(percents)
+        calibration.check_levels(percents)

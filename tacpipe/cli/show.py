@@ -21,7 +21,7 @@ from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ROLES
-from tacpipe.recording import ending
+from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
 SHOWN = 20  # Recordings that are listed before the remaining ones are counted
@@ -153,7 +153,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
         lines.append(f"{counted(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
-    lines += ending.describe_incomplete(value["attributes"], value["recordings"])
+    lines += spool_folders.describe_incomplete(value["attributes"], value["recordings"])
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
     lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(

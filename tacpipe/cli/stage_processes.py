@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.engine import processor
+from tacpipe.engine import provenance
 from tacpipe.engine.executors import local
 from tacpipe.io import termination
 from tacpipe.training import devices
@@ -60,7 +60,7 @@ class StageProcesses:
 
     def __init__(self, jobs: int, folder: Path, modules: Sequence[str]) -> None:
         """Take the number of jobs (0: one per usable core), a folder for their output, and the modules to import."""
-        self.jobs = jobs or processor.jobs()
+        self.jobs = jobs or provenance.jobs()
         self._folder, self._modules = folder, modules
         self._running: dict[str, Process] = {}  # Processes by name of the stage
         self._slots: dict[str, int] = {}  # Number from 0 of each running stage, which selects its GPU
@@ -92,12 +92,12 @@ class StageProcesses:
     def start(self, name: str, command: Command, together: int) -> None:
         """Start a command of stage ``name``, which has none running; ``together`` commands share the cores."""
         if self._context is None:
-            with processor.shared_by(self.jobs):  # The process that forks passes its environment on.
+            with provenance.shared_by(self.jobs):  # The process that forks passes its environment on.
                 self._context = local.start_fork_server(self._modules)
         words = command if isinstance(command, str) else list(command)
         self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
         gpu = devices.gpu_for(self._slots[name])
-        variables = processor.each_of(self.jobs) | processor.jobs_of(together) | gpu
+        variables = provenance.each_of(self.jobs) | provenance.jobs_of(together) | gpu
         arguments = words, str(Path.cwd()), variables, *map(str, self._output_paths(self._slots[name]))
         process = self._context.Process(target=_run, args=arguments)
         with termination.deferred(), local.without_main():

@@ -47,21 +47,21 @@ def require_metres(path: Path, cloud: Cloud) -> None:
 
 
 def _pcd(path: Path) -> Cloud:
-    from tacpipe.clouds import pcd
+    from tacpipe.clouds import point_files
 
     content = regular.content(path)
-    header = pcd.read_header(path, content)
+    header = point_files.read_header(path, content)
     if header.data != "binary_compressed":
-        return pcd.read(path)
-    pcd.require_compressed(path, content, header)  # open3d takes the memory that the file declares
+        return point_files.read(path)
+    point_files.require_compressed(path, content, header)  # open3d takes the memory that the file declares
     return _by_open3d(path, header.points)
 
 
 def _ply(path: Path) -> Cloud:
     """Return the cloud of a PLY file; open3d's parser writes beyond its memory where a header is made to have it do so."""
-    from tacpipe.clouds import ply
+    from tacpipe.clouds import point_files
 
-    xyz, colours = ply.parsed(path, regular.content(path))
+    xyz, colours = point_files.parse_ply(path, regular.content(path))
     _require_finite(path, xyz)
     return Cloud(xyz, colours)
 

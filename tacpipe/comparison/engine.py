@@ -11,8 +11,20 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Question, Settings, grouped, separate, spread
-from tacpipe.comparison.specification import Kind, TaskReport, by_task, report_on
+from tacpipe.comparison.runs import (
+    MODEL,
+    ComparedRun,
+    Kind,
+    Method,
+    Question,
+    Settings,
+    TaskReport,
+    by_task,
+    grouped,
+    report_on,
+    separate,
+    spread,
+)
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.intervals import Estimate, paired_t

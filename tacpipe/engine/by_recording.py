@@ -12,7 +12,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import computing, execution, keys, provenance
-from tacpipe.engine.executors.executor import ChosenExecutor
+from tacpipe.engine.executors.local import ChosenExecutor
 from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.previous import Previous
@@ -179,7 +179,7 @@ class ByRecording:
             summary = Outcome(self.outcome.output)
             for recording, record in records_by_name.items():
                 summary.add_record(name, recording, record)
-            made_by = {**provenance.describe(0.0), **summary.of_results()}
+            made_by = {**provenance.describe_provenance(0.0), **summary.of_results()}
             self.store.commit(group.identity, {"recordings": result, "files": {}}, made_by, replace=True)
         return result
 

@@ -159,7 +159,7 @@ class _Sending:
 def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Done | _Made:
     if task.dry:
         result, _ = execution.execute(task, store, ScratchStore())
-        return Done(task.recording, {"result": result, "provenance": provenance.describe(0.0)})
+        return Done(task.recording, {"result": result, "provenance": provenance.describe_provenance(0.0)})
     leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
     record = store.record(key)
     if record is not None and not task.rerun and records.complete(store, record):
@@ -170,7 +170,7 @@ def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Do
         stage = registry.load_step(task.name)
         code = provenance.code(stage)  # The file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
-    origin = {**provenance.describe(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+    origin = {**provenance.describe_provenance(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
         _manifest_of(task, stage, result).keep(store, durable=True)

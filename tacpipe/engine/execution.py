@@ -230,7 +230,7 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
             _remaking.discard(key)
         if store.has(name, size):
             return store.read(name, size)
-        unlike = "; ".join(provenance.unlike(made_by, provenance.describe(0.0)))
+        unlike = "; ".join(provenance.unlike(made_by, provenance.describe_provenance(0.0)))
         obstacle = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = obstacle or f"nothing in the store says how {path} was made"
     raise DamagedError(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe.engine import pipeline, processor
+from tacpipe.engine import pipeline, provenance
 from tacpipe.engine.executors.local import Local
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request, RequestInputs
@@ -73,7 +73,7 @@ def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outco
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(requests)]
     pool = Local(jobs, pool_from=2)
     at_once = min(pool.jobs, len(tasks))
-    with processor.shared_by(at_once), terminal.progress_bar(f"{requests[0].name}, folds", len(requests)) as advance:
+    with provenance.shared_by(at_once), terminal.progress_bar(f"{requests[0].name}, folds", len(requests)) as advance:
         for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
             advance(note=str(requests[position].output))
             yield requests[position], became
@@ -124,8 +124,8 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
             return None
     if each_s is None:
         return None
-    at_once = min(jobs or processor.jobs(), len(missing))
-    hours = total_s(each_s, len(missing), at_once, processor.threads(), processor.usable_cores()) / _HOUR_S
+    at_once = min(jobs or provenance.jobs(), len(missing))
+    hours = total_s(each_s, len(missing), at_once, provenance.threads(), provenance.usable_cores()) / _HOUR_S
     return DurationEstimate(len(missing), at_once, each_s, hours)
 
 

@@ -16,7 +16,7 @@ from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
-from tacpipe.engine.executors.executor import ChosenExecutor
+from tacpipe.engine.executors.local import ChosenExecutor
 from tacpipe.engine.keys import WorkerTask
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.output import Unread
@@ -405,5 +405,5 @@ class _RequestRun:
         stored = vars(result_manifest.keep(self.store, durable=result_manifest.recorded))
         if not self.outcome.bad:
             result = {"recordings": {}, "files": {manifest.NAME: stored}}
-            made_by = {**provenance.describe(0.0), **self.outcome.of_results()}
+            made_by = {**provenance.describe_provenance(0.0), **self.outcome.of_results()}
             self.store.commit(self.identity, result, made_by, replace=True)

@@ -1,8 +1,13 @@
 """Slides of an iCub's forearm, RoboSkin, over the twenty materials that the BioTac slides have (IROS 2020).
 
 Published within dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, a file a fold, with a
-file of labels each. Their axes went through a wrong reshape before (`tacpipe.signals.array_order`); which arrangement a file
+file of labels each. Their axes went through a wrong reshape before; which arrangement a file
 has is derived from its values. The rate is not published.
+
+Time is the axis along which neighbours resemble each other most. Each slide was written as (taxel, time, triangle) and then
+read as (triangle, taxel, time) without moving its axes: ``X[r, c, j] = U[(T r + j) mod 6, c, floor((T r + j) / 6)]`` for
+slides of T frames and 6 triangles, where U is the slide as it was measured. Values change places only, so the way back is
+exact.
 """
 
 from __future__ import annotations
@@ -18,6 +23,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import walk
@@ -92,7 +100,6 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
 
     from tacpipe.channels import schema
     from tacpipe.formats import published
-    from tacpipe.signals.array_order import scramble
     from tacpipe.signals.resampling import uniform_grid
 
     (block, place), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
@@ -184,7 +191,6 @@ def _read_slide(path: Path, place: int) -> Float32s:
     import numpy as np
 
     from tacpipe.channels.schema import TRIANGLE_TAXELS, TRIANGLES
-    from tacpipe.signals.array_order import is_time, lag_one, unscramble
 
     block = _cached_array(path)
     if block.dtype.kind not in "fiu" or block.shape[1:3] != (TRIANGLES, TRIANGLE_TAXELS) or block.shape[3] < 2:
@@ -262,3 +268,61 @@ def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
 def _unreadable(path: Path, error: BaseException) -> TacpipeError:
     described = plain(" ".join(str(error).split()), 200)
     return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")
+
+
+LEAST = 0.5  # lag-1 autocorrelation that time must have
+
+
+def lag_one(values: AnyArray, axis: int) -> float:
+    """Return the lag-1 autocorrelation of ``values`` along ``axis``: the correlation of all pairs of neighbours along it.
+
+    NaN where there are no neighbours or they do not vary.
+
+    >>> round(lag_one(np.array([[0.0, 1.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]]), axis=1), 1)
+    1.0
+    """
+    moved = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
+    before, after = moved[:-1].ravel(), moved[1:].ravel()
+    if not before.size or not np.isfinite(moved).all():
+        return float("nan")
+    before, after = before - before.mean(), after - after.mean()
+    spread = float(np.sqrt((before @ before) * (after @ after)))
+    return float(before @ after) / spread if spread > 0 else float("nan")
+
+
+def is_time(values: AnyArray, axis: int, lowest: float = LEAST) -> bool:
+    """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``lowest`` or more, and the largest.
+
+    False where nothing varies along it: such an array states nothing about its axes.
+    """
+    candidate = axis % values.ndim
+    along = [lag_one(values, place) for place in range(values.ndim)]
+    other_axes = [
+        correlation for place, correlation in enumerate(along) if place != candidate and np.isfinite(correlation)
+    ]
+    return along[candidate] >= lowest and all(along[candidate] > correlation for correlation in other_axes)
+
+
+def scramble(slides: AnyArray) -> AnyArray:
+    """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, of the same shape.
+
+    >>> measured = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
+    >>> scramble(measured).tolist()
+    [[[0, 10, 1, 11]], [[2, 12, 3, 13]]]
+    """
+    triangles, taxels, frames = slides.shape[-3:]
+    in_turn = np.moveaxis(slides, -3, -1)  # (…, taxel, time, triangle)
+    rows = in_turn.reshape(*slides.shape[:-3], taxels, triangles, frames)
+    return np.ascontiguousarray(np.swapaxes(rows, -3, -2))
+
+
+def unscramble(published: AnyArray) -> AnyArray:
+    """Return slides as they were measured, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
+
+    >>> unscramble(np.array([[[0, 10, 1, 11]], [[2, 12, 3, 13]]])).tolist()
+    [[[0, 1, 2, 3]], [[10, 11, 12, 13]]]
+    """
+    triangles, taxels, frames = published.shape[-3:]
+    rows = np.swapaxes(published, -3, -2)  # (…, taxel, row, place in the row)
+    in_turn = rows.reshape(*published.shape[:-3], taxels, frames, triangles)
+    return np.ascontiguousarray(np.moveaxis(in_turn, -1, -3))

@@ -87,7 +87,7 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
-    from tacpipe.clouds import pcd
+    from tacpipe.clouds import point_files
     from tacpipe.clouds.files import require_metres
     from tacpipe.formats import published
 
@@ -99,7 +99,7 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
             f"{grasp_files[CLOUD].parent} is named {time_s!r}; a grasp's folder must be named after its time, ten digits of "
             f"unix seconds. Give it the name that it was published under."
         )
-    cloud, grasp = pcd.read(grasp_files[CLOUD]), _read_grasp(grasp_files[GRASP])
+    cloud, grasp = point_files.read(grasp_files[CLOUD]), _read_grasp(grasp_files[GRASP])
     require_metres(grasp_files[CLOUD], cloud)
     _check_distance(grasp_files[GRASP], cloud, grasp, params.beside_mm)
     t_ns = int(time_s) * 10**9

@@ -92,7 +92,7 @@ def _poses(path: Path) -> Floats:
 
     from tacpipe.formats import xela
     from tacpipe.formats.csv_table import file_row
-    from tacpipe.signals.rotations import continuous, quaternions_of
+    from tacpipe.signals.kinematics import continuous, quaternions_of
 
     entries = [f"ee_T_{row}{column}" for row in range(4) for column in range(4)]  # named by row and column
     transforms = xela.read_floats(path, entries).reshape(-1, 4, 4)

@@ -6,16 +6,16 @@ import time
 from collections.abc import Callable
 
 from tacpipe.errors import DeviceError
-from tacpipe.links import camera, can, folder, hid, lsl, ports, tcp, udp, websocket
+from tacpipe.links import camera, can, folder, hid, lsl, network, ports, websocket
 from tacpipe.links.link import Address, Arrived, Link
 from tacpipe.sensors.sensor import Ask, Dialogue, Sensor
 
 OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
     "serial": ports.open_serial,
     "hid": hid.open_hid,
-    "udp": udp.open_udp,
-    "tcp": tcp.open_tcp,
-    "tcp+udp": tcp.open_both,
+    "udp": network.open_udp,
+    "tcp": network.open_tcp,
+    "tcp+udp": network.open_both,
     "ws": websocket.open_websocket,
     "can": can.open_can,
     "folder": folder.open_folder,

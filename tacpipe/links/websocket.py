@@ -35,7 +35,7 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
         from websockets.sync.client import connect
 
     host_and_port, _, path = place.partition("/")
-    host, port = network.place("ws", host_and_port)
+    host, port = network.format_place("ws", host_and_port)
     wire = network.connect(
         host, port, name
     )  # our own connection uses no proxy and has the same error texts as all links

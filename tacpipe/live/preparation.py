@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
-from tacpipe.live import publishing, scheduling
-from tacpipe.live.settings import SessionOptions, Settings, parse_option
-from tacpipe.live.task import LiveTask
+from tacpipe.live import publishing, wire
+from tacpipe.live.settings import LiveTask, SessionOptions, Settings, parse_option
 from tacpipe.plugins import fields
 from tacpipe.printable import plain
 from tacpipe.recording import recorder
@@ -64,7 +63,7 @@ def prepare(rig: Rig, rig_file: str, options: Mapping[str, Any]) -> PreparedSess
     settings = Settings.from_sources(model.live.settings, rig.live, rig_file, parsed)
     if settings.realtime:
         with settings.naming("realtime"):
-            scheduling.check()
+            wire.check()
     with settings.naming("publish"):
         for address in settings.publish:
             publishing.check(address)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.errors import FAILED, TacpipeError, UsageError
-from tacpipe.live import publishing, scheduling, wire
+from tacpipe.live import publishing, wire
 from tacpipe.live.engine import Continuation, Engine
 from tacpipe.live.messages import Message
 from tacpipe.live.publishing import Publishers
@@ -204,9 +204,9 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     os.nice(options.nice)
     sys.setswitchinterval(SWITCH_S)
     if options.settings.realtime:
-        scheduling.realtime(scheduling.MODEL)
+        wire.realtime(wire.MODEL)
     send(connection, {"ready": engine.ready()})
-    from tacpipe.models.threads import one_thread  # torch, which the engine has loaded
+    from tacpipe.models.tensors import one_thread  # torch, which the engine has loaded
 
     with publishers, one_thread():  # once, not in each forecast
         Loop(connection, engine, publishers, wire.Blocks(options.streams)).run()

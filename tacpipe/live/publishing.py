@@ -249,7 +249,7 @@ class UdpPublisher:
             raise UsageError(f"--publish udp:{place}?{excerpt(options)}: the only option is format, json or msgpack.")
         self.dropped = 0
         self._packed = to_json if kind == "json" else _msgpack()
-        host, port = network.place("udp", place)
+        host, port = network.format_place("udp", place)
         try:
             family, *_, target = socket.getaddrinfo(host or "127.0.0.1", port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, socket.SOCK_DGRAM)

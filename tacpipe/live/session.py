@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
-from tacpipe.live import scheduling, wire
+from tacpipe.live import wire
 from tacpipe.live.settings import SessionOptions
 from tacpipe.live.wire import RecorderTap
 from tacpipe.recording import clock
@@ -129,13 +129,13 @@ class Supervisor:
         self._beginning = None
         self.tap.note(StreamNote(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
         if self.options.settings.realtime:
-            scheduling.realtime(scheduling.RECORDER)
+            wire.realtime(wire.RECORDER)
 
     def end(self) -> None:
         """End the recording: what comes until the next one begins is not predicted."""
         self._offset_ns = None
         if self.options.settings.realtime:
-            scheduling.ordinary()  # decoding and writing have no deadline
+            wire.ordinary()  # decoding and writing have no deadline
         self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[StreamNote]:

@@ -1,20 +1,27 @@
-"""Connect the recording process with the model's process: blocks as in a spool one way, lines of JSON back.
+"""Connect the recording process with the model's process, and schedule their threads in real time.
 
 The threads that read the links call `RecorderTap.put`, which never waits and never raises. Blocks that the socket does
 not accept at once wait in a queue of bounded size. When it is full, the whole queue is dropped and counted, and the
 model's process is informed. The recording loses nothing.
+
+Blocks go one way, as in a spool, lines of JSON back. The threads of both run before all ordinary programs, the recorder's
+before the model's. The priority of ``nice`` is no substitute: where the kernel groups processes by session
+(``sched_autogroup_enabled``, as on most desktops), it counts among the programs of one terminal only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import socket
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.recording import clock, spool
 from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, StreamNote
 from tacpipe.recording.station import BEGAN
@@ -161,3 +168,40 @@ class RecorderTap:
                 self._waiting.popleft()
             else:
                 self._waiting[0] = self._waiting[0][sent:]
+
+
+RECORDER, MODEL = 20, 10  # priorities: the recording never waits for the model
+
+
+def check() -> None:
+    """Raise `UsageError` where the system does not allow real-time scheduling."""
+    try:
+        _set(0, RECORDER)
+    except (OSError, AttributeError) as error:
+        raise UsageError(
+            f"--realtime: real-time scheduling is not allowed here ({error}). Run the session as root, or have "
+            f"`@realtime - rtprio {RECORDER}` in /etc/security/limits.d and this user in that group; or leave it out."
+        ) from error
+    ordinary()
+
+
+def realtime(priority: int) -> None:
+    """Have all threads of this process run before ordinary programs; without the right to, they stay as they are."""
+    for thread in _threads():
+        with contextlib.suppress(OSError):  # the thread may have ended
+            _set(thread, priority)
+
+
+def ordinary() -> None:
+    """Have all threads of this process scheduled as ever."""
+    for thread in _threads():
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _set(thread: int, priority: int) -> None:
+    os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority))
+
+
+def _threads() -> list[int]:
+    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()]

@@ -1,12 +1,19 @@
-"""Measure how well probabilities match frequencies: temperature, reliability, and detection of unknown classes.
+"""Measure how well probabilities and quantiles match frequencies: temperature, reliability, pinball loss and coverage.
 
 Temperature scaling divides scores by one number before the softmax, which changes no name (Guo, Pleiss, Sun and Weinberger,
 On calibration of modern neural networks, ICML 2017). It is fitted by the likelihood of labels that hedge as Platt's do
 (Probabilistic outputs for support vector machines, 1999): with n slides a label counts 1 - 1 / (n + 2), so that no error
 among few slides does not become certainty.
+
+The pinball loss (Koenker and Bassett, Regression quantiles, 1978) of a quantile ``q`` at a level ``p`` is ``p (y - q)``
+where the true value ``y`` lies above, else ``(1 - p) (q - y)``: least, on average, for the true quantile. Coverage is the
+fraction of true values in the band between the lowest and the highest quantile; a band is only good if it is narrow too.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -14,6 +21,7 @@ from scipy.stats import rankdata
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Ints
 from tacpipe.errors import TacpipeError
+from tacpipe.metrics import intervals
 
 BINS = 10  # equally wide bins of confidence
 SMALLEST = 1e-12  # probability
@@ -95,3 +103,154 @@ def auroc(known_scores: AnyFloats, unknown_scores: AnyFloats) -> float:
     return float(
         (ranks.sum() - len(known_scores) * (len(known_scores) + 1) / 2) / (len(known_scores) * len(unknown_scores))
     )
+
+
+def check_levels(percents: tuple[int, ...]) -> None:
+    """Raise `TacpipeError` unless levels are whole percentages that lie symmetrically about 50 and include it.
+
+    >>> check_levels((10, 50, 90))
+    """
+    ordered = tuple(sorted(set(percents)))
+    mirrored = tuple(100 - percent for percent in reversed(ordered))
+    if ordered != percents or ordered != mirrored or 50 not in ordered or len(ordered) < 3 or ordered[0] < 1:
+        listed_percents = ",".join(map(str, percents))
+        raise TacpipeError(
+            f"The quantiles {listed_percents} are not levels that lie symmetrically about 50. Give percentages "
+            f"from 1 to 99 in "
+            f"ascending order with 50 in the middle, as 10,50,90."
+        )
+
+
+def pinball(above: AnyFloats, levels: AnyFloats) -> AnyFloats:
+    """Return the loss by value and level (..., level) where the true value lies ``above`` (..., level) the quantile."""
+    return np.maximum(levels * above, (levels - 1) * above)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over the values of one recording: what adds up."""
+
+    pinball: AnyFloats  # (step, level), counts
+    below: AnyFloats  # (step, level), true values at or below the quantile
+    covered: AnyFloats  # (step,), true values in the band from the lowest to the highest quantile
+    width: AnyFloats  # (step,), of that band, counts
+    values: AnyFloats  # (step,)
+
+    @classmethod
+    def from_predictions(cls, truth: AnyFloats, predicted: AnyFloats, levels: AnyFloats) -> Sums:
+        """Return the sums over true values (value, step) of predicted quantiles (value, step, level).
+
+        ``levels`` (level,) are fractions in ascending order.
+        """
+        above = truth[..., None].astype(np.float64) - predicted
+        inside = (above[..., 0] >= 0) & (above[..., -1] <= 0)
+        return cls(
+            pinball(above, levels).sum(axis=0),
+            (above <= 0).sum(axis=0).astype(np.float64),
+            inside.sum(axis=0).astype(np.float64),
+            (predicted[..., -1].astype(np.float64) - predicted[..., 0]).sum(axis=0),
+            np.full(truth.shape[1], float(len(truth))),
+        )
+
+    def __add__(self, further: Sums) -> Sums:
+        """Return the sums over the values of both."""
+        return Sums(*(getattr(self, name) + getattr(further, name) for name in self.__dataclass_fields__))
+
+
+def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None) -> dict[str, Any]:
+    """Return the measures over recordings by step, ``t1`` …, and over all steps, ``mean``.
+
+    ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with the 95 % interval of it over
+    recordings as ``coverage_low`` and ``coverage_high``; ``width`` the band's mean; ``below_q10`` … the fraction
+    of true values at or below each quantile. ``pinball_skill`` is 1 - pinball / pinball of ``baseline``, sums of the same
+    recordings.
+    """
+    total = recordings[0]
+    for recording in recordings[1:]:
+        total = total + recording
+    measures: dict[str, Any] = {
+        "pinball": _steps(total.pinball.mean(axis=1), total.values),
+        "coverage": _steps(total.covered, total.values),
+        "width": _steps(total.width, total.values),
+    }
+    for at, percent in enumerate(percents):
+        measures[f"below_q{percent}"] = _steps(total.below[:, at], total.values)
+    if len(recordings) > 1:
+        low, high = _interval(recordings)
+        measures["coverage_low"], measures["coverage_high"] = low, high
+    if baseline is not None:
+        baseline_pinball = np.sum([recording.pinball.sum(axis=1) for recording in baseline], axis=0)
+        pinball_sums = total.pinball.sum(axis=1)
+        gains = intervals.skill(
+            np.append(pinball_sums, pinball_sums.sum()), np.append(baseline_pinball, baseline_pinball.sum())
+        )
+        measures["pinball_skill"] = _by_step(gains)
+    return measures
+
+
+def _steps(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
+    """Return sums (step,) divided by how many values each is of, by step and over all."""
+    return _by_step(np.append(sums / values, sums.sum() / values.sum()))
+
+
+def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the ends of the 95 % interval of coverage over recordings, by step and over all."""
+    covered, values = (
+        np.stack([np.append(getattr(recording, name), getattr(recording, name).sum()) for recording in recordings])
+        for name in ("covered", "values")
+    )
+    shares = intervals.share_interval(covered, values)
+    return _by_step(shares.low), _by_step(shares.high)
+
+
+def _by_step(values: AnyFloats) -> dict[str, float]:
+    """Return values (step + 1,) by their names, to 9 digits; what is not defined is left out."""
+    names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
+    return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+
+
+def most_promised(groups: int) -> float:
+    """Return the highest level that can be promised with this number of calibration groups.
+
+    >>> most_promised(4)
+    0.8
+    """
+    return groups / (groups + 1)
+
+
+def conformal_quantile(scores: AnyFloats, groups: Ints, level: float, *, promised: bool = False) -> float:
+    """Return the smallest score at or below which ``level`` of the weight lies, each group weighing the same.
+
+    Windows of a recording depend on each other, so recordings are what is exchangeable, and each counts the same however
+    long it is. Two answers are given for the quantile of scores of calibration recordings:
+
+    - **pooled** (Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA
+      2022, section 3.1, pooling CDFs): the quantile of all scores, each weighted by one over the number of scores of its
+      group. Coverage tends to the level as groups become many; with few it has no guarantee.
+    - **promised** (Lee, Barber and Willett, Distribution-free inference with hierarchical data, 2023, HCP; with one
+      score a group it is split conformal prediction, Vovk et al., Algorithmic Learning in a Random World, 2005): as many
+      groups and one more, whose scores are infinite. A score of a new exchangeable group lies at or below it with a
+      probability of at least the level, averaged over draws of all groups. With K groups no level above K / (K + 1) can
+      be promised.
+
+    ``scores`` and ``groups`` (score,) are of calibration recordings. With ``promised`` one more group of infinite scores is
+    among them; the result is infinite where the level cannot be promised. Raises `TacpipeError` without scores, for other
+    shapes, and for a level that is not between 0 and 1.
+
+    >>> conformal_quantile(np.array([1.0, 2.0, 3.0, 9.0]), np.array([0, 0, 0, 1]), 0.5)
+    3.0
+    >>> conformal_quantile(np.arange(9.0), np.arange(9), 0.9, promised=True)
+    8.0
+    """
+    if not 0 < level < 1:
+        raise TacpipeError(f"The level {level:g} is not between 0 and 1. Give one like 0.9.")
+    if scores.ndim != 1 or scores.shape != groups.shape or not len(scores):
+        raise TacpipeError(
+            f"Scores of {scores.shape} and groups of {groups.shape} have no quantile; both must be (score,), one or more."
+        )
+    _, codes = np.unique(groups, return_inverse=True)
+    sizes = np.bincount(codes)
+    order = np.argsort(scores, kind="stable")
+    weights = 1 / (sizes[codes[order]] * (len(sizes) + promised))
+    reached = np.cumsum(weights) >= level - 1e-9  # sums of as many as there are scores round
+    return float(scores[order[int(np.argmax(reached))]]) if reached.any() else float("inf")

@@ -30,7 +30,7 @@ from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s, Ints
 from tacpipe.errors import TacpipeError
 from tacpipe.models.minirocket import Rocket, with_profile
 from tacpipe.models.readout import statistics
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 
 COMPONENTS = 300  # upper limit
 PATTERNS = "patterns."  # begins the names of the tensors of patterns
@@ -127,7 +127,7 @@ class ClassDistance:
             )
         stored = {name: tensors[name] for name in NAMES}
         stored["projection"] = stored["projection"].astype(np.float64)
-        distance = cls(**stored, patterns=Rocket.from_tensors(under(PATTERNS, tensors)))
+        distance = cls(**stored, patterns=Rocket.from_tensors(tensors_under(PATTERNS, tensors)))
         components, slides = len(distance.gain), len(distance.labels)
         shapes = {
             "projection": (len(distance.centre), components),

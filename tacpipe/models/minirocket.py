@@ -24,7 +24,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int32s, Ints
 from tacpipe.errors import TacpipeError
 from tacpipe.models.readout import Readout
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 
 LENGTH = 9  # weights of a kernel
 HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
@@ -266,8 +266,8 @@ class MinirocketClassifier:
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> MinirocketClassifier:
         """Return the classifier that `to_tensors` described."""
         return cls(
-            Rocket.from_tensors(under("patterns.", tensors)),
-            Readout.from_tensors(under("readout.", tensors)),
+            Rocket.from_tensors(tensors_under("patterns.", tensors)),
+            Readout.from_tensors(tensors_under("readout.", tensors)),
             float(tensors["share"][0]),
         )
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int32s, Ints
 from tacpipe.errors import TacpipeError
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 
 ALPHAS = tuple(10.0 ** (power / 2) for power in range(-8, 5))  # against inner products that are 1 on the average
 SPREAD = 1e-5  # added to the covariance within classes, beside inner products that are 1 on the average
@@ -297,7 +297,7 @@ class StatisticsClassifier:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
         """Return the classifier that `to_tensors` described."""
-        return cls(Readout.from_tensors(under("readout.", tensors)), VIEWS[int(tensors["view"][0])])
+        return cls(Readout.from_tensors(tensors_under("readout.", tensors)), VIEWS[int(tensors["view"][0])])
 
 
 def read(x: AnyFloats, view: View = "all") -> Float32s:

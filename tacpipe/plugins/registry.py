@@ -294,7 +294,7 @@ def load_sensor(name: str) -> Any:
 
 
 def load_executor(name: str) -> Any:
-    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.executor.Executor`).
+    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.local.Executor`).
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """

@@ -23,7 +23,7 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spooled
 from tacpipe.store.store import Object, Store
 
 if TYPE_CHECKING:
@@ -61,7 +61,10 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             files[BYTES] = vars(store.put_written(copied, durable=True))
     result = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
-    provenance_entry = {**provenance.describe(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
+    provenance_entry = {
+        **provenance.describe_provenance(round(time.perf_counter() - began_s, 4)),
+        "irreplaceable": True,
+    }
     store.commit(identity, result, provenance_entry, durable=True)
     output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
     names: list[str] = []  # the name of the recording, last

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, LinkReader, StreamFault
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spooled, StreamNote
+from tacpipe.recording.spool_folders import COMPLETED
 from tacpipe.recording.station import LOST, OPENED, OVERRUN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor

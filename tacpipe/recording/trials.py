@@ -16,12 +16,10 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, sealing, spool_folders, triggers
 from tacpipe.recording.appending import NothingError
-from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import ENDED, Spool, StreamNote
-from tacpipe.recording.spool_folders import users
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import ENDED, Spool, Spooled, StreamNote
+from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, users
 from tacpipe.recording.watch import RigView
 from tacpipe.store.store import Store
 

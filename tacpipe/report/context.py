@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method
-from tacpipe.comparison.specification import TaskReport
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, TaskReport
 from tacpipe.datasets.selection import PUBLISHED
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry

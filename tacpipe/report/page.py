@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.comparison.specification import TaskReport, by_task, report_on
+from tacpipe.comparison.runs import TaskReport, by_task, report_on
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras

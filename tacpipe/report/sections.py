@@ -10,8 +10,7 @@ import numpy as np
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, grouped
-from tacpipe.comparison.specification import TaskReport
+from tacpipe.comparison.runs import MODEL, TaskReport, grouped
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, context, screen

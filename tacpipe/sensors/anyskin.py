@@ -18,10 +18,9 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.sensors import number_texts, sensor
-from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.byte_framer import ByteFramer, LineFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
-from tacpipe.sensors.text_framer import LineFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

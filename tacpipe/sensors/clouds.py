@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s
-from tacpipe.clouds import pcd, ply
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import MAGIC, Cloud, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -72,7 +72,7 @@ class Clouds(Sensor):
         points = (samples.values[0] / np.float32(self.unit_m)).astype(np.float32)
         edges = np.flatnonzero(np.diff(samples.rows)) + 1
         groups = np.split(np.arange(len(samples)), edges)
-        return [ply.packed(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
+        return [point_files.pack_ply(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
 
     def _points(self, content: bytes) -> tuple[Float32s, Bytes | None]:
         """Return the points that were seen (point, xyz), metres, and their colours (point, rgb)."""
@@ -95,5 +95,5 @@ def _parsed(content: bytes) -> tuple[Float32s, Bytes | None]:
     if content.startswith(MAGIC):
         return DepthFrame.of_bytes(content).points()
     if content.startswith(b"ply"):
-        return ply.parsed(NAMED, content)
-    return pcd.parsed(NAMED, content)
+        return point_files.parse_ply(NAMED, content)
+    return point_files.parse_pcd(NAMED, content)

@@ -19,7 +19,7 @@ from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
-from tacpipe.signals import rotations
+from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -219,13 +219,13 @@ def _matrices(states: NDArray[np.void], name: str) -> Float32s:
 def _poses(states: NDArray[np.void], name: str) -> Floats:
     """Return a pose of the end effector as position and quaternion (frame, 7)."""
     pose = _matrices(states, name).astype(np.float64)
-    return np.hstack([pose[:, :3, 3], rotations.quaternions_of(pose[:, :3, :3])])
+    return np.hstack([pose[:, :3, 3], kinematics.quaternions_of(pose[:, :3, :3])])
 
 
 def _flat(poses: Floats) -> Floats:
     """Return positions with quaternions (frame, 7) as matrices, column after column (frame, 16)."""
     matrices = np.zeros((len(poses), 4, 4))
-    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = rotations.matrices_of(poses[:, 3:]), poses[:, :3], 1
+    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = kinematics.matrices_of(poses[:, 3:]), poses[:, :3], 1
     return matrices.transpose(0, 2, 1).reshape(-1, POSE)
 
 

@@ -21,10 +21,10 @@ import numpy as np
 from tacpipe.arrays import Floats, Indices
 from tacpipe.errors import UsageError
 from tacpipe.sensors import number_texts
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Device, Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
-from tacpipe.signals import rotations
+from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -209,14 +209,14 @@ def _fields(name: str) -> list[pa.Field]:
 def _columns(name: str, numbers: Floats) -> Floats:
     """Return what an output's numbers (sample, number) are in m, rad and quaternions."""
     if name in POSES:
-        return np.hstack([numbers[:, :3] / 1000, rotations.quaternions_of_angles(np.radians(numbers[:, 3:]))])
+        return np.hstack([numbers[:, :3] / 1000, kinematics.quaternions_of_angles(np.radians(numbers[:, 3:]))])
     return np.radians(numbers) if name in ANGLES else numbers
 
 
 def _sent(name: str, columns: Floats) -> Floats:
     """Return the numbers (sample, number) that the controller sends for columns, in mm and degrees."""
     if name in POSES:
-        return np.hstack([columns[:, :3] * 1000, np.degrees(rotations.angles_of(columns[:, 3:]))])
+        return np.hstack([columns[:, :3] * 1000, np.degrees(kinematics.angles_of(columns[:, 3:]))])
     return np.degrees(columns) if name in ANGLES else columns
 
 

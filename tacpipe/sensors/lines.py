@@ -28,13 +28,12 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, line_layout, sensor
+from tacpipe.sensors.byte_framer import LineFramer, TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
-from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineSum
+from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineNumbers, LineSum, Parser, line_sums
 from tacpipe.sensors.line_layout import LineSequence as Counter
-from tacpipe.sensors.line_parser import LineNumbers, Parser, sums
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, Samples
-from tacpipe.sensors.text_framer import LineFramer, TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -130,7 +129,7 @@ class Lines(DescribedSensor):
 
     @functools.cached_property
     def _cells(self) -> tuple[LineCell, ...]:
-        return line_layout.cells(self.columns)
+        return line_layout.layout_cells(self.columns)
 
     @functools.cached_property
     def _places(self) -> dict[str, tuple[int, LineCell]]:
@@ -266,7 +265,7 @@ def _read(parser: Parser, lines: tuple[bytes, ...]) -> Read | None:
 def _summed(lines: Sequence[bytes], total: LineSum) -> list[bytes]:
     mark, begin = total.mark.encode(), total.begin.encode()
     end = mark if total.mark_summed else b""
-    totals = sums([line[len(begin) :] + end for line in lines], total).tolist()
+    totals = line_sums([line[len(begin) :] + end for line in lines], total).tolist()
     digits = f"%0{2 * total.width}X" if total.digits == "hex" else "%d"
     return [line + mark + (digits % value).encode() for line, value in zip(lines, totals, strict=True)]
 

@@ -15,8 +15,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats, Int64s, Times
 from tacpipe.sensors import layout
 from tacpipe.sensors.framing import Chunks, Pending
-from tacpipe.sensors.line_layout import LineSum
-from tacpipe.sensors.line_parser import sums
+from tacpipe.sensors.line_layout import LineSum, line_sums
 
 FEWEST = 5  # lines that a guess takes
 MOST = 1000  # lines that are looked at
@@ -135,7 +134,7 @@ def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Opt
                 total = LineSum(kind=kind, mark=mark, begin=begin, mark_summed=through)  # type: ignore[arg-type]
                 end = mark if through else ""
                 texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in parted]
-                if (sums(texts, total) == declared).mean() >= STEADY:
+                if (line_sums(texts, total) == declared).mean() >= STEADY:
                     options: Options = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
                     options["mark_summed"] = through
                     usual = {"mark": "*", "digits": "hex", "begin": "", "mark_summed": False}

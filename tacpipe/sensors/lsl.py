@@ -19,9 +19,9 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
 from tacpipe.channels.lsl import LslChannel
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

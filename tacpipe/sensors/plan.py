@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

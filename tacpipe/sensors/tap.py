@@ -20,9 +20,9 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Floats
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -20,7 +20,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
-from tacpipe.signals import rotations
+from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -208,7 +208,7 @@ class UrRtde(Sensor):
         packages["size"], packages["type"], packages["recipe"] = self.package.itemsize, DATA, 1
         packages[STAMP] = samples.t_device_ns / 1e9
         for name, block in zip(self.outputs, samples.values, strict=True):
-            wire = np.hstack([block[:, :3], rotations.vectors_of(block[:, 3:])]) if name in POSES else block
+            wire = np.hstack([block[:, :3], kinematics.vectors_of(block[:, 3:])]) if name in POSES else block
             packages[name] = wire[:, 0] if packages[name].ndim == 1 else wire
         return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
 
@@ -323,7 +323,7 @@ def _native(values: AnyArray, name: str) -> AnyArray:
     """Return an output's values (sample, channel) in this machine's order of bytes, a pose with its quaternion."""
     block = values[:, None] if values.ndim == 1 else values
     block = block.astype(bool if type_of(name) == "BOOL" else block.dtype.newbyteorder("="))
-    return np.hstack([block[:, :3], rotations.quaternions_of_vectors(block[:, 3:])]) if name in POSES else block
+    return np.hstack([block[:, :3], kinematics.quaternions_of_vectors(block[:, 3:])]) if name in POSES else block
 
 
 def _are_numbers(packages: AnyArray) -> Bools:

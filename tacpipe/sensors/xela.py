@@ -21,9 +21,9 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Counts
 from tacpipe.errors import UsageError
+from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

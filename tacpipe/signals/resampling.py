@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.rotations import continuous
+from tacpipe.signals.kinematics import continuous
 
 GAP_NS = 50_000_000  # longest time between two samples without a gap, of sensors of 20 Hz or more
 GAP_PERIODS = 2.5  # the same of slower sensors, in their periods

@@ -1,7 +1,11 @@
-"""The scene of a grasp on the simulated table: an object, what a camera sees of it, and how two fingers take it.
+"""Draw the scene of a grasp on the simulated table: an object, what a camera sees of it, and how two fingers take it.
 
 What nobody sees of it, such as the effort of the hand, is part of the scene too: it is all that a trial needs for what
 the fingers then measure.
+
+As in the letter's protocol, the line between the fingers goes through a point shifted along the first principal axis of what
+the camera sees, half as deep as the body is there. Of the level lines through it one is taken along which both fingers stay
+within a cone of friction about the normals.
 """
 
 from __future__ import annotations
@@ -10,14 +14,156 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tacpipe.arrays import Floats
+from tacpipe.arrays import Bools, Floats
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
-from tacpipe.simulation import antipodal, depth_camera, fingertip_sp, household, pinch
-from tacpipe.simulation.bodies import Ellipsoid
+from tacpipe.simulation import depth_camera, fingertip_sp, pinch
+from tacpipe.simulation.bodies import Bow, Box, Ellipsoid, Frustum, Shape
 from tacpipe.simulation.depth_camera import Placed
-from tacpipe.simulation.household import Thing
+
+FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
+MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}
+SHARES = (0.6, 0.2, 0.2)  # fraction of the objects per entry of MODULI_PA
+TAPER, NARROW = (
+    (0.08, 0.22),
+    0.4,
+)  # slope of cones within friction, and smallest fraction of the radius at the top
+REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
+SPHERES_M = (0.012, 0.058)  # radii of those
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A named object, its surface, and how readily it gives way: one over Young's modulus, 1/Pa."""
+
+    name: str
+    family: str
+    shape: Shape
+    stiffness: str
+
+    @property
+    def compliance_1_pa(self) -> float:
+        """One over Young's modulus, 1/Pa; 0 if rigid."""
+        return 1 / MODULI_PA[self.stiffness]
+
+
+def draw_household_thing(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
+    """Return an object of a family as ``rng`` draws it, named by the family and its ``number``, as in "cone-03".
+
+    ``stiffness`` is one of `MODULI_PA`, or mixed. Raises `TacpipeError` for an unknown family or stiffness.
+    """
+    if family not in FAMILIES:
+        raise TacpipeError(f"There is no family {family!r}; known are {', '.join(FAMILIES)}.")
+    if stiffness not in (*MODULI_PA, "mixed"):
+        raise TacpipeError(f"There is no stiffness {stiffness!r}; known are mixed, {', '.join(MODULI_PA)}.")
+    drawn = str(rng.choice(list(MODULI_PA), p=SHARES))
+    shape = _shape(family, rng)
+    return Thing(f"{family}-{number:02d}", family, shape, drawn if stiffness == "mixed" else stiffness)
+
+
+def _shape(family: str, rng: np.random.Generator) -> Shape:
+    """Return a body whose least width is some 20 mm and whose greatest 120 mm."""
+
+    def between(*limits_mm: tuple[float, float]) -> list[float]:
+        return [0.001 * float(rng.uniform(*limits)) for limits in limits_mm]
+
+    if family == "box":
+        return Box(np.array(between((15, 35), (22, 50), (35, 60))))
+    if family == "cylinder":
+        radius, half = between((20, 45), (25, 60))
+        return Frustum(radius, radius, half)
+    if family == "sphere":
+        return Ellipsoid(np.repeat(between((27, 58)), 3))
+    if family == "ellipsoid":
+        return Ellipsoid(np.array(between((18, 32), (26, 45), (38, 60))))
+    if family == "cone":
+        bottom, half = between((28, 50), (25, 60))
+        return Frustum(bottom, max(NARROW * bottom, bottom - 2 * half * float(rng.uniform(*TAPER))), half)
+    tube, arc = between((11, 19), (36, 44))
+    return Bow(arc, tube, float(rng.uniform(1.2, 2.6)))
+
+
+OPENING_M = (0.02, 0.12)  # distance between the fingers
+CONE_RAD = np.deg2rad(15.0)  # largest angle between closing and a normal
+MARGIN_M = 0.004  # least way from a contact to an edge
+DIRECTIONS = 36  # number of lines that are tried
+LEAN_RAD = np.deg2rad(4.0)  # standard deviation of their angle to the table
+PITCH_RAD = np.deg2rad(20.0)  # largest angle of the approach to the vertical, about the closing axis
+FAR_M = 0.2  # distance from which the fingers approach
+
+
+def antipodal_grasps(
+    placed: Placed, seen_m: Floats, up: Floats, shift: float, rng: np.random.Generator, *, central: bool = False
+) -> Grasp | None:
+    """Return a grasp of a body that is seen at points (point, xyz), metres; None if no line suits.
+
+    ``shift`` is the largest fraction of half the cloud's length by which the point is shifted; ``central`` takes the
+    body's origin instead. Finger 1, the one at ``g1``, comes from the camera's left, as on the published rig.
+    """
+    through = placed.origin_m if central else _inside(placed, _shifted(seen_m, shift, rng))
+    if through is None:
+        return None
+    ways = _level(up, rng)
+    start, stop = (through - FAR_M * side * ways for side in (1, -1))
+    first = start + placed.hit(start, ways)[:, None] * ways
+    second = stop - placed.hit(stop, -ways)[:, None] * ways
+    suitable = np.flatnonzero(_suitable(placed, first, second))
+    if not len(suitable):
+        return None
+    chosen = int(rng.choice(suitable))
+    closing, pitch = ways[chosen], rng.uniform(-PITCH_RAD, PITCH_RAD)
+    down = -up + (up @ closing) * closing
+    down /= np.linalg.norm(down)
+    approach = np.cos(pitch) * down + np.sin(pitch) * np.cross(closing, down)
+    return Grasp(first[chosen], second[chosen], np.column_stack([approach, closing, np.cross(approach, closing)]))
+
+
+def _shifted(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
+    """Return the seen point nearest to one on the first principal axis (xyz), metres."""
+    centre = seen_m.mean(axis=0)
+    axis = np.linalg.eigh(np.cov(seen_m.T))[1][:, -1]
+    half = np.ptp(seen_m @ axis) / 2
+    target = centre + shift * half * rng.uniform(-1, 1) * axis
+    return np.asarray(seen_m[np.argmin(((seen_m - target) ** 2).sum(axis=1))])
+
+
+def _inside(placed: Placed, seen_m: Floats) -> Floats | None:
+    """Return the point halfway through the body along the camera's ray to ``seen_m`` (xyz), metres, None if it misses."""
+    ray = seen_m / np.linalg.norm(seen_m)
+    near = float(placed.hit(np.zeros((1, 3)), ray[None])[0])
+    back = near + 2 * placed.shape.bound_m + FAR_M
+    far = back - float(placed.hit((back * ray)[None], -ray[None])[0])
+    if not np.isfinite(near):
+        return None
+    hollow = far - near > 2 * placed.shape.bound_m
+    return None if hollow else np.asarray((near + far) / 2 * ray)
+
+
+def _level(up: Floats, rng: np.random.Generator) -> Floats:
+    """Return unit vectors nearly level with the table (direction, xyz), all towards positive x."""
+    side = np.cross(up, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    angle = np.pi * (np.arange(DIRECTIONS) + rng.random()) / DIRECTIONS - np.pi / 2
+    lean = rng.normal(0, LEAN_RAD, DIRECTIONS)
+    level = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(up, side))
+    ways = np.cos(lean)[:, None] * level + np.outer(np.sin(lean), up)
+    return np.asarray(ways * np.where(ways[:, :1] < 0, -1.0, 1.0))
+
+
+def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
+    """Return which pairs of contacts (pair, xyz) fingers of the hand can hold (pair,)."""
+    with np.errstate(invalid="ignore"):
+        gap = second_m - first_m
+        opening = np.linalg.norm(gap, axis=1)
+        closing = gap / opening[:, None]
+    suitable = np.isfinite(opening) & (opening >= OPENING_M[0]) & (opening <= OPENING_M[1])
+    for at_m, sign in ((first_m, -1), (second_m, 1)):
+        rows = np.flatnonzero(suitable)
+        along = sign * (placed.normal(at_m[rows]) * closing[rows]).sum(axis=1)
+        suitable[rows] &= (along >= np.cos(CONE_RAD)) & (placed.shape.margin_m(placed.inward(at_m[rows])) >= MARGIN_M)
+    return np.asarray(suitable)
+
 
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera
@@ -72,11 +218,11 @@ class Readings:
 
 def families(rig: GraspRig) -> tuple[str, ...]:
     """Return the families that a rig grasps, raising `TacpipeError` for an unknown one."""
-    names = household.FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
-    unknown = [name for name in names if name not in household.FAMILIES]
+    names = FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
+    unknown = [name for name in names if name not in FAMILIES]
     if unknown:
         raise TacpipeError(
-            f"There is no family {unknown[0]!r}; known are {', '.join(household.FAMILIES)}, or all for all of them."
+            f"There is no family {unknown[0]!r}; known are {', '.join(FAMILIES)}, or all for all of them."
         )
     return ("sphere",) if rig.spheres else names
 
@@ -85,12 +231,12 @@ def draw_thing(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
     """Return what trial ``index`` grasps: the same object whichever others there are, but for spheres of all sizes."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
-        drawn = household.draw_thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
-        return replace(drawn, name="spheres", shape=Ellipsoid(np.full(3, household.REFERENCE_M)))
+        drawn = draw_household_thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
+        return replace(drawn, name="spheres", shape=Ellipsoid(np.full(3, REFERENCE_M)))
     names = families(rig)
     number, kind = divmod(index % (len(names) * rig.objects), len(names))
-    rng = np.random.default_rng([seed, THINGS, household.FAMILIES.index(names[kind]), number])
-    return household.draw_thing(rng, names[kind], number + 1, rig.stiffness)
+    rng = np.random.default_rng([seed, THINGS, FAMILIES.index(names[kind]), number])
+    return draw_household_thing(rng, names[kind], number + 1, rig.stiffness)
 
 
 def sensors(seed: int) -> fingertip_sp.Sensors:
@@ -103,7 +249,7 @@ def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
     thing = draw_thing(seed, index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
     rests = thing.shape.rests()
-    scale = float(rng.uniform(*household.SPHERES_M)) / household.REFERENCE_M if rig.spheres else 1.0
+    scale = float(rng.uniform(*SPHERES_M)) / REFERENCE_M if rig.spheres else 1.0
     for _ in range(TRIES):
         up, height_m = depth_camera.camera(rng, CAMERA_M, TILT_RAD)
         pose = rests[0 if rig.one_pose else int(rng.integers(len(rests)))]
@@ -113,7 +259,7 @@ def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
         if len(depth_m) < LEAST_POINTS:
             continue
         points = depth_camera.measured(direction, depth_m, rig.noise_scale, rng)
-        grasp = antipodal.grasped(placed, points.astype(np.float64), up, rig.shift, rng, central=rig.spheres)
+        grasp = antipodal_grasps(placed, points.astype(np.float64), up, rig.shift, rng, central=rig.spheres)
         if grasp is None:
             continue
         colours = depth_camera.painted(placed.inward(direction * depth_m[:, None]), rng)
@@ -134,7 +280,7 @@ def read_sensors(hand: fingertip_sp.Sensors, scene: GraspScene, t_ns: int, rig: 
 
 def _scaled(scene: GraspScene, scale: float) -> GraspScene:
     """Return a scene with all lengths times ``scale``: the camera sees the same, only nearer and smaller or the reverse."""
-    thing = replace(scene.thing, shape=Ellipsoid(np.full(3, household.REFERENCE_M * scale)))
+    thing = replace(scene.thing, shape=Ellipsoid(np.full(3, REFERENCE_M * scale)))
     placed = Placed(thing.shape, scene.placed.rotation, scene.placed.origin_m * scale)
     grasp = Grasp(scene.grasp.g1_m * scale, scene.grasp.g2_m * scale, scene.grasp.wrist)
     cloud = Cloud((scene.cloud.points_m * scale).astype(np.float32), scene.cloud.colours)

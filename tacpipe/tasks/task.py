@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
-    from tacpipe.comparison.specification import TaskReport
+    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.live.task import LiveTask
+    from tacpipe.live.settings import LiveTask
     from tacpipe.plugins.stage import AnyStage, Requirements, Result
     from tacpipe.tasks.recordings import OpenedChain
 

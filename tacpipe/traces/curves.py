@@ -1,4 +1,4 @@
-"""The curves of a stream: its channels by what they measure, with the names and units that a plot shows."""
+"""Return the curves of a stream, channels with names and units for plots, and the paths of positions through space."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import arm
+from tacpipe.channels.arm import METRES, ORIENTATION, POSITION
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,12 +39,12 @@ class Curves:
         return name if self.unit in _NO_UNIT else f"{name} ({self.unit})"
 
 
-def of_streams(streams: Mapping[str, pa.Table]) -> list[Curves]:
+def curves_of_streams(streams: Mapping[str, pa.Table]) -> list[Curves]:
     """Return the curves of all streams with times, stream by stream, but for tactile channels, labels and clocks."""
-    return [curves for stream, table in streams.items() for curves in of_table(stream, table)]
+    return [curves for stream, table in streams.items() for curves in curves_of_table(stream, table)]
 
 
-def of_table(stream: str, table: pa.Table) -> list[Curves]:
+def curves_of_table(stream: str, table: pa.Table) -> list[Curves]:
     """Return the curves of a stream, one for each quantity and unit in the order of its columns; see `of_streams`.
 
     Several vibration readings a row are one curve at their own rate, a finger.
@@ -106,3 +107,57 @@ def _drawn(field: pa.Field, about: Mapping[str, str]) -> bool:
     number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
     clock = field.name == TIME or field.name.startswith("t_") or field.name in ("seq", "device_seq")
     return number and not clock and about.get("quantity", "") not in _NO_CURVES
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path in metres, without the rows whose position is not finite."""
+
+    name: str
+    t_ns: Times  # (time,)
+    position_m: Floats  # (time, xyz)
+    quaternion: Floats | None = None  # (time, xyzw), where the stream has one orientation
+
+
+def paths_of_streams(streams: Mapping[str, pa.Table]) -> list[Path]:
+    """Return the paths of all streams whose rows are moments, but not of clouds, whose rows are points."""
+    return [path for stream, table in streams.items() for path in paths_of_table(stream, table)]
+
+
+def paths_of_table(stream: str, table: pa.Table) -> list[Path]:
+    """Return the paths of a stream: one for each position in m, cm or mm with the components x, y and z."""
+    if TIME not in table.column_names or not table.num_rows:
+        return []
+    t_ns = table.column(TIME).to_numpy()
+    if 2 * len(np.unique(t_ns)) < len(t_ns):  # a cloud's points share a stamp
+        return []
+    positions = _vectors(table, POSITION, "xyz")
+    turned = _vectors(table, ORIENTATION, "xyzw")
+    quaternion = matrix(table, [field.name for field in next(iter(turned.values()))]) if len(turned) == 1 else None
+    paths = []
+    for shared, fields in positions.items():
+        scale = [METRES.get(described(field).get("unit", "m")) for field in fields]
+        if None in scale:
+            continue
+        place_m = matrix(table, [field.name for field in fields]) * np.array(scale, dtype=np.float64)
+        valid = np.isfinite(place_m).all(axis=1)
+        if quaternion is not None:
+            valid &= np.isfinite(quaternion).all(axis=1) & (np.abs(quaternion).sum(axis=1) > 0)
+        if valid.any():
+            part = f"{stream} {shared.split('_')[0]}".strip() if len(positions) > 1 else stream or "position"
+            paths.append(Path(part, t_ns[valid], place_m[valid], None if quaternion is None else quaternion[valid]))
+    return paths
+
+
+def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Field]]:
+    """Return the columns of each vector of a quantity that has all of ``parts``, in their order."""
+    by_name: dict[str, dict[str, pa.Field]] = {}
+    for field in table.schema:
+        if described(field).get("quantity") == quantity:
+            shared = arm.of_name(field.name)[1]
+            by_name.setdefault(shared, {})[arm.component(field)] = field
+    return {
+        name: [fields_by_part[part] for part in parts]
+        for name, fields_by_part in by_name.items()
+        if set(fields_by_part) == set(parts)
+    }

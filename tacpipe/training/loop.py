@@ -28,7 +28,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sync_folder, write_whole
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 from tacpipe.training import following
 from tacpipe.training.following import Followers, TrainedNetwork
 from tacpipe.training.following import Line as Line
@@ -246,10 +246,10 @@ class _TrainingState:
         if saved is None:
             return
         tensors, state = saved
-        self.model.load_state_dict(under("model.", tensors))
-        self.best = under("best.", tensors)
+        self.model.load_state_dict(tensors_under("model.", tensors))
+        self.best = tensors_under("best.", tensors)
         slots: dict[int, dict[str, Tensor]] = {}
-        for name, value in under("adam.", tensors).items():
+        for name, value in tensors_under("adam.", tensors).items():
             slot, tensor = name.split(".", 1)
             slots.setdefault(int(slot), {})[tensor] = value
         self.optimiser.load(slots)

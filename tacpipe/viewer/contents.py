@@ -17,10 +17,9 @@ from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
 from tacpipe.printable import plain
 from tacpipe.signals import contact
-from tacpipe.traces import curves, paths, spans, taxels
+from tacpipe.traces import curves, spans, taxels
 from tacpipe.traces import predictions as forecasts
-from tacpipe.traces.curves import TIME, Curves, described
-from tacpipe.traces.paths import Path
+from tacpipe.traces.curves import TIME, Curves, Path, described
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
@@ -271,13 +270,13 @@ def _of_tables(
         name,
         attributes,
         {stream: (table.num_rows, None if stream in clouds else rate_hz(table)) for stream, table in streams.items()},
-        curves.of_streams(plotted),
-        curves.of_streams(truth),
+        curves.curves_of_streams(plotted),
+        curves.curves_of_streams(truth),
         touched,
         marks,
         missing,
         happened,
-        paths.of_streams(plotted),
+        curves.paths_of_streams(plotted),
         [points for stream, table in clouds.items() for points in _points(stream, table)],
         [frames for stream, table in streams.items() for frames in _frames(stream, table)],
         ahead,

@@ -13,8 +13,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Floats, Indices, Times
 from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
-from tacpipe.traces.curves import Curves
-from tacpipe.traces.paths import Path
+from tacpipe.traces.curves import Curves, Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels

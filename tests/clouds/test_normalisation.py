@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from tacpipe.clouds import normalisation
+from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.normalisation import Extent
+from tacpipe.clouds.geometry import Extent
 
 SEEDS = st.integers(0, 2**32 - 1)
 STILL = np.eye(3)
@@ -30,7 +30,7 @@ def turned(seed: int) -> np.ndarray:
 
 def normalised(method: str, cloud: Cloud, rotation: np.ndarray = STILL, wrist: np.ndarray | None = None) -> np.ndarray:
     points = cloud.points_m.astype(float) @ rotation.T
-    scaled: np.ndarray = normalisation.normalised(method, points, Extent.of(cloud), rotation, wrist)
+    scaled: np.ndarray = geometry.normalised(method, points, Extent.of(cloud), rotation, wrist)
     return scaled
 
 
@@ -104,18 +104,18 @@ def test_colours_are_scaled_by_their_own_extremes_or_by_black_and_white() -> Non
     colours = np.array([[0, 100, 7], [51, 200, 7], [255, 150, 7]], np.uint8)
     extent = Extent.of(Cloud(np.eye(3, dtype=np.float32), colours))
     shares = colours / 255.0
-    minmax = normalisation.colours_normalised("minmax", shares, extent)
+    minmax = geometry.colours_normalised("minmax", shares, extent)
     assert minmax.tolist() == [pytest.approx(row, abs=1e-12) for row in ([-1, -1, -1], [-0.6, 1, -1], [1, 0, -1])]
-    by_range = normalisation.colours_normalised("wrist", shares, extent)
+    by_range = geometry.colours_normalised("wrist", shares, extent)
     assert by_range[:, 0].tolist() == pytest.approx([-1, -0.6, 1])
     for method in ("none", "sphere"):
-        assert normalisation.colours_normalised(method, shares, extent) is shares
+        assert geometry.colours_normalised(method, shares, extent) is shares
 
 
 @settings(max_examples=30)
 @given(SEEDS, st.sampled_from([0.0, 45.0, 90.0, 180.0]))
 def test_random_turns_are_rotations_about_x_then_y_then_z_within_their_angles(seed: int, largest_deg: float) -> None:
-    rotation = normalisation.random_rotation(np.random.default_rng(seed), largest_deg)
+    rotation = geometry.random_rotation(np.random.default_rng(seed), largest_deg)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
     x, y, z = np.radians(np.random.default_rng(seed).uniform(-largest_deg, largest_deg, 3))

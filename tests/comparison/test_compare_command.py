@@ -16,8 +16,7 @@ import pytest
 from tacpipe.cli import compare
 from tacpipe.cli.compare import Compared
 from tacpipe.comparison import engine, runs
-from tacpipe.comparison.runs import ComparedRun, Question
-from tacpipe.comparison.specification import report_on
+from tacpipe.comparison.runs import ComparedRun, Question, report_on
 from tacpipe.engine import pipeline
 from tacpipe.metrics import headline
 from tests import older

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 from tacpipe.comparison import engine
-from tacpipe.comparison.runs import grouped, separate
-from tacpipe.comparison.specification import report_on
+from tacpipe.comparison.runs import grouped, report_on, separate
 from tacpipe.metrics import intervals, pairing
 from tests.comparison.comparison_fakes import MEAN, QUESTION, run, sums
 

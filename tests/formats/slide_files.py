@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tacpipe.signals.array_order import scramble
+from tacpipe.formats.roboskin import scramble
 
 ARM = {
     "cp": "posx,posy,posz,ox,oy,oz, ow",

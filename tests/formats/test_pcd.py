@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tacpipe.clouds import pcd
+from tacpipe.clouds import point_files
 from tacpipe.errors import TacpipeError
 from tests.formats.grasp_files import colours, header, packed, points_m
 
@@ -37,7 +37,7 @@ def test_a_cloud_that_open3d_wrote_is_read_with_its_colours(
     values.colors = open3d.utility.Vector3dVector(rgb / 255)
     path = tmp_path_factory.mktemp("cloud") / "cloud.pcd"
     assert open3d.io.write_point_cloud(path, values, write_ascii=text)
-    result = pcd.read(path)
+    result = point_files.read(path)
     np.testing.assert_allclose(result.points_m, points, rtol=0, atol=1e-9 if text else 0)
     np.testing.assert_array_equal(np.asarray(result.colours), rgb)
 
@@ -50,7 +50,7 @@ def test_the_published_layout_is_read_as_open3d_reads_it(
     points, rgb = cloud
     path = tmp_path_factory.mktemp("cloud") / "cloud.pcd"
     write(path, header(len(points)).encode() + packed(points, rgb) + bytes(3916))
-    result, theirs = pcd.read(path), open3d.io.read_point_cloud(path)
+    result, theirs = point_files.read(path), open3d.io.read_point_cloud(path)
     np.testing.assert_array_equal(result.points_m, np.asarray(theirs.points).astype(np.float32))
     np.testing.assert_array_equal(np.asarray(result.colours), np.rint(np.asarray(theirs.colors) * 255))
     np.testing.assert_array_equal(result.points_m, points)
@@ -64,7 +64,7 @@ def test_fields_stand_in_any_order_and_further_ones_are_skipped(tmp_path: Path) 
         points[axis] = points_m()[:, place]
     points["rgb"], points["n"], points["_"] = 0xAB_12_34_56, np.nan, 7  # the highest byte is no colour
     head = header(50, FIELDS="n rgb z _ y x", SIZE="4 4 8 1 8 8", TYPE="F U F U F F", COUNT="3 1 1 2 1 1", VERSION=".7")
-    result = pcd.read(write(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
+    result = point_files.read(write(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
     np.testing.assert_array_equal(result.points_m, points_m())
     assert np.asarray(result.colours).tolist() == [[0x12, 0x34, 0x56]] * 50
 
@@ -73,14 +73,14 @@ def test_lines_of_text_are_points_and_colours_are_the_bits_of_their_float(tmp_pa
     bits = np.array([0x00FF8001, 0x0000007F], np.uint32).view(np.float32)
     rows = [f"{2 * row}.5 -1e-2 3 {float(value):.9g} 4 5" for row, value in enumerate(bits)]
     head = header(2, "ascii", FIELDS="x y z rgb w", SIZE="4 4 4 4 4", TYPE="F F F F F", COUNT="1 1 1 1 2")
-    result = pcd.read(write(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
+    result = point_files.read(write(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
     np.testing.assert_allclose(result.points_m, [(0.5, -0.01, 3), (2.5, -0.01, 3)])
     assert np.asarray(result.colours).tolist() == [[255, 128, 1], [0, 0, 127]]
 
 
 def test_a_cloud_without_rgb_has_no_colours_and_count_may_be_left_out(tmp_path: Path) -> None:
     head = header(50, FIELDS="x y z", SIZE="4 4 4", TYPE="F F F", COUNT="")
-    result = pcd.read(write(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
+    result = point_files.read(write(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
     assert result.colours is None
     np.testing.assert_array_equal(result.points_m, points_m())
 
@@ -127,7 +127,7 @@ LINE = "1 2 3 0\n"
 def test_what_is_no_cloud_or_not_whole_is_refused_with_the_file(tmp_path: Path, content: bytes, value: str) -> None:
     path = write(tmp_path / "cloud.pcd", content)
     with pytest.raises(TacpipeError, match=rf"cloud\.pcd.*{value}"):
-        pcd.read(path)
+        point_files.read(path)
 
 
 def test_points_that_are_not_finite_are_counted_and_the_first_is_named(tmp_path: Path) -> None:
@@ -135,12 +135,12 @@ def test_points_that_are_not_finite_are_counted_and_the_first_is_named(tmp_path:
     points[[7, 31], [0, 2]] = np.nan, np.inf
     path = write(tmp_path / "cloud.pcd", header(50).encode() + packed(points, colours()))
     with pytest.raises(TacpipeError, match=r"2 of 50 points.*point 7"):
-        pcd.read(path)
+        point_files.read(path)
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match=r"cloud\.pcd"):
-        pcd.read(tmp_path / "cloud.pcd")
+        point_files.read(tmp_path / "cloud.pcd")
 
 
 @settings(max_examples=100, deadline=None)
@@ -153,6 +153,6 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(
         content[place] = data.draw(st.integers(0, 255))
     path = write(tmp_path_factory.mktemp("cloud") / "cloud.pcd", bytes(content[: data.draw(st.integers(0, 1100))]))
     try:
-        assert len(pcd.read(path)) > 0
+        assert len(point_files.read(path)) > 0
     except TacpipeError as error:
         assert "cloud.pcd" in str(error)

@@ -10,9 +10,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.roboskin import Params, discover, roboskin
+from tacpipe.formats.roboskin import Params, discover, roboskin, scramble, unscramble
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.signals.array_order import scramble, unscramble
 from tests.formats.slide_files import touched, write_roboskin
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))

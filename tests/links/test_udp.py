@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links import udp
+from tacpipe.links import network
 from tacpipe.links.link import OLDEST_NS, Arrivals, LinkLostError
 from tests.links import peers
 from tests.links.peers import Listened, Quiet, open_address
@@ -34,14 +34,14 @@ def free_port() -> int:
 def stamping() -> Iterator[None]:
     """A kernel that stamps what arrives: it begins to some time after the first socket asks, later where it is busy."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        asking.setsockopt(socket.SOL_SOCKET, udp.STAMPS, 1)
+        asking.setsockopt(socket.SOL_SOCKET, network.STAMPS, 1)
         asking.bind(("127.0.0.1", 0))
         late = True
         while late:
             asking.sendto(b"", asking.getsockname())
             time.sleep(0.01)
             read_s = time.time()
-            _, ((_, _, stamp),), _, _ = asking.recvmsg(1, udp.ROOM)
+            _, ((_, _, stamp),), _, _ = asking.recvmsg(1, network.ROOM)
             seconds, nanoseconds = struct.unpack("@ll", stamp)
             late = seconds + nanoseconds / 1e9 > read_s
         yield
@@ -70,7 +70,7 @@ def test_a_datagram_is_stamped_when_it_came_and_not_when_it_was_read() -> None:
 
 
 def test_datagrams_that_the_kernel_drops_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(udp, "QUEUE", 4096)
+    monkeypatch.setattr(network, "QUEUE", 4096)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         port = free_port()
         link = open_address(f"udp::{port}", Quiet())
@@ -169,13 +169,13 @@ class Flooded(socket.socket):
         self.queued -= 1
         self.clocks.now_ns += 700
         stamp = struct.pack("@ll", *divmod(self.clocks.now_ns + WALL_NS, 1_000_000_000))
-        return str(self.clocks.now_ns).encode(), [(socket.SOL_SOCKET, udp.STAMPS, stamp)], 0, None
+        return str(self.clocks.now_ns).encode(), [(socket.SOL_SOCKET, network.STAMPS, stamp)], 0, None
 
 
 def test_datagrams_that_come_while_others_are_fetched_bear_their_own_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
     with Flooded(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.clocks = Clocks(monkeypatch, itertools.repeat(0))
-        link = udp.UdpLink("flood", port, prompt=True)
+        link = network.UdpLink("flood", port, prompt=True)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
             port.bind(("127.0.0.1", 0))
             device.sendto(b"", port.getsockname())  # The datagram makes the port ready
@@ -258,7 +258,7 @@ def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hos
     names = {"a": "192.0.2.1", "b": "192.0.2.2"}
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.queued = [(names[host], host.encode()) for host in "abab"]
-        link = udp.UdpLink("crowd", port, prompt=True, sender=sender)
+        link = network.UdpLink("crowd", port, prompt=True, sender=sender)
         datagrams = link._queued()
 
         assert b"".join(data for _, data in datagrams).decode() == hosts
@@ -268,10 +268,10 @@ def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hos
 
 def test_a_flood_is_left_to_the_next_read() -> None:
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
-        port.queued = [("192.0.2.1", b"x")] * (udp.MOST_QUEUED + 10)
-        link = udp.UdpLink("flood", port, prompt=True)
+        port.queued = [("192.0.2.1", b"x")] * (network.MOST_QUEUED + 10)
+        link = network.UdpLink("flood", port, prompt=True)
 
-        assert [len(link._queued()), len(link._queued())] == [udp.MOST_QUEUED, 10]
+        assert [len(link._queued()), len(link._queued())] == [network.MOST_QUEUED, 10]
         link.close()
 
 

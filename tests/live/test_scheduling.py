@@ -7,7 +7,7 @@ import os
 import pytest
 
 from tacpipe.errors import UsageError
-from tacpipe.live import scheduling
+from tacpipe.live import wire
 
 
 def test_a_system_that_does_not_allow_it_is_named_before_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -16,9 +16,9 @@ def test_a_system_that_does_not_allow_it_is_named_before_the_session(monkeypatch
 
     monkeypatch.setattr(os, "sched_setscheduler", refused)
     with pytest.raises(UsageError, match="rtprio 20"):
-        scheduling.check()
-    scheduling.realtime(scheduling.MODEL)  # a process whose rights ended meanwhile goes on as ever
-    scheduling.ordinary()
+        wire.check()
+    wire.realtime(wire.MODEL)  # a process whose rights ended meanwhile goes on as ever
+    wire.ordinary()
 
 
 def test_all_threads_are_set_and_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,7 +28,7 @@ def test_all_threads_are_set_and_set_back(monkeypatch: pytest.MonkeyPatch) -> No
         set_to[thread] = policy, param.sched_priority
 
     monkeypatch.setattr(os, "sched_setscheduler", noted)
-    scheduling.realtime(scheduling.RECORDER)
-    assert set(set_to.values()) == {(os.SCHED_RR, scheduling.RECORDER)} and os.getpid() in set_to
-    scheduling.ordinary()
+    wire.realtime(wire.RECORDER)
+    assert set(set_to.values()) == {(os.SCHED_RR, wire.RECORDER)} and os.getpid() in set_to
+    wire.ordinary()
     assert set(set_to.values()) == {(os.SCHED_OTHER, 0)}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tacpipe.channels import biotac_sp
-from tacpipe.clouds import ply
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError, UsageError
@@ -145,7 +145,7 @@ def test_a_cloud_comes_as_points_as_a_file_of_the_folder_or_from_the_request_bef
 ) -> None:
     cloud = handmade.cloud(3)
     assert cloud.colours is not None
-    (tmp_path / "egg.ply").write_bytes(ply.packed(cloud.points_m, cloud.colours))
+    (tmp_path / "egg.ply").write_bytes(point_files.pack_ply(cloud.points_m, cloud.colours))
     np.savez(tmp_path / "egg.npz", points_m=cloud.points_m, colours=cloud.colours)
     session = Session(models["tree-ensemble"], folder=tmp_path)
     first = session.ask(request(cloud)).touch

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import tacpipe
-from tacpipe.clouds import ply
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.live.preparation import free_ports
@@ -38,7 +38,7 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
     name = sorted(recordings.recordings)[0]
     cloud, grasp = Cloud.of(recordings[name].table("cloud")), Grasp.of(recordings[name].table("grasp"))
     (lab.folder / "clouds").mkdir()
-    (lab.folder / "clouds" / "cup.ply").write_bytes(ply.packed(cloud.points_m, cloud.colours))
+    (lab.folder / "clouds" / "cup.ply").write_bytes(point_files.pack_ply(cloud.points_m, cloud.colours))
     (port,) = free_ports(1)
     options = f'{{ folder = "{lab.folder / "clouds"}" }}'
     (lab.folder / "rig.toml").write_text(live.stream("requests", "grasps", f"udp:127.0.0.1:{port}", options))

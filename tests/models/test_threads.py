@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from threadpoolctl import ThreadpoolController
 
-from tacpipe.models.threads import one_thread
+from tacpipe.models.tensors import one_thread
 
 
 def test_products_of_matrices_have_one_thread_in_the_block_and_as_many_as_before_after_it() -> None:

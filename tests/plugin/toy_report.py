@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
-from tacpipe.comparison.specification import TaskReport
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question, TaskReport
 from tacpipe.metrics.pairing import Measure
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tacpipe.clouds import files as cloud_files
-from tacpipe.clouds import pcd, ply
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.codecs import codec
 from tacpipe.codecs.measures import Moments
@@ -37,7 +37,7 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import hid
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
-from tacpipe.recording import rig, spool, spool_folders, spooled
+from tacpipe.recording import rig, spool, spool_folders
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
@@ -69,8 +69,8 @@ def targets() -> dict[str, Target]:
         Target("params", _params, lambda: [(HERE / "params.yaml").read_bytes(), b"synchronize: {rate_hz: 50}\n"]),
         Target("rig", _rig, lambda: [path.read_bytes() for path in sorted((HERE / "rigs").glob("*.toml"))]),
         Target("spool", _spool, _spools),
-        Target("pcd", lambda data: pcd.parsed(NAMED, data), _pcds),
-        Target("ply", lambda data: ply.parsed(NAMED, data), _plys),
+        Target("pcd", lambda data: point_files.parse_pcd(NAMED, data), _pcds),
+        Target("ply", lambda data: point_files.parse_ply(NAMED, data), _plys),
         Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
         Target("report-descriptor", hid.parse_report_descriptor, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
@@ -155,7 +155,7 @@ def _spool(data: bytes) -> object:
     headed = data[:1] == b"\1"
     _write_input("spool/header.json", data[1:] if headed else json.dumps(HEADER).encode())
     _write_input("spool/bytes", _spools()[0][1:] if headed else data[1:])
-    read_spool = spooled.Spooled(_folder() / "spool")
+    read_spool = spool.Spooled(_folder() / "spool")
     read = list(read_spool.blocks())
     for _, block in read:
         if isinstance(block, Chunks):
@@ -188,10 +188,10 @@ def _pcds() -> list[bytes]:
 @functools.cache
 def _plys() -> list[bytes]:
     points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
-    full_file = ply.packed(points, colours)
+    full_file = point_files.pack_ply(points, colours)
     text = full_file[: full_file.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
     rows = "".join(f"{x:g} {y:g} {z:g} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(points, colours, strict=True))
-    return [full_file, ply.packed(points, None), text + rows.encode()]
+    return [full_file, point_files.pack_ply(points, None), text + rows.encode()]
 
 
 @functools.cache

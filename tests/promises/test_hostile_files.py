@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.clouds import files as cloud_files
-from tacpipe.clouds import pcd, ply
+from tacpipe.clouds import point_files
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.formats import csv_table
 from tacpipe.io import memory, parquet_claims
@@ -217,7 +217,7 @@ def test_sizes_of_compressed_points_that_lie_are_refused(
 def test_points_that_a_ply_file_only_claims_are_refused(tmp_path: Path, points: str, form: str) -> None:
     content = f"ply\nformat {form} 1.0\nelement vertex {points}\n{XYZ}end_header\n1 2 3\n".encode()
     check_refusal(cloud(tmp_path, "a.ply", content), r"a\.ply")
-    check_refusal(lambda: ply.parsed(Path("a.ply"), content), r"a\.ply")
+    check_refusal(lambda: point_files.parse_ply(Path("a.ply"), content), r"a\.ply")
 
 
 @pytest.mark.parametrize("element", ["face 1000000000000", "face 1"])
@@ -244,7 +244,7 @@ def test_one_long_number_among_many_does_not_take_its_length_for_each() -> None:
     rows = b"1" * 1_000_000 + b" 1 1\n" + b"1 1 1\n" * 99_999
     head = f"{PCD}POINTS 100000\nDATA ascii\n".encode()
     text = f"ply\nformat ascii 1.0\nelement vertex 100000\n{XYZ}end_header\n".encode()
-    for read, content in ((pcd.parsed, head + rows), (ply.parsed, text + rows)):
+    for read, content in ((point_files.parse_pcd, head + rows), (point_files.parse_ply, text + rows)):
         with bound_memory(SMALL):
             xyz, _ = read(Path("a"), content)
         assert np.isinf(xyz[0, 0]) and xyz[0, 1:].tolist() == [1, 1] and (xyz[1:] == 1).all()

@@ -19,8 +19,7 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.signals.clocks import fit_clock, host_times
 from tests.sensors import made

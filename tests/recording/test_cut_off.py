@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from tacpipe.recording import appending
-from tacpipe.recording.spool import Spool, StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tests.conftest import Lab
 from tests.recording import force_rig, live
 from tests.recording.scripted import Script

@@ -16,8 +16,7 @@ from tacpipe.links.link import LinkLostError
 from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.spool import Spool, StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples

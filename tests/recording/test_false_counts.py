@@ -9,8 +9,7 @@ import pytest
 
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing, station
-from tacpipe.recording.spool import Spool, StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.station import Station
 from tests.conftest import Lab
 from tests.recording import live

@@ -18,8 +18,7 @@ from tacpipe.recording import appending, spool_folders
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.sealing import seal
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.store import store as store_of

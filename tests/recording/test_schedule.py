@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tacpipe.recording import recorder, sealing
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spooled
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab
 from tests.recording import live

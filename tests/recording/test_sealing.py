@@ -11,8 +11,7 @@ from tacpipe.io import parquet
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.recording import appending, sealing
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording.spool import Spool
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.store.store import Store

@@ -15,9 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.recording import spool_folders, spooled
-from tacpipe.recording.spool import Spool, StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording import spool_folders
+from tacpipe.recording.spool import Spool, Spooled, StreamNote, Tallied
 from tacpipe.sensors.framing import Chunks
 
 STREAMS = ["a", "b"]
@@ -166,7 +165,7 @@ time.sleep(60)
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == [("a", 1, b"one"), ("a", 2, b"two")]
-    assert read.tallied() == {"a": spooled.Tallied(7, 70, 123)}
+    assert read.tallied() == {"a": Tallied(7, 70, 123)}
 
 
 def test_a_spool_without_a_header_is_refused_with_a_sentence(tmp_path: Path) -> None:

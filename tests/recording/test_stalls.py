@@ -11,15 +11,14 @@ import pytest
 
 from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
-from tacpipe.links import udp
+from tacpipe.links import network
 from tacpipe.plugins import registry
 from tacpipe.recording import clock, pace, sealing
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
-from tacpipe.recording.spool import Spool, StreamNote
-from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.station import READ_S, Station
 from tests.conftest import Lab
 from tests.recording import force_rig, live
@@ -167,11 +166,11 @@ def test_a_device_that_takes_its_time_is_no_stall() -> None:
 
 
 def test_a_datagram_says_whether_the_kernel_stamped_it() -> None:
-    link = udp.UdpLink("x", udp.bind_port("127.0.0.1", 0, "x"), prompt=True)
+    link = network.UdpLink("x", network.bind_port("127.0.0.1", 0, "x"), prompt=True)
     try:
         link._arrival([])
         assert not link.kernel_stamped
-        link._arrival([(1, udp.STAMPS, bytes(16))])
+        link._arrival([(1, network.STAMPS, bytes(16))])
         assert link.kernel_stamped
     finally:
         link.close()

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from tacpipe.comparison import engine
-from tacpipe.comparison.runs import Method, grouped
-from tacpipe.comparison.specification import report_on
+from tacpipe.comparison.runs import Method, grouped, report_on
 from tacpipe.report import sections
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Section, SmallPrint, Table
 from tacpipe.report.context import Context

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bytes, Int64s
+from tacpipe.sensors.byte_framer import LineFramer
 from tacpipe.sensors.framing import Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.text_framer import LineFramer
 
 Columns = dict[str, AnyArray]
 Limits = dict[str, tuple[int, int]]

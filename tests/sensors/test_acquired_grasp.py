@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.channels import schema
-from tacpipe.clouds import ply
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp, estimated_wrist
 from tacpipe.plugins.registry import load
@@ -41,7 +41,7 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     record = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
     acquired_streams = {
-        "scene": acquired(Clouds(), ply.packed(full_scene.cloud.points_m, full_scene.cloud.colours)),
+        "scene": acquired(Clouds(), point_files.pack_ply(full_scene.cloud.points_m, full_scene.cloud.colours)),
         "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": record}).encode()),
     }
 

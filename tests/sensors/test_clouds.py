@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.clouds import files, ply
+from tacpipe.clouds import files, point_files
 from tacpipe.clouds.cloud import Cloud, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.recording.reading import LinkReader
@@ -153,7 +153,7 @@ def test_what_is_no_whole_cloud_is_malformed(content: bytes) -> None:
 
 def test_a_cloud_without_the_colours_that_the_rig_tells_of_is_refused() -> None:
     points, colours = random_cloud(3, 0)
-    bare, coloured = ply.packed(points, None), ply.packed(points, colours)
+    bare, coloured = point_files.pack_ply(points, None), point_files.pack_ply(points, colours)
 
     for sensor, right in ((Clouds(colour=False), bare), (Clouds(), coloured)):
         runs, losses = sensor.framer().feed(Chunks.of([(1, bare), (2, coloured)]))

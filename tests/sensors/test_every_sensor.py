@@ -12,10 +12,10 @@ import pytest
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
+from tacpipe.sensors.byte_framer import LineFramer, TextFramer
 from tacpipe.sensors.framing import FrameRun
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.sensors.spacemouse import StateFramer
-from tacpipe.sensors.text_framer import LineFramer, TextFramer
 from tests.sensors import described, harm, made
 
 KINDS = list(registry.sensors())

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.sensors import checks, framing
-from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.byte_framer import ByteFramer, LineFramer
 from tacpipe.sensors.framing import Chunks, FrameRun, Framing, FramingLoss, PacketFramer
-from tacpipe.sensors.text_framer import LineFramer
 
 
 def sum_is_right(frames: Bytes) -> Bools:

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.sensors import number_texts
+from tacpipe.sensors.byte_framer import LineFramer, TextFramer
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.text_framer import LineFramer, TextFramer
 
 WRITTEN = st.one_of(
     st.floats(-1e9, 1e9).map(lambda number: f"{number:.3f}"),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.signals.array_order import is_time, lag_one
+from tacpipe.formats.roboskin import is_time, lag_one
 
 
 def walk(seed: int, channels: int = 12, frames: int = 80) -> np.ndarray:

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tacpipe.signals import rotations
-from tacpipe.signals.rotations import continuous, quaternions_of
+from tacpipe.signals import kinematics
+from tacpipe.signals.kinematics import continuous, quaternions_of
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -38,9 +38,9 @@ def test_vectors_angles_and_matrices_of_a_quaternion_are_those_of_scipy(seed: in
     turned = Rotation.from_quat(np.random.default_rng(seed).normal(size=(20, 4)))
     unit = turned.as_quat()
 
-    np.testing.assert_allclose(rotations.matrices_of(unit), turned.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(rotations.vectors_of(unit), turned.as_rotvec(), atol=1e-9)
-    np.testing.assert_allclose(rotations.angles_of(unit), turned.as_euler("ZYX"), atol=1e-6)
+    np.testing.assert_allclose(kinematics.matrices_of(unit), turned.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(kinematics.vectors_of(unit), turned.as_rotvec(), atol=1e-9)
+    np.testing.assert_allclose(kinematics.angles_of(unit), turned.as_euler("ZYX"), atol=1e-6)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -49,8 +49,8 @@ def test_a_vector_or_three_angles_give_the_quaternion_that_scipy_gives(seed: int
     values[0] = 0
 
     for quaternions, expected in (
-        (rotations.quaternions_of_vectors(values), Rotation.from_rotvec(values)),
-        (rotations.quaternions_of_angles(values), Rotation.from_euler("ZYX", values)),
+        (kinematics.quaternions_of_vectors(values), Rotation.from_rotvec(values)),
+        (kinematics.quaternions_of_angles(values), Rotation.from_euler("ZYX", values)),
     ):
         np.testing.assert_allclose(
             quaternions * np.sign(quaternions[:, 3:] + 1e-300), expected.as_quat(canonical=True), atol=1e-12
@@ -59,8 +59,8 @@ def test_a_vector_or_three_angles_give_the_quaternion_that_scipy_gives(seed: int
 
 def test_angles_with_the_second_at_a_right_angle_still_give_the_rotation() -> None:
     angles_rad = np.radians([[30.0, 90.0, 0.0], [30.0, -90.0, 20.0], [170.0, 90.0, -60.0]])
-    turned = rotations.quaternions_of_angles(angles_rad)
+    turned = kinematics.quaternions_of_angles(angles_rad)
 
-    restored = rotations.quaternions_of_angles(rotations.angles_of(turned))
+    restored = kinematics.quaternions_of_angles(kinematics.angles_of(turned))
 
     np.testing.assert_allclose(np.abs((restored * turned).sum(axis=1)), 1, atol=1e-12)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tacpipe.signals.array_order import is_time, scramble, unscramble
+from tacpipe.formats.roboskin import is_time, scramble, unscramble
 from tests.formats.slide_files import touched
 
 slides = hnp.arrays(np.float32, hnp.array_shapes(min_dims=3, max_dims=5, max_side=7), elements=st.floats(width=32))

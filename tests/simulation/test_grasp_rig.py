@@ -17,7 +17,7 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.simulation import depth_camera, household
+from tacpipe.simulation import depth_camera, grasp_scene
 from tacpipe.simulation.grasp import session, simulate_trial, stamp_ns
 from tacpipe.simulation.grasp_scene import GraspRig, GraspScene, draw_thing, perform
 from tests.simulation.grasp_datasets import SEED
@@ -184,7 +184,7 @@ def test_objects_take_turns_and_stay_what_they_are_when_others_are_left_out() ->
     assert set(names.values()) == {2}
     assert len(names) == 30
     only_cone = draw_thing(SEED, 0, GraspRig(families="cone"))
-    mixed_cone = draw_thing(SEED, household.FAMILIES.index("cone"), RIG)
+    mixed_cone = draw_thing(SEED, grasp_scene.FAMILIES.index("cone"), RIG)
     assert (only_cone.name, only_cone.shape) == (mixed_cone.name, mixed_cone.shape) == ("cone-01", mixed_cone.shape)
 
 
@@ -199,7 +199,7 @@ def test_grasps_of_a_session_follow_one_another_and_those_of_others_come_before_
 
 def thing_name(index: int) -> str:
     number, kind = divmod(index % 30, 6)
-    return f"{household.FAMILIES[kind]}-{number + 1:02d}"
+    return f"{grasp_scene.FAMILIES[kind]}-{number + 1:02d}"
 
 
 def test_spheres_of_all_sizes_look_the_same_but_for_scale_and_are_gripped_through_the_centre(
@@ -208,7 +208,7 @@ def test_spheres_of_all_sizes_look_the_same_but_for_scale_and_are_gripped_throug
     rig = GraspRig(spheres=True)
     normalised = []
     for radius in (0.015, 0.05):
-        monkeypatch.setattr(household, "SPHERES_M", (radius, radius))
+        monkeypatch.setattr(grasp_scene, "SPHERES_M", (radius, radius))
         view = perform(SEED, 3, rig)
         assert view.grasp.opening_m == pytest.approx(2 * radius)
         np.testing.assert_allclose(view.grasp.middle_m, view.placed.origin_m, atol=1e-9)

@@ -14,9 +14,9 @@ from numpy.polynomial import polynomial
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.roboskin import is_time, lag_one, scramble, unscramble
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.registry import load
-from tacpipe.signals.array_order import is_time, lag_one, scramble, unscramble
 from tacpipe.simulation import fingertip, forearm
 from tacpipe.simulation.slide import SENSORS, SlideRig, material, nuisance, place, simulate_trial
 from tests.fake_recordings import column

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tacpipe.simulation import fingertip_sp, pinch, touch_bound
+from tacpipe.simulation import fingertip_sp, grasp, pinch
 from tacpipe.simulation.grasp import stamp_ns
 from tacpipe.simulation.grasp_scene import GraspRig, perform, read_sensors, sensors
 from tests.simulation.grasp_datasets import SEED, grasps, readings
@@ -19,10 +19,10 @@ TRIALS = range(240)
 def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognormal_effort() -> None:
     situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(1)
-    possible = touch_bound.readings(
+    possible = grasp.draw_readings(
         situation, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
     )
-    mean, variance = touch_bound.mean_and_variance(possible)
+    mean, variance = grasp.mean_and_variance(possible)
     limit = 140 * pinch.limits_n(situation.opening_m)
     expected = np.array([1676, 2779]) + limit * np.exp(0.02)
     np.testing.assert_allclose(mean[:, -1], expected, atol=1.5)
@@ -32,12 +32,12 @@ def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognorma
 def test_drift_and_noise_add_their_own_variances() -> None:
     situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(2)
-    possible = touch_bound.readings(
+    possible = grasp.draw_readings(
         situation, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0
     )
     periods = np.array([2.0, 3.0, 5.0])
     expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # Variances of three waves, and of rounding.
-    np.testing.assert_allclose(touch_bound.mean_and_variance(possible)[1][:, -1], expected, rtol=0.03)
+    np.testing.assert_allclose(grasp.mean_and_variance(possible)[1][:, -1], expected, rtol=0.03)
 
 
 @pytest.mark.parametrize("index", [0, 1, 5])
@@ -53,10 +53,8 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
         repeated_counts.append(
             fingertip_sp.counted(repeated_touch.signal + sensor_pair.noise * rng.normal(size=(2, 25)))
         )
-    mean, variance = touch_bound.mean_and_variance(np.array(repeated_counts))
-    expected_mean, spread = touch_bound.mean_and_variance(
-        touch_bound.readings(scene.situation, sensor_pair, rng, draws=3_000)
-    )
+    mean, variance = grasp.mean_and_variance(np.array(repeated_counts))
+    expected_mean, spread = grasp.mean_and_variance(grasp.draw_readings(scene.situation, sensor_pair, rng, draws=3_000))
     np.testing.assert_allclose(expected_mean, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
     np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
 
@@ -78,5 +76,5 @@ def test_the_least_error_is_the_root_of_the_mean_variance_by_target() -> None:
     variances = np.zeros((4, 2, 25))
     variances[:, 0, -1], variances[:, 1, -1] = [9, 9, 25, 25], 4
     variances[:, 0, :-1], variances[:, 1, :-1] = 1, 36
-    rmse = touch_bound.irreducible_rmse(variances)
+    rmse = grasp.irreducible_rmse(variances)
     assert rmse == pytest.approx({"pdc_mf": np.sqrt(17), "pdc_th": 2, "e_mf": 1, "e_th": 6})

@@ -6,12 +6,12 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels import schema
-from tacpipe.traces import curves, paths
+from tacpipe.traces import curves
 from tests.viewer import hand
 
 
 def test_channels_of_one_quantity_and_unit_share_a_plot_and_clocks_have_none() -> None:
-    plots = curves.of_table("robot", hand.arm())
+    plots = curves.curves_of_table("robot", hand.arm())
 
     assert [(plot.title, plot.names) for plot in plots] == [
         ("robot position (m)", ("x", "y", "z")),
@@ -23,13 +23,13 @@ def test_channels_of_one_quantity_and_unit_share_a_plot_and_clocks_have_none() -
 def test_taxels_labels_masks_and_pictures_are_no_curves() -> None:
     streams = {"xela1": hand.finger(hand.pressed()), "marks": hand.labels(), "camera": hand.camera()}
 
-    assert curves.of_streams(streams) == []
+    assert curves.curves_of_streams(streams) == []
 
 
 def test_readings_within_a_row_become_one_curve_at_their_own_rate() -> None:
     table = schema.stream(np.arange(3) * 22_000, np.arange(44 * 3).reshape(3, 44).T, schema.biotac_fields())
 
-    (vibration,) = [plot for plot in curves.of_table("biotac", table) if plot.quantity == "vibration"]
+    (vibration,) = [plot for plot in curves.curves_of_table("biotac", table) if plot.quantity == "vibration"]
 
     assert vibration.values.shape == (66, 1)
     np.testing.assert_array_equal(np.diff(vibration.t_ns), 1000)
@@ -40,18 +40,18 @@ def test_readings_within_a_row_become_one_curve_at_their_own_rate() -> None:
 def test_nulls_are_nan() -> None:
     table = pa.table({"t_ns": [0, 1, 2], "a": pa.array([1, None, 3], pa.int16())})
 
-    (curve,) = curves.of_table("s", table)
+    (curve,) = curves.curves_of_table("s", table)
 
     np.testing.assert_array_equal(curve.values.ravel(), [1, np.nan, 3])
 
 
 def test_a_path_is_in_metres_with_the_orientation_beside_it() -> None:
-    (path,) = paths.of_table("robot", hand.arm())
+    (path,) = curves.paths_of_table("robot", hand.arm())
 
     assert path.name == "robot" and path.quaternion is not None
     np.testing.assert_allclose(path.position_m[-1], [0.3999, 0, 0.5])
     cm = [schema.float_field(f"p_{axis}", "cm", "position", axis) for axis in "xyz"]
-    (marker_path,) = paths.of_table("m", schema.stream(np.arange(2), [[100, 200], [0, 0], [5, 5]], cm))
+    (marker_path,) = curves.paths_of_table("m", schema.stream(np.arange(2), [[100, 200], [0, 0], [5, 5]], cm))
     np.testing.assert_allclose(marker_path.position_m, [[1, 0, 0.05], [2, 0, 0.05]])
 
 
@@ -61,9 +61,9 @@ def test_two_points_of_one_stream_are_two_paths_and_a_cloud_is_none() -> None:
     ]
     grasp = schema.stream(np.array([0]), np.arange(6.0)[:, None], fields)
 
-    assert [(path.name, path.position_m.tolist()) for path in paths.of_table("grasp", grasp)] == [
+    assert [(path.name, path.position_m.tolist()) for path in curves.paths_of_table("grasp", grasp)] == [
         ("grasp g1", [[0, 1, 2]]),
         ("grasp g2", [[3, 4, 5]]),
     ]
     cloud = pa.table({"t_ns": [0] * 9, **{f"{axis}_m": np.arange(9.0) for axis in "xyz"}})
-    assert paths.of_table("cloud", cloud) == []
+    assert curves.paths_of_table("cloud", cloud) == []

@@ -50,7 +50,7 @@ def test_each_bin_of_the_carpet_has_the_value_farthest_from_rest(seed: int, rows
 
 def test_the_picture_of_a_notebook_is_svg_of_bounded_size_whatever_the_length() -> None:
     skin = taxels.of_table("xela1", hand.finger(hand.pressed()))
-    arm = curves.of_table("<arm>", hand.arm())
+    arm = curves.curves_of_table("<arm>", hand.arm())
     picture = drawing.svg(drawing.rows(arm * 10, skin))
 
     root = ET.fromstring(picture)

@@ -21,7 +21,7 @@ def test_auto_is_cuda_where_there_is_one(available: bool, monkeypatch: pytest.Mo
     assert devices.kind() == ("cuda" if available else "cpu")
     with devices.chosen("cpu"):
         assert devices.kind() == "cpu"
-        assert provenance.describe(0.0)["device"] == "cpu"
+        assert provenance.describe_provenance(0.0)["device"] == "cpu"
 
 
 def test_without_torch_the_device_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:

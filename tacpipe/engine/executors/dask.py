@@ -25,7 +25,7 @@ from pathlib import Path
 from queue import Queue
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.engine import execution, processor, provenance
+from tacpipe.engine import execution, provenance
 from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks
 from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import TacpipeError, UsageError
@@ -47,7 +47,7 @@ def local_versions(stage: str) -> dict[str, Any]:
     Raises `UsageError` where there is no such stage.
     """
     stage_object = registry.load(registry.stage_name(stage))
-    environment = provenance.describe(0.0)
+    environment = provenance.describe_provenance(0.0)
     python = ".".join(environment["python"].split(".")[:2])
     code = provenance.code(stage_object)
     return {
@@ -85,7 +85,7 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
     without Dask.
     """
     if not address:
-        with _started(jobs or processor.jobs()) as workers:
+        with _started(jobs or provenance.jobs()) as workers:
             yield workers
         return
     if not _is_here(address):

@@ -10,12 +10,14 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from tacpipe.engine import processor
+from tacpipe.engine import provenance
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory, termination
+from tacpipe.plugins import registry
 from tacpipe.training import devices
 
 if TYPE_CHECKING:
@@ -109,7 +111,7 @@ class Local:
 
     def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
         """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
-        self.jobs, self._pool_from = jobs or processor.jobs(), pool_from
+        self.jobs, self._pool_from = jobs or provenance.jobs(), pool_from
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
@@ -201,3 +203,50 @@ def _death_told() -> Iterator[None]:
             "A worker process died, most likely for lack of memory. What was finished is kept: run the same command "
             "again, with a smaller --jobs if it happens again."
         ) from error
+
+
+VARIABLE = "TACPIPE_EXECUTOR"  # names one where a command does not
+LOCAL = "local"
+
+
+class Executor(Protocol):
+    """Interface of an executor's plug-in, which computes tasks.
+
+    The plug-in's entry point names a function ``connected(address, jobs)`` that returns a context manager of it:
+    ``address`` is what was given behind the executor's name (``host:port`` of ``dask://host:port``, or empty), ``jobs``
+    how many processes were asked for, 0 for as many as are sensible.
+    """
+
+    def run(self, compute: Callable[[Any], Any], tasks: Sequence[Any], preload: Sequence[str]) -> Iterator[Any]:
+        """Yield ``compute(task)`` of every task (`tacpipe.engine.keys.WorkerTask`), in any order.
+
+        ``preload`` are modules that a worker will need. Raises `TacpipeError` where tasks cannot be computed there; what
+        was finished is in the store by then. Where the iterator is closed, nothing that waits is begun. What a result
+        names is announced in the lease of the tasks' run before the result is yielded.
+        """
+        ...  # a protocol has no body
+
+
+class ChosenExecutor:
+    """The executor that a command names, used within a block; it is opened for the first work."""
+
+    def __init__(self, executor: str, jobs: int) -> None:
+        """Take an executor as ``NAME`` or ``NAME://ADDRESS``; empty: `VARIABLE`, or `LOCAL`. Raises `UsageError`."""
+        name, _, self._address = (executor or os.environ.get(VARIABLE, "") or LOCAL).partition("://")
+        self._jobs = jobs
+        self._connect = registry.load_executor(name)
+        self._stack = ExitStack()
+        self._open: Executor | None = None
+
+    def __enter__(self) -> ChosenExecutor:
+        return self
+
+    def __exit__(self, *raised: Any) -> bool | None:
+        return self._stack.__exit__(*raised)
+
+    def opened(self) -> Executor:
+        """Return the executor, connected."""
+        if self._open is None:
+            connection: AbstractContextManager[Executor] = self._connect(self._address, self._jobs)
+            self._open = self._stack.enter_context(connection)
+        return self._open

@@ -15,9 +15,9 @@ import numpy as np
 from tacpipe.arrays import Times
 from tacpipe.errors import UsageError
 from tacpipe.plugins import params
+from tacpipe.sensors.byte_framer import LineFramer
 from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Frames, Sensor
-from tacpipe.sensors.text_framer import LineFramer
 
 CAN_BYTES = 13  # size of a CAN frame of a link
 NEIGHBOURS = 8  # sound frames on either side: more than any framer needs to lock

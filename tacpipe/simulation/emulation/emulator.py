@@ -29,9 +29,8 @@ from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, no_steps
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.pacing import FramePace
 from tacpipe.simulation.emulation.source import Sampled, SampleSource, Timing
-from tacpipe.simulation.emulation.transmission import Transmission, TransmissionPlan
+from tacpipe.simulation.emulation.transmission import FramePace, Transmission, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
 PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder")  # links that keep frames apart
@@ -54,7 +53,7 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
 
         return TcpUdp(stream.sensor) if scheme == "tcp+udp" else Tcp(stream.sensor)
     if scheme == "ws":
-        from tacpipe.simulation.emulation.websocket import Websocket
+        from tacpipe.simulation.emulation.tcp import Websocket
 
         return Websocket(stream.sensor)
     if scheme == "can":
@@ -201,12 +200,12 @@ class Emulator:
         )
         timing = Timing(rate_hz, start_ns, clock(its_pace, seed), steps, self.faults.wrap_s)
         if its_pace.slides:
-            from tacpipe.simulation.emulation.slide_source import SlideSource
+            from tacpipe.simulation.emulation.source import SlideSource
 
             return SlideSource(sensor, timing, self.seed)
         last = name[-1] if name[-1] in "12" else "1"
         if stream_of_clouds(sensor):
-            from tacpipe.simulation.emulation.cloud_source import CloudSource
+            from tacpipe.simulation.emulation.source import CloudSource
 
             return CloudSource(sensor, timing, seed)
         return SampleSource(sensor, self.world, timing, seed, (its_pace.finger or int(last)) - 1)

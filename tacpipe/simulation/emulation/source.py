@@ -1,8 +1,11 @@
-"""The samples that an emulated sensor takes: its fields over time, filled from the one world that its rig shares.
+"""Sample emulated sensors: the fields, clouds and slides of one world that the rig shares, over time.
 
 uSkin and proximity counts come from the models of the simulated rig, with their noise, drift and held frames; what other
 fields show follows from their quantity and unit. Samples are made a block at a time, so that hours need no memory, and
 any block can be made once more: the same seed gives the same values.
+
+Clouds show a table with an object and another next to it, each a new scene. A BioTac slides over one material after
+another, in the trials of `tacpipe simulate material`.
 """
 
 from __future__ import annotations
@@ -14,13 +17,17 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Counts, Floats, Int64s, Times
+from tacpipe.arrays import AnyArray, Bytes, Counts, Float32s, Floats, Int64s, Ints, Times
+from tacpipe.errors import UsageError
+from tacpipe.sensors.biotac import BioTac
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.simulation import faults, pick_and_move, taxels
+from tacpipe.simulation import depth_camera, faults, grasp_scene, pick_and_move, taxels
 from tacpipe.simulation.emulation import quantities
 from tacpipe.simulation.emulation.byte_faults import no_steps
 from tacpipe.simulation.emulation.quantities import SensorView
 from tacpipe.simulation.emulation.world import World
+from tacpipe.simulation.grasp_scene import GraspRig
+from tacpipe.simulation.slide import SENSORS, SlideRig, simulate_trial
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -197,3 +204,80 @@ def _blocks(widths: Sequence[int], columns: Columns) -> tuple[AnyArray, ...]:
     stops = np.cumsum(widths).tolist()
     runs = [range(stop - width, stop) for stop, width in zip(stops, widths, strict=True)]
     return tuple(np.column_stack([columns[number] for number in run]) for run in runs)
+
+
+CLOUD_EVERY = 16  # one of so many of the camera's 300,000 points is kept
+
+
+class CloudSource:
+    """The clouds of one camera, from its start on; as `Source`, but with many rows a frame."""
+
+    def __init__(self, sensor: Sensor, timing: Timing, seed: Sequence[int]) -> None:
+        self.sensor, self.timing = sensor, timing
+        self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # clouds a block
+        self._seed = seed[0]
+        self._coloured = len(sensor.fields()) > 3
+        self._samples = functools.lru_cache(2)(self._generate)
+
+    def block(self, number: int) -> Samples:
+        """Return the points of the clouds of block ``number``; ``rows`` reports on which each is."""
+        return self._samples(number)
+
+    def numbers(self, block: int) -> Int64s:
+        """Return the numbers of a block's clouds, counted from 0 through the stream (cloud,)."""
+        return block * self.rows + np.arange(self.rows, dtype=np.int64)
+
+    def _generate(self, block: int) -> Samples:
+        points, colours = zip(*(self._view(int(number)) for number in self.numbers(block)), strict=True)
+        rows = np.repeat(np.arange(self.rows, dtype=np.int64), [len(cloud) for cloud in points])
+        values = (np.concatenate(points), np.concatenate(colours)) if self._coloured else (np.concatenate(points),)
+        return Samples(values, rows=rows)
+
+    def _view(self, number: int) -> tuple[Float32s, Bytes]:
+        scene = grasp_scene.perform(self._seed, number)
+        neighbour = grasp_scene.draw_thing(self._seed, number + 1)
+        rng = np.random.default_rng([self._seed, 9, number])
+        cloud = depth_camera.view(
+            scene.placed, neighbour.shape, scene.up, scene.camera_m, GraspRig().noise_scale, rng
+        ).cloud
+        assert cloud.colours is not None
+        return cloud.points_m[::CLOUD_EVERY].astype(np.float32), cloud.colours[::CLOUD_EVERY]
+
+
+SLIDE_KEPT = 3  # trials that are kept in case they are asked for once more
+
+
+class SlideSource:
+    """The samples of one BioTac, from its start on."""
+
+    def __init__(self, sensor: Sensor, timing: Timing, seed: int, rig: SlideRig | None = None) -> None:
+        """Take a BioTac; raises `UsageError` for any other sensor."""
+        if not isinstance(sensor, BioTac):
+            raise UsageError("emulate: slides is for the sensor biotac; leave it out for others.")
+        self.sensor: Sensor = sensor
+        self.timing, self._fingers = timing, sensor.fingers
+        self.rows = max(1, round(timing.rate_hz * BLOCK_S))
+        self._seed, self._rig = seed, rig or SlideRig(arm_every=0)
+        self._fields = [field.name for field in BioTac().fields()]
+        self._ends = [0]  # end of each trial in samples from the start
+        self._trial = functools.lru_cache(SLIDE_KEPT)(self._generate)
+
+    def numbers(self, block: int) -> Int64s:
+        """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
+        return block * self.rows + np.arange(self.rows, dtype=np.int64)
+
+    def block(self, number: int) -> Samples:
+        """Return the samples of block ``number``, `rows` of them."""
+        numbers = self.numbers(number)
+        while self._ends[-1] <= numbers[-1]:
+            self._ends.append(self._ends[-1] + len(self._trial(len(self._ends) - 1)))
+        trials = np.searchsorted(self._ends, numbers, side="right") - 1
+        rows = [self._trial(int(trial))[row - self._ends[trial]] for trial, row in zip(trials, numbers, strict=True)]
+        readings = np.tile(np.stack(rows), self._fingers)
+        device_ns = faults.device_stamps(self.timing.taken_ns(numbers), self.timing.clock)
+        return Samples((readings,), numbers % (self.sensor.counter or 1), device_ns)
+
+    def _generate(self, number: int) -> Ints:
+        """Return the readings of a trial (sample, 44)."""
+        table = simulate_trial(self._seed, len(SENSORS) * number, self._rig).streams[SENSORS[0]]
+        return np.column_stack([table.column(name).to_numpy() for name in self._fields]).astype(np.uint16)

@@ -1,20 +1,55 @@
-"""Send a stream of an emulated rig: samples are planned ahead, changed by the faults, and sent when they are due."""
+"""Send a stream of an emulated rig: samples are planned ahead, changed by the faults, and sent when they are due.
+
+Deadlines are absolute: a frame that is late takes nothing away from the next ones, so that a stream does not drift.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from tacpipe.arrays import Times
+from tacpipe.errors import UsageError
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.simulation.emulation import byte_faults, pacing
+from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, SentItem, one_by_one
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.pacing import FramePace
 from tacpipe.simulation.emulation.source import Sampled
+
+
+@dataclass(frozen=True)
+class FramePace:
+    """How a stream's frames come; in a rig file the keys of ``emulate``, for the whole rig or one stream."""
+
+    jitter_ms: float = 0.2  # mean delay of a frame, exponentially distributed
+    burst_ms: float = 0.0  # frames are collected for so long and sent together, as USB bridges do; 0: each alone
+    skew_ppm: float | None = None  # excess rate of the device's clock; None: random within 50
+    offset_ms: float | None = None  # lead of the device's clock; None: random within 80
+    slides: bool = False  # a biotac sends the slides of `tacpipe simulate material` instead of the rig's grasps
+    finger: int | None = None  # finger of the gripper with the sensor, 1 or 2; None: the last digit of its name, or 1
+
+    def __post_init__(self) -> None:
+        if self.jitter_ms < 0 or self.burst_ms < 0:
+            raise UsageError(
+                f"emulate: jitter_ms is {self.jitter_ms:g} and burst_ms {self.burst_ms:g}; neither can be below 0."
+            )
+        if self.finger not in (None, 1, 2):
+            raise UsageError(f"emulate: finger is {self.finger}; the gripper has finger 1 and finger 2.")
+
+
+def next_due_ns(taken_ns: Times, pace: FramePace, after_ns: int, rng: np.random.Generator) -> Times:
+    """Return when frames of samples taken at ``taken_ns`` (frame,) go out: none before ``after_ns``, and in order."""
+    late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(taken_ns))).astype(np.int64)
+    due = np.maximum(np.maximum.accumulate(taken_ns + late_ns), after_ns)
+    burst_ns = round(pace.burst_ms * 1e6)
+    burst_due_ns: Times = -(-due // burst_ns) * burst_ns if burst_ns else due
+    return burst_due_ns
+
 
 AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
 IDLE_NS = 20_000_000  # period of checks of a stream without a receiver
@@ -41,7 +76,7 @@ class TransmissionPlan:
         source = self.source
         numbers = source.numbers(self._block)
         frames = one_by_one(source.sensor, source.sensor.encode(source.block(self._block)))
-        due_ns = pacing.due_ns(source.timing.taken_ns(numbers), self.pace, self.until_ns, self._rng)
+        due_ns = next_due_ns(source.timing.taken_ns(numbers), self.pace, self.until_ns, self._rng)
         self._block += 1
         self.until_ns = int(due_ns[-1]) + 1
         return self._harm.apply(frames, due_ns.tolist(), int(numbers[0]))

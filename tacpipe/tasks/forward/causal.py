@@ -15,8 +15,8 @@ from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Times
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.signals import kinematics
+from tacpipe.signals.kinematics import quaternions_of_vectors
 from tacpipe.signals.resampling import linear, slerp
-from tacpipe.signals.rotations import quaternions_of_vectors
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 

@@ -17,8 +17,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
-from tacpipe.metrics import headline, quantiles
-from tacpipe.metrics.quantiles import Sums
+from tacpipe.metrics import calibration, headline
+from tacpipe.metrics.calibration import Sums
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks
 from tacpipe.tasks.forward.alarms import Loads
@@ -106,7 +106,7 @@ class QuantileSums:
         unit_sums = list(sums_by_unit.values())
         persistence = [sums[BASELINE] for sums in unit_sums]
         return {
-            name: quantiles.tree([sums[name] for sums in unit_sums], percents, persistence) for name in unit_sums[0]
+            name: calibration.tree([sums[name] for sums in unit_sums], percents, persistence) for name in unit_sums[0]
         }
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:

@@ -24,7 +24,7 @@ from tacpipe.models.windows import ARM, POSE, ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
-from tacpipe.signals.rotations import continuous
+from tacpipe.signals.kinematics import continuous
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.networks import acted
 from tacpipe.tasks.forward.params import ForwardConfig, Params

@@ -19,7 +19,7 @@ from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.signals import kinematics
-from tacpipe.signals.rotations import continuous
+from tacpipe.signals.kinematics import continuous
 from tacpipe.signals.runs import window_starts
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from safetensors.numpy import save
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Float32s, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.quantiles import conformal_quantile, most_promised
+from tacpipe.metrics.calibration import conformal_quantile, most_promised
 from tacpipe.models.residual_quantiles import ResidualQuantiles
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 from tacpipe.models.windows import POSE, ForecastWindows, without_plan
 from tacpipe.tasks import task
 
@@ -113,7 +113,7 @@ class Uncertainty:
 
         Each quantile is moved until, of the calibration recordings, each weighing the same, as many values lie at or below
         it as its level states: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019), each
-        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.quantiles`). ``promised``: pairs of
+        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.calibration`). ``promised``: pairs of
         quantiles are moved together so far that the band between them holds in a new recording with at least its level;
         raises `TacpipeError` with too few recordings for that.
         """
@@ -133,7 +133,7 @@ class Uncertainty:
         """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
         arrays = model_files.arrays(content, FILE)
         uncertainty = cls(
-            ResidualQuantiles.from_tensors(under(ERRORS, arrays)),
+            ResidualQuantiles.from_tensors(tensors_under(ERRORS, arrays)),
             *(arrays[name] for name in ("moved", "unconditional", "persistence")),
         )
         levels = len(uncertainty.percents)

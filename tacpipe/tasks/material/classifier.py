@@ -18,7 +18,7 @@ from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.models.readout import Level, StatisticsClassifier, View
 from tacpipe.models.recurrent_autoencoder import AutoencoderShape
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
@@ -341,7 +341,8 @@ class Classifier:
         if self.architecture in READOUTS:
             arrays, kind = model_files.arrays(content, file, but=CHOSEN), READOUTS[self.architecture]
             return {
-                name: ReadoutReader(kind.from_tensors(under(f"{name}.", arrays)), self.classes) for name in self.layouts
+                name: ReadoutReader(kind.from_tensors(tensors_under(f"{name}.", arrays)), self.classes)
+                for name in self.layouts
             }
         if self.architecture == SPECTRA:
             arrays, stored = model_files.arrays(content, file), self.config["spectra"]
@@ -351,7 +352,7 @@ class Classifier:
                     bands,
                     layout.rate_hz,
                     stored["speed_m_s"][name],
-                    Transfer.from_tensors(under(f"{name}.", arrays)),
+                    Transfer.from_tensors(tensors_under(f"{name}.", arrays)),
                     self.classes,
                 )
                 for name, layout in self.layouts.items()
@@ -360,7 +361,7 @@ class Classifier:
         readers: dict[str, Reader] = {}
         for name in self.layouts:
             shape = AutoencoderShape(**self.config["shapes"][name])
-            weights = under(f"{name}.", tensors)
+            weights = tensors_under(f"{name}.", tensors)
             network = model_files.filled(functools.partial(estimators.build_network, self.params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
@@ -382,7 +383,7 @@ class Classifier:
         if self.architecture == STATISTICS:
             kinds |= dict.fromkeys(LEVEL_VIEWS, StatisticsClassifier)
         baselines: dict[str, dict[str, Baseline]] = {
-            kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
+            kind: {name: cls.from_tensors(tensors_under(f"{kind}.{name}.", arrays)) for name in self.layouts}
             for kind, cls in kinds.items()
         }
         return {**baselines, PERMUTED_LABELS: {**shuffled}} if shuffled else baselines

@@ -13,9 +13,9 @@ from scipy.special import logsumexp
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int64s, Ints
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import calibration, quantiles
+from tacpipe.metrics import calibration
 from tacpipe.models.class_distance import ClassDistance
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 
 CALIBRATION_FILE = "known.safetensors"
 Rule = Literal["probability", "distance"]
@@ -65,7 +65,7 @@ class SensorCalibration:
         temperature, threshold, rule = (float(number) for number in tensors["numbers"])
         if temperature <= 0 or not 0 <= int(rule) < len(RULES):
             raise ValueError(f"the temperature is {temperature} and the rule {rule}")
-        distance = ClassDistance.from_tensors(under(DISTANCE, tensors))
+        distance = ClassDistance.from_tensors(tensors_under(DISTANCE, tensors))
         return cls(temperature, RULES[int(rule)], threshold, distance)
 
 
@@ -90,7 +90,7 @@ def fit_calibration(
     Raises `TacpipeError` with too few slides for that.
     """
     count = len(validation.labels)
-    if quantiles.most_promised(count) < 1 - false_unknown:
+    if calibration.most_promised(count) < 1 - false_unknown:
         raise TacpipeError(
             f"{count} validation slides cannot set a threshold that at most {100 * false_unknown:g} % of known slides fall "
             f"below; it takes {int(np.ceil(1 / false_unknown - 1 - 1e-9))} or more. Split with more of them "
@@ -108,7 +108,7 @@ def fit_calibration(
     }
     areas = {rule: calibration.auroc(scores[rule], scores_without_class[rule]) for rule in RULES}
     rule = max(RULES, key=lambda candidate: areas[candidate])
-    threshold = -quantiles.conformal_quantile(-scores[rule], np.arange(count), 1 - false_unknown, promised=True)
+    threshold = -calibration.conformal_quantile(-scores[rule], np.arange(count), 1 - false_unknown, promised=True)
     return SensorCalibration(temperature, rule, threshold, unset.distance), areas
 
 
@@ -125,7 +125,7 @@ def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
 def unpack_calibrations(content: bytes, sensors: Mapping[str, object]) -> dict[str, SensorCalibration]:
     """Return the calibrations that `pack_calibrations` wrote. Raises `TacpipeError` for another file."""
     tensors = model_files.arrays(content, CALIBRATION_FILE)
-    return {name: SensorCalibration.from_tensors(under(f"{name}.", tensors)) for name in sensors}
+    return {name: SensorCalibration.from_tensors(tensors_under(f"{name}.", tensors)) for name in sensors}
 
 
 def _log_odds(scores: AnyFloats) -> Floats:

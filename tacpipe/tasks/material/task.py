@@ -12,9 +12,9 @@ from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tacpipe.comparison.specification import TaskReport
+    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.live.task import LiveTask
+    from tacpipe.live.settings import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.recordings import OpenedChain

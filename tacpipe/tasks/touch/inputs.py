@@ -13,14 +13,14 @@ from tacpipe.arrays import Float32s, Floats, Indices
 from tacpipe.clouds import geometry
 from tacpipe.clouds import grasp as frame
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.grasp import Grasp, local_points
-from tacpipe.clouds.normalisation import (
+from tacpipe.clouds.geometry import (
     NORMALISATIONS,
     Extent,
     colours_normalised,
     normalised,
     random_rotation,
 )
+from tacpipe.clouds.grasp import Grasp, local_points
 from tacpipe.errors import TacpipeError
 
 Arrays = tuple[Float32s, Float32s]

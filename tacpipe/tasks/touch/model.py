@@ -12,7 +12,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics.quantiles import check_levels
+from tacpipe.metrics.calibration import check_levels
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks import recordings
 from tacpipe.tasks.recordings import open_for_model

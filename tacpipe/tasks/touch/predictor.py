@@ -22,7 +22,7 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
 from tacpipe.models.forest import Forest
-from tacpipe.models.tensors import under
+from tacpipe.models.tensors import tensors_under
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import excerpt
 from tacpipe.tasks import task
@@ -221,7 +221,7 @@ class Predictor:
         device = devices.kind()
         with model_files.validated("the model"):
             loaded_members = [
-                _member(params, about, under(f"{number}.", tensors), device)
+                _member(params, about, tensors_under(f"{number}.", tensors), device)
                 for number, about in enumerate(config["members"])
             ]
             baselines = None
@@ -233,7 +233,7 @@ class Predictor:
                 target for one in loaded_members for target in one.targets
             }:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
-            shrunk = {name: value.numpy() for name, value in under(SHRINKAGE, tensors).items()}
+            shrunk = {name: value.numpy() for name, value in tensors_under(SHRINKAGE, tensors).items()}
             shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
             quantiles = ReadingQuantiles.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
         return cls(params, config, loaded_members, baselines, chain, shrinkage, quantiles)
@@ -293,7 +293,7 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
     width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:
         forests = tuple(
-            (tuple(group), Forest.from_tensors(under(f"{number}.", tensors)))
+            (tuple(group), Forest.from_tensors(tensors_under(f"{number}.", tensors)))
             for number, group in enumerate(about["groups"])
         )
         for group, forest in forests:
@@ -301,11 +301,11 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
         if {target for group, _ in forests for target in group} != {*targets}:
             raise ValueError(f"the forests do not predict {excerpt(targets)}")
         return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
-    scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
+    scale = Affine.from_tensors({name: value.numpy() for name, value in tensors_under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):
         raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
     if not isinstance(params, members.NetworkParams):
         raise ValueError(f"the architecture {params.architecture} has a network")
-    network = model_files.filled(lambda: members.network(params, targets), under("network.", tensors))
+    network = model_files.filled(lambda: members.network(params, targets), tensors_under("network.", tensors))
     members.checked(params)
     return members.NetworkMember(targets, network.to(device).eval(), scale, params)

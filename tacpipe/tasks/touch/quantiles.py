@@ -3,7 +3,7 @@
 Grasps are few, so that no spread can be learned for each: a value's error is measured in units of its own standard
 deviation over training grasps, and of these units the quantiles are those of all values of a target together, each
 calibration grasp weighing the same: split conformal prediction with normalised errors (Papadopoulos, Gammerman and Vovk,
-2008), over groups (`tacpipe.metrics.quantiles`).
+2008), over groups (`tacpipe.metrics.calibration`).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from tacpipe.channels import biotac_sp
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import quantiles
-from tacpipe.metrics.quantiles import Sums
-from tacpipe.models.tensors import under
+from tacpipe.metrics import calibration
+from tacpipe.metrics.calibration import Sums
+from tacpipe.models.tensors import tensors_under
 from tacpipe.tasks import task
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 
-FILE = "quantiles.safetensors"
+FILE = "calibration.safetensors"
 LEVELS = "levels"
 MEAN = "mean"
 
@@ -85,7 +85,7 @@ class ReadingQuantiles:
     def load(cls, content: bytes, targets: Sequence[str]) -> Self:
         """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
         tensors = model_files.arrays(content, FILE)
-        offsets = {name: dict(under(f"{name}.", tensors)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
+        offsets = {name: dict(tensors_under(f"{name}.", tensors)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
         for by_target in offsets.values():
             shapes = {target: by_target[target].shape for target in targets}
             if shapes != {target: (len(tensors[LEVELS]), biotac_sp.width(target)) for target in targets}:
@@ -110,7 +110,7 @@ def tree(
             sums, constant_sums = (
                 _sums(fitted, grasps, predicted, (name, target), mask, names) for name in (predictor, CONSTANT)
             )
-            for measure, values in quantiles.tree(sums, fitted.percents, constant_sums).items():
+            for measure, values in calibration.tree(sums, fitted.percents, constant_sums).items():
                 if MEAN in values:
                     measures.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
     return {"n": int(mask.sum()), **measures}
@@ -133,7 +133,7 @@ def coverage(
             bands = fitted.quantiles({target: values[mask]}, predictor)[target]  # (grasp, value, level)
             truth = grasps.readings[target][mask]
             above = truth[..., None] - bands
-            lost = quantiles.pinball(above, fitted.levels).mean(axis=2)
+            lost = calibration.pinball(above, fitted.levels).mean(axis=2)
             count = truth.shape[1]
             parts.append(
                 pa.table(
@@ -180,17 +180,17 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
     offsets = np.zeros(len(levels))
     for at, level in enumerate(levels):
         if not promised or at == middle:
-            offsets[at] = quantiles.conformal_quantile(flat, groups, float(level))
+            offsets[at] = calibration.conformal_quantile(flat, groups, float(level))
     if promised:
         away = np.abs(flat - offsets[middle])
         for low in range(middle):
             level = float(levels[-1 - low] - levels[low])
-            far = quantiles.conformal_quantile(away, groups, level, promised=True)
+            far = calibration.conformal_quantile(away, groups, level, promised=True)
             if not np.isfinite(far):
                 raise TacpipeError(
                     f"{len(errors)} calibration grasps can promise a band that holds "
-                    f"{100 * quantiles.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with more "
-                    f"of them (`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
+                    f"{100 * calibration.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with "
+                    f"more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
                 )
             offsets[low], offsets[-1 - low] = offsets[middle] - far, offsets[middle] + far
     return offsets

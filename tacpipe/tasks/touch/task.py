@@ -13,9 +13,9 @@ from tacpipe.tasks.touch.params import Params
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tacpipe.comparison.specification import TaskReport
+    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.live.task import LiveTask
+    from tacpipe.live.settings import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel

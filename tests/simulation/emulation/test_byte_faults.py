@@ -18,9 +18,8 @@ from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, Happening, SentItem, of_run, one_by_one, parse
-from tacpipe.simulation.emulation.pacing import FramePace
 from tacpipe.simulation.emulation.source import SampleSource, Timing
-from tacpipe.simulation.emulation.transmission import TransmissionPlan
+from tacpipe.simulation.emulation.transmission import FramePace, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
 WORLD = World(1)

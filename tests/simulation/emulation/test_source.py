@@ -17,10 +17,9 @@ from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.signals import kinematics
 from tacpipe.simulation import pick_and_move, taxels
-from tacpipe.simulation.emulation import joints, ledger
+from tacpipe.simulation.emulation import ledger, world
 from tacpipe.simulation.emulation.quantities import unit_scale
-from tacpipe.simulation.emulation.slide_source import SlideSource
-from tacpipe.simulation.emulation.source import SampleSource, Timing
+from tacpipe.simulation.emulation.source import SampleSource, SlideSource, Timing
 from tacpipe.simulation.emulation.world import CYCLE_NS, World
 from tacpipe.simulation.slide import SlideRig, simulate_trial
 from tests.simulation.emulation.rigs import ALL_SENSORS
@@ -83,10 +82,10 @@ def test_distance_grows_by_what_the_object_slips() -> None:
 
 def test_the_hand_is_where_the_joints_carry_it() -> None:
     t_ns = np.arange(0, 2 * CYCLE_NS, 50_000_000)
-    place, _ = joints.hand(kinematics.joint_frames(kinematics.PANDA, WORLD.joint_angles(t_ns)))
+    place, _ = world.hand_pose(kinematics.joint_frames(kinematics.PANDA, WORLD.joint_angles(t_ns)))
     assert np.abs(place - WORLD.arm(t_ns)[:, 1:4]).max() < 5e-4
     angles = WORLD.joint_angles(t_ns)
-    assert (angles >= joints.LOWEST_RAD).all() and (angles <= joints.HIGHEST_RAD).all()
+    assert (angles >= world.LOWEST_RAD).all() and (angles <= world.HIGHEST_RAD).all()
 
 
 def test_the_joints_speeds_are_those_of_their_angles() -> None:
@@ -98,13 +97,13 @@ def test_the_joints_speeds_are_those_of_their_angles() -> None:
 def test_joint_torques_do_the_work_of_the_load() -> None:
     angle = WORLD.joint_angles(np.array([4_000_000_000]))
     force = np.array([[1.0, -2.0, 3.0]])
-    torque = joints.torques(angle, force)[0]
+    torque = world.joint_torques(angle, force)[0]
     for joint in range(7):
         moved = angle.copy()
         moved[0, joint] += 1e-5
         way = (
-            joints.hand(kinematics.joint_frames(kinematics.PANDA, moved))[0]
-            - joints.hand(kinematics.joint_frames(kinematics.PANDA, angle))[0]
+            world.hand_pose(kinematics.joint_frames(kinematics.PANDA, moved))[0]
+            - world.hand_pose(kinematics.joint_frames(kinematics.PANDA, angle))[0]
         )
         assert torque[joint] * 1e-5 == pytest.approx(-float((way @ force[0])[0]), abs=1e-8)
 
@@ -138,7 +137,7 @@ def test_a_fast_clock_takes_samples_faster_and_shows_their_nominal_spacing() -> 
 def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
     sensor = ALL_SENSORS.streams[name].sensor
     if name == "clouds":
-        from tacpipe.simulation.emulation.cloud_source import CloudSource
+        from tacpipe.simulation.emulation.source import CloudSource
 
         samples = CloudSource(sensor, Timing(2), (0,)).block(0)
     else:

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
+from tacpipe.clouds import geometry
 from tacpipe.clouds import grasp as frame
-from tacpipe.clouds import normalisation
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.normalisation import Extent
+from tacpipe.clouds.geometry import Extent
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch.inputs import MODES, CloudInputs, CloudSources
 from tests.tasks.touch.handmade import cloud, grasp
@@ -34,7 +34,7 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("normalisation", normalisation.NORMALISATIONS)
+@pytest.mark.parametrize("normalisation", geometry.NORMALISATIONS)
 def test_each_mode_has_the_channels_and_numbers_of_the_letter(mode: str, normalisation: str) -> None:
     drawn = sources(mode, 10, normalisation)
     channels, numbers = COUNTS[mode]
@@ -113,10 +113,10 @@ def test_a_random_turn_takes_cloud_grasp_and_wrist_along(seed: int, method: str)
     drawn = sources("xyzpose", 40, method, rotation_deg=180.0)
     points, numbers = (arrays[0].astype(float) for arrays in drawn.draw([0], rng(seed)))
     planned, cloud_points = grasp(0), cloud(0).points_m.astype(float)
-    turn = normalisation.random_rotation(rng(seed), 180.0)  # the first that is drawn
+    turn = geometry.random_rotation(rng(seed), 180.0)  # the first that is drawn
     assert planned.wrist is not None
     np.testing.assert_allclose(numbers[6:].reshape(3, 3), turn @ planned.wrist, atol=1e-6)
-    expected = normalisation.normalised(method, cloud_points @ turn.T, Extent.of(cloud(0)), turn, None)
+    expected = geometry.normalised(method, cloud_points @ turn.T, Extent.of(cloud(0)), turn, None)
     np.testing.assert_allclose(np.sort(points, axis=0), np.sort(expected, axis=0), atol=1e-5)
     if method == "none":
         ends = np.stack([planned.g1_m, planned.g2_m])

@@ -17,7 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.models.threads import one_thread
+from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN

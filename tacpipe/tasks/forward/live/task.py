@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.settings import Settings, TaskSettings, option
-from tacpipe.live.task import LiveTask, SessionPlan
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings, option
 from tacpipe.plugins.constraints import PositiveInt, Range
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.tasks.forward.live.messages import ALARM, DECLARATION, FORECAST

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Question
-from tacpipe.comparison.specification import Kind, TaskReport
+from tacpipe.comparison.runs import MODEL, ComparedRun, Kind, Method, Question, TaskReport
 from tacpipe.metrics import pairing
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
-from tacpipe.comparison.specification import Kind
+from tacpipe.comparison.runs import ComparedRun, Kind, PredictorErrors, Question
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
 from tacpipe.report.context import Tree, drop_duplicates

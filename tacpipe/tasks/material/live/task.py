@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.settings import Settings, TaskSettings
-from tacpipe.live.task import LiveTask, SessionPlan
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
 from tacpipe.printable import listed
 from tacpipe.tasks.material.live.messages import DECLARATION, LEAST_SEEN, MATERIAL, MaterialDescription

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import ComparedRun, Method
-from tacpipe.comparison.specification import Kind, TaskReport
+from tacpipe.comparison.runs import ComparedRun, Kind, Method, TaskReport
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint
 from tacpipe.report.context import Context

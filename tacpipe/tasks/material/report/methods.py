@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, marks
-from tacpipe.comparison.specification import Kind
+from tacpipe.comparison.runs import ComparedRun, Kind, Method, PredictorErrors, Question, marks
 from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, Tree, drop_duplicates

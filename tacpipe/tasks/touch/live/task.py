@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from tacpipe.live.settings import Settings, TaskSettings
-from tacpipe.live.task import LiveTask, SessionPlan
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.tasks.touch.live.messages import COLUMNS, DECLARATION, TOUCH
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import ComparedRun
-from tacpipe.comparison.specification import TaskReport
+from tacpipe.comparison.runs import ComparedRun, TaskReport
 from tacpipe.metrics import headline
 from tacpipe.report import blocks, screen
 from tacpipe.report.blocks import NONE, Cell, Charts, Fold
