@@ -11,7 +11,7 @@ import pytest
 
 from tacpipe.datasets import directory, manifest, pages
 from tacpipe.io.hashing import file_digest
-from tacpipe.store import layout, notes, presence
+from tacpipe.store import layout, presence
 from tests.conftest import Lab
 
 SCALE = "scale data/r -o data/s --factor 2 --jobs 1"
@@ -234,7 +234,7 @@ def test_where_folders_changed_a_moment_ago_their_names_are_looked_at_and_their_
     monkeypatch.setattr(presence, "SETTLED_NS", 2 * DAY_NS)
     lab.run("simulate toy --trials 2 --rows 3 -o data/r")
     lab.run(SCALE)
-    note = notes.read(lab.store, lab.folder / "data/s")
+    note = presence.read_note(lab.store, lab.folder / "data/s")
     assert note is not None and note.head.directory is None
     assert {state for state, *_ in note.shelves.values()} == {None}
     shows.clear()
@@ -295,5 +295,5 @@ def test_a_store_that_cannot_be_written_is_a_hit_all_the_same(noted: Lab, monkey
     def refused(*arguments: object) -> None:
         raise PermissionError("no")
 
-    monkeypatch.setattr(notes, "write", refused)
+    monkeypatch.setattr(presence, "write_note", refused)
     assert '"reused": 4' in noted.run(f"{SCALE} --json").out

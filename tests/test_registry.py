@@ -148,9 +148,9 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
 
 
 def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab: Lab) -> None:
-    from tacpipe.simulation import demo
+    from tacpipe.cli import demo
 
-    *commands, last = demo.commands(Path("out"))
+    *commands, last = demo.demo_commands(Path("out"))
     assert {words[1] for words in commands if words[0] == "train"} == set(registry.tasks())
     evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
     assert last[: len(evaluated) + 1] == ["report", *evaluated]
@@ -158,20 +158,20 @@ def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab:
 
 
 def test_the_demo_on_a_rig_trains_on_the_recordings_of_the_rig_and_shows_what_it_evaluated() -> None:
-    from tacpipe.simulation import demo
+    from tacpipe.cli import demo
 
-    commands = demo.rig(Path("out"))
+    commands = demo.demo_rig(Path("out"))
     assert commands[0][0] == "acquire" and commands[2][:2] == ["synchronize", "out/recordings"]
     evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
     assert commands[-1][:2] == ["report", "out/results"] and evaluated == ["out/results"]
 
 
 def test_the_demo_prints_at_most_60_lines() -> None:
+    from tacpipe.cli import demo
     from tacpipe.cli.demo import NEXT
-    from tacpipe.simulation import demo
 
-    notes, closing = len(demo.parts(Path("out"))), len(NEXT.splitlines()) + 2
-    assert 2 * len(demo.commands(Path("out"))) + notes + closing <= 60  # each command and at most one warning
+    notes, closing = len(demo.demo_parts(Path("out"))), len(NEXT.splitlines()) + 2
+    assert 2 * len(demo.demo_commands(Path("out"))) + notes + closing <= 60  # each command and at most one warning
 
 
 def test_a_plug_in_states_the_order_and_the_lines_of_its_commands(

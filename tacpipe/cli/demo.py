@@ -5,10 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal, termination
-from tacpipe.plugins import extras
+from tacpipe.plugins import extras, registry
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.task import Demo
 
 LEARNING = ("jinja2", "matplotlib", "safetensors", "scipy", "sklearn", "torch", "vl_convert")
 LINKS = ("serial", "websockets")
@@ -24,23 +28,21 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 
     Raises `TacpipeError` if a command fails.
     """
-    from tacpipe.simulation import demo
-
     extras.require("The demo on a rig", *LEARNING, *LINKS)
-    emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / demo.EMULATED)]
+    emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
     terminal.note("$ tacpipe " + " ".join(emulate) + " &")
     serving = subprocess.Popen([sys.executable, "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
     try:
         if not serving.stdout.readline():  # It prints the path of its rig file once all streams are served.
             raise TacpipeError(f"The demo stopped: {rig_file} could not be emulated.")
-        acquire, *chain = demo.rig(output)
+        acquire, *chain = demo_rig(output)
         _run([acquire])
     finally:
         serving.terminate()
         serving.communicate()
     _run(chain)
-    return demo.page(output)
+    return demo_page(output)
 
 
 def _run(commands: list[list[str]]) -> None:
@@ -74,13 +76,44 @@ def run(output: Path) -> Path:
 
     Raises `TacpipeError` if one of them fails.
     """
-    from tacpipe.simulation import demo
-
     extras.require("The demo", *LEARNING)
-    _run(demo.commands(output))
-    parts = demo.parts(output)
+    _run(demo_commands(output))
+    parts = demo_parts(output)
     for part in parts:
         terminal.note(headline_of(Path(part.results[0])))
     terminal.note(f"Trained only briefly: {', '.join(model for part in parts for model in part.shortened)}.")
     terminal.note(NEXT.format(output=output))
-    return demo.page(output)
+    return demo_page(output)
+
+
+LIVE_S, LIVE_TRIALS = 30, 6  # length and trials of the emulated rig
+EMULATED = "emulated"  # the folder of the emulated rig's own rig file
+
+
+def demo_commands(output: Path) -> list[list[str]]:
+    """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
+    demos = demo_parts(output)
+    datasets = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
+    return [*(words for demo in demos for words in demo.commands), ["report", *datasets, "-o", str(demo_page(output))]]
+
+
+def demo_rig(output: Path) -> list[list[str]]:
+    """Return the commands after the emulated rig is up: 30 s recorded live, then the chain to a forecast."""
+    recordings = str(output / "recordings")
+    live = ["--trials", str(LIVE_TRIALS), "--duration-s", str(LIVE_S / LIVE_TRIALS)]
+    return [
+        ["acquire", str(output / EMULATED / "rig.toml"), "-o", recordings, *live],
+        ["show", recordings],
+        *(words for demo in demo_parts(output) for words in demo.recorded),
+        ["report", str(output / "results"), "-o", str(demo_page(output))],
+    ]
+
+
+def demo_parts(output: Path) -> list[Demo]:
+    """Return the parts of all tasks that have one."""
+    return [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
+
+
+def demo_page(output: Path) -> Path:
+    """Return the path of the page of results."""
+    return output / "report.html"

@@ -19,9 +19,8 @@ from tacpipe.engine.request import Request
 from tacpipe.errors import DamagedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.io.hashing import file_digest
 from tacpipe.plugins.stage import Attribute
-from tacpipe.store import notes
-from tacpipe.store.notes import Head, Note
-from tacpipe.store.presence import Look
+from tacpipe.store import presence
+from tacpipe.store.presence import Head, Look, Note
 from tacpipe.store.store import MissingError, Store
 
 
@@ -216,7 +215,7 @@ class _Directory(_Place):
     @cached_property
     def _noted(self) -> Note | None:
         """The note on what is shown here, if that is the manifest that was noted."""
-        note, root = notes.read(self.store, self.path), self.root
+        note, root = presence.read_note(self.store, self.path), self.root
         if note is None or root is None or root["manifest"] != note.head.manifest:
             return None
         with suppress(OSError, TacpipeError):

@@ -19,8 +19,7 @@ from tacpipe.datasets.pages import Pages
 from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.hashing import digest
-from tacpipe.store.notes import Head, Note
-from tacpipe.store.presence import Look
+from tacpipe.store.presence import Head, Look, Note
 from tacpipe.store.store import Store
 
 

@@ -13,7 +13,7 @@ from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
 from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.io import regular
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
@@ -125,7 +125,7 @@ class RequestInputs:
         else:
             command = self.request.name.replace(".", " ")
             reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
-        return source_files.describe(self.request.source, read, reason, self.request.output)
+        return container.describe_unread(self.request.source, read, reason, self.request.output)
 
     def plan(self) -> ResultPlan:
         """Return what is known of the result before anything is computed."""

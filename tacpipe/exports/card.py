@@ -15,9 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.exports import contents, readme
+from tacpipe.exports import contents
 from tacpipe.exports.contents import Column, Contents, Loss, stream_label
-from tacpipe.exports.files import Content, Files
+from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, sections
 from tacpipe.plugins.constraints import Names
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 from tacpipe.printable import plain
@@ -209,7 +209,7 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
         cite_as=params.cite_as,
     )
     files: dict[str, Content] = {
-        readme.NAME: _readme(params, recordings, described, patterns),
+        README_NAME: _readme(params, recordings, described, patterns),
         NAME: croissant_json(about, described, patterns),
         f"{LABELS}.parquet": _labels(recordings),
     }
@@ -220,7 +220,7 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
         if stream.differing
     ]
     licence = [] if params.license else ["no licence is stated: give --license, as cc-by-4.0"]
-    return Result(files=Files(files), notes=[*licence, *differing, *readme.loss_notes(recordings, described)])
+    return Result(files=Files(files), notes=[*licence, *differing, *loss_notes(recordings, described)])
 
 
 def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
@@ -265,7 +265,7 @@ def _readme(params: Params, recordings: Dataset, described: Contents, patterns: 
         f"# {plain(params.title, 200)}",
         params.description,
         _opening(described),
-        *readme.sections(recordings, described),
+        *sections(recordings, described),
     ]
     return "\n\n".join(filter(None, parts)).encode() + b"\n"
 

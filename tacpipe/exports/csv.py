@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.exports import contents, readme
+from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Contents, ExportStream, Loss, stream_label
-from tacpipe.exports.files import Content, Files
+from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
@@ -74,8 +74,8 @@ def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
         for recording in recordings
     }
     files[LAYOUT] = layout_text(described).encode()
-    files[readme.NAME] = readme.readme_text("Tactile recordings as CSV", _OPENING, recordings, described)
-    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
+    files[README_NAME] = readme_text("Tactile recordings as CSV", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=loss_notes(recordings, described))
 
 
 def layout_text(described: Contents) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
-from tacpipe.exports import contents, readme
+from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss, stream_label
 from tacpipe.exports.files import Files, Scratch, copy_to_sink
 from tacpipe.plugins.constraints import Rate
@@ -131,9 +131,9 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
         )
     elif split:
         raise UsageError("split belongs to --structure robomimic; files of single recordings have no masks.")
-    text = readme.readme_text("Tactile recordings as HDF5", opening, recordings, described)
-    notes += readme.loss_notes(recordings, described)
-    return Result(files=Files({readme.NAME: text}), notes=notes, written=writers)
+    text = files.readme_text("Tactile recordings as HDF5", opening, recordings, described)
+    notes += files.loss_notes(recordings, described)
+    return Result(files=Files({files.README_NAME: text}), notes=notes, written=writers)
 
 
 def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> IO[bytes]:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.streams import GRID
 from tacpipe.errors import UsageError
-from tacpipe.exports import contents, readme
+from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Loss
-from tacpipe.exports.files import Content, Files
+from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
 from tacpipe.exports.lerobot_features import (
     ACTION,
     ORIGINALS,
@@ -147,8 +147,8 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     indices = {name: order[task] for name, task in tasks.items()}
     files["meta/stats.json"] = _json_bytes(dataset_statistics(parts, frame_features, starts, lengths, indices, fps))
     files["meta/tacpipe.json"] = _json_bytes(_feature_metadata(frame_features, described))
-    files[readme.NAME] = readme.readme_text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
-    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
+    files[README_NAME] = readme_text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=loss_notes(recordings, described))
 
 
 def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.exports import contents, readme
+from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss
 from tacpipe.exports.files import Files
 from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
@@ -74,8 +74,8 @@ def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
     Example: tacpipe export mcap data/recordings -o exports/mcap
     """
     described = contents.contents_from_parts(parts)
-    text = readme.readme_text("Tactile recordings as MCAP", _OPENING, recordings, described)
-    return Result(files=Files({readme.NAME: text}), notes=readme.loss_notes(recordings, described))
+    text = files.readme_text("Tactile recordings as MCAP", _OPENING, recordings, described)
+    return Result(files=Files({files.README_NAME: text}), notes=files.loss_notes(recordings, described))
 
 
 @dataclass(frozen=True)

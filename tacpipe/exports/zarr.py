@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.exports import contents, readme
-from tacpipe.exports.files import Content, Files
+from tacpipe.exports import contents
+from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
@@ -104,10 +104,8 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
         }
     )
     files = {f"{STORE}/{name}": content for name, content in files.items()}
-    files[readme.NAME] = readme.readme_text(
-        "Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described
-    )
-    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
+    files[README_NAME] = readme_text("Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=loss_notes(recordings, described))
 
 
 def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[str, Content]:

@@ -23,9 +23,8 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, Floats, Int64s, Times
 from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats import xdf_chunks
-from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.formats import container, xdf_chunks
+from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, DamagedChunk
 from tacpipe.io import regular
 from tacpipe.io.spill import Piece, Spill, unpack

@@ -23,7 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
-from tacpipe.store import layout, notes
+from tacpipe.store import layout, presence
 from tacpipe.store.records import digests
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import MissingError, Store
@@ -336,7 +336,7 @@ def _sweep(
             _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-        notes.forget(store, [path.stem for path in layout.entries(store.root, "roots")])
+        presence.forget_notes(store, [path.stem for path in layout.entries(store.root, "roots")])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1

@@ -1,4 +1,4 @@
-"""Remember that all files of a large dataset were present, with the state of their folders.
+"""Remember in notes that all files of a large dataset were present, with the state of their folders.
 
 While the folders are unchanged the files are there, and none of them is looked at.
 
@@ -6,26 +6,141 @@ A folder changes its time whenever a name in it comes, goes or is given to anoth
 the look that the next change might have the same time, its time is not noted. Of a folder of objects each object is looked
 at then; of the dataset's directory the names and inodes are listed, which are those of the objects. What is written into a
 file in place changes no folder; whoever reads the file finds that.
+
+No result rests on a note: a key is made of bytes that were hashed. A note that cannot be read is ignored.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import stat
 import time
 from array import array
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io.hashing import SETTLED_NS
-from tacpipe.store import notes
-from tacpipe.store.notes import Head, Note, Row, State
+from tacpipe.io import regular
+from tacpipe.io.hashing import SETTLED_NS, digest
+from tacpipe.store import layout
+from tacpipe.store.roots import name_of
 from tacpipe.store.store import Store
+
+NOTE_FORMAT = 2
+_HEAD_BYTES = 1 << 20  # the longest first line that is read
+_ROW = 48  # bytes: a digest of 32, the size of the object, and its inode
+State = list[int]  # State of a folder: device, inode, and times of change
+Row = tuple[str, int, int]  # Object: digest, size in bytes, inode
+
+
+@dataclass(frozen=True)
+class Head:
+    """Note on a dataset whose objects are all in the store, and whose directory holds only links to them."""
+
+    key: str  # Key of the run that computed the dataset
+    manifest: str  # digest
+    reused: int  # results of that run
+    rows: int
+    boot: str = ""
+    directory: State | None = None  # None: it changed too shortly before; then its listing is compared
+    listing: str = ""  # digest of the names in the directory and their inodes
+
+
+@dataclass(frozen=True)
+class Note:
+    """A note as it is kept."""
+
+    head: Head
+    shelves: Mapping[str, tuple[State | None, int, int, str]]  # state, first row, rows, digest of these rows
+    file: Path
+    body: int  # Offset of the rows in the file
+
+    def rows(self, shelf: str) -> list[Row] | None:
+        """Return the objects that were noted on a shelf; None where the note is damaged."""
+        content = self.content(shelf)
+        if content is None:
+            return None
+        rows = []
+        for at in range(0, len(content), _ROW):
+            size, inode = content[at + 32 : at + 40], content[at + 40 : at + _ROW]
+            rows.append((content[at : at + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little")))
+        return rows
+
+    def content(self, shelf: str) -> bytes | None:
+        """Return the rows of a shelf as they are kept; None where the note is damaged."""
+        _, begin, count, expected_digest = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
+        content = b""
+        with contextlib.suppress(OSError, TacpipeError), regular.opened(self.file, follow=False) as reading:
+            reading.seek(self.body + begin * _ROW)
+            content = reading.read(count * _ROW)
+        return content if hashlib.sha256(content).hexdigest() == expected_digest else None
+
+
+def encode_note(rows: Iterable[Row]) -> bytes:
+    """Return objects as they are kept."""
+    parts = (
+        bytes.fromhex(name) + size.to_bytes(8, "little") + inode.to_bytes(8, "little") for name, size, inode in rows
+    )
+    return b"".join(parts)
+
+
+def read_note(store: Store, directory: Path) -> Note | None:
+    """Return the note on a directory; None where there is none, or none that can be read."""
+    file = _file(store, directory)
+    with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
+        with regular.opened(file, follow=False) as reading:
+            first = reading.readline(_HEAD_BYTES)
+        head: dict[str, Any] = json.loads(first)
+        if head.pop("check") == digest(head) and head.pop("format") == NOTE_FORMAT:
+            shelves = {shelf: tuple(values) for shelf, values in head.pop("shelves").items()}
+            return Note(Head(**head), shelves, file, len(first))
+    return None
+
+
+def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple[State | None, bytes]]) -> None:
+    """Keep a note whole or not at all; it need not outlast a loss of power. ``shelves`` has state and rows of each."""
+    places, begin = {}, 0
+    for shelf, (state, content) in sorted(shelves.items()):
+        places[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()
+        begin += len(content) // _ROW
+    value = {"format": NOTE_FORMAT, **vars(head), "shelves": places}
+    first = json.dumps({**value, "check": digest(value)}).encode() + b"\n"
+    file, draft = _file(store, directory), Path(store.draft())
+    try:
+        with draft.open("xb") as writing:
+            writing.writelines([first, *(content for _, (_, content) in sorted(shelves.items()))])
+        file.parent.mkdir(exist_ok=True)
+        if not layout.is_linked(str(store.root), file):
+            draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def forget_notes(store: Store, names: Iterable[str]) -> None:
+    """Remove the notes on directories that no root of these names has."""
+    retained = set(names)
+    for path in layout.entries(store.root, layout.PRESENCE):
+        if path.name not in retained:
+            path.unlink(missing_ok=True)
+
+
+def shelved_notes(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """Yield each shelf with its objects, in the order of shelves."""
+    shelves: dict[str, list[Row]] = {}
+    for row in rows:
+        shelves.setdefault(row[0][:2], []).append(row)
+    yield from sorted(shelves.items())
+
+
+def _file(store: Store, directory: Path) -> Path:
+    return store.root / layout.PRESENCE / name_of(*store.roots.kind_and_name(directory))
+
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system is repaired between two starts of a computer
 _MOST_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
@@ -96,11 +211,11 @@ class Look:
             if _inodes(self._directory) != inodes or not self._alike(rows):
                 return False
             shelves = {
-                shelf: (settled(self._shelves[shelf]), notes.encoded(shelf_rows))
-                for shelf, shelf_rows in notes.shelved(rows)
+                shelf: (settled(self._shelves[shelf]), encode_note(shelf_rows))
+                for shelf, shelf_rows in shelved_notes(rows)
             }
             listing = _listing(directory_state, inodes)
-            notes.write(
+            write_note(
                 self._store,
                 self._directory,
                 replace(head, boot=boot, directory=settled(directory_state), listing=listing),
@@ -128,7 +243,7 @@ class Look:
             inodes = _inodes(self._directory)
             if any(inodes.get(path) != inode for path, inode in expected.items()):
                 return False
-            added = dict(notes.shelved({*new, self._stored(head.manifest)}))
+            added = dict(shelved_notes({*new, self._stored(head.manifest)}))
             settled = self._settled()
             shelves = {}
             for shelf in {*note.shelves, *added}:
@@ -138,10 +253,10 @@ class Look:
                 is_unchanged = shelf in note.shelves and note.shelves[shelf][0] == state
                 shelves[shelf] = (
                     state if is_unchanged else settled(state),
-                    content + notes.encoded(added.get(shelf, ())),
+                    content + encode_note(added.get(shelf, ())),
                 )
             listing = _listing(directory_state, inodes)
-            notes.write(
+            write_note(
                 self._store, self._directory, replace(head, boot=_boot(), directory=None, listing=listing), shelves
             )
             return True
@@ -162,7 +277,7 @@ class Look:
                 if content is None:
                     return
                 shelves[shelf] = states.get(shelf, state), content
-            notes.write(self._store, self._directory, replace(note.head, directory=directory_state), shelves)
+            write_note(self._store, self._directory, replace(note.head, directory=directory_state), shelves)
 
     def _changed(self, note: Note) -> set[str]:
         return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}

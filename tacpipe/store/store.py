@@ -21,7 +21,7 @@ from tacpipe.io import files, memory, regular, terminal
 from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
-from tacpipe.store.directory import Directory
+from tacpipe.store.backend import Directory
 from tacpipe.store.leases import Announcing, Leases
 from tacpipe.store.roots import Roots
 

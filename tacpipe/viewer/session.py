@@ -1,7 +1,10 @@
-"""Write recordings for Rerun's viewer, one file each, and open the viewer in a window or a local browser.
+"""Show recordings in a viewer session, with few large views and the others in tabs.
 
 Rerun's program serves the viewer and the recordings. Its page would load fonts and send statistics over the network;
 the server here hands the page on with a policy under which a browser refuses that.
+
+On the left the time axes, one below the other and moved together: touch, spans, streams. On the right the taxels at the
+cursor, all taxels over the whole recording, and space. Rerun is imported inside the functions.
 """
 
 from __future__ import annotations
@@ -18,9 +21,14 @@ from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
 from tacpipe.errors import TacpipeError
+from tacpipe.traces.taxels import Taxels
+from tacpipe.viewer import stream
 from tacpipe.viewer.contents import DrawnContents
 
 NAME = "tacpipe"
@@ -37,18 +45,18 @@ def write(
     """
     import rerun as rr
 
-    from tacpipe.viewer import layout, stream
+    from tacpipe.viewer import stream
 
     looks: dict[str, str] = {}
     paths = []
     for contents in recordings:
-        look = repr(layout.signature(contents))
+        look = repr(signature(contents))
         name = looks.setdefault(look, application(dataset, len(looks)))
         paths.append(folder / f"{re.sub(UNSAFE, '-', contents.name)}{ENDING}")
         recording = rr.RecordingStream(name, recording_id=contents.name)
         recording.save(paths[-1])
         recording.send_recording_name(contents.name)
-        recording.send_blueprint(layout.blueprint(contents, with_list=with_list))
+        recording.send_blueprint(blueprint(contents, with_list=with_list))
         stream.RerunStream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
         recording.disconnect()  # writes what is left
     return paths
@@ -162,3 +170,243 @@ def _free() -> int:
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
+
+
+LANE, LEAST, MOST = 0.35, 1.1, 2.2  # height of the spans next to that of the touch, 3: a lane, and its limits
+MAPS_A_ROW = 3
+SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of a longer one
+
+
+def signature(contents: DrawnContents) -> tuple[Any, ...]:
+    """Return what the layout depends on; recordings with the same one share it."""
+    titles = (
+        sorted(f"{curve.stream} {curve.title}" for curve in contents.curves),
+        sorted(finger.name for finger in contents.taxels),
+    )
+    steps = sorted({(forecast.measured.name, forecast.step) for forecast in contents.forecasts})
+    space = (sorted(path.name for path in contents.paths), sorted({cloud.stream for cloud in contents.clouds}))
+    cameras = sorted(camera.stream for camera in contents.frames)
+    prediction = (
+        (contents.classification.key, len(contents.classification.leading())) if contents.classification else ()
+    )
+    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), prediction)
+
+
+def blueprint(contents: DrawnContents, *, with_list: bool = False) -> Any:
+    """Return the layout of a recording's views as Rerun's blueprint."""
+    import rerun.blueprint as rrb
+
+    left, right = _times(contents), _moments(contents)
+    if left:
+        root = rrb.Horizontal(_stacked(left), _stacked([*right, _places(contents)]), column_shares=[1.7, 1])
+    elif right:
+        root = rrb.Horizontal(_places(contents)[0], _stacked(right), column_shares=[1, 1.2])
+    else:
+        root = _places(contents)[0]
+    return rrb.Blueprint(
+        root,
+        _playing(contents),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="expanded" if with_list else "collapsed"),  # this panel has the list of recordings
+    )
+
+
+def _playing(contents: DrawnContents) -> Any:
+    """Return the panel of time: a long recording plays the seconds around its largest touch, over and over."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    part_s = loop_s(contents)
+    if part_s is None:
+        return rrb.TimePanel(state="collapsed", timeline=stream.TIMELINE, play_state="playing", loop_mode="all")
+    selection = rr.encodings.AbsoluteTimeRange(*(round(edge_s * 1e9) for edge_s in part_s))
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=stream.TIMELINE,
+        play_state="playing",
+        loop_mode="selection",
+        time_selection=selection,
+    )
+
+
+def loop_s(contents: DrawnContents) -> tuple[float, float] | None:
+    """Return the part of a recording of more than 20 s that plays at first, seconds from its start; None for all."""
+    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+    if contents.duration_s <= SHORT_S or not touched:
+        return None
+    strongest = max(touched, key=lambda finger: float(np.nanmax(finger.load, initial=0.0)))
+    peak_s = (int(strongest.t_ns[int(np.nanargmax(strongest.load))]) - contents.ends_ns[0]) / 1e9
+    start_s = min(max(peak_s - LOOP_S / 2, 0.0), contents.duration_s - LOOP_S)
+    return start_s, start_s + LOOP_S
+
+
+def _stacked(parts: list[tuple[Any, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    views, shares = zip(*parts, strict=True)
+    return rrb.Vertical(*views, row_shares=list(shares)) if len(views) > 1 else views[0]
+
+
+def _times(contents: DrawnContents) -> list[tuple[Any, float]]:
+    """Return the views with a time axis, with their heights."""
+    import rerun.blueprint as rrb
+
+    views: list[tuple[Any, float]] = []
+    unit = f" ({_unit(contents)})".replace(" ()", "")
+    ahead = [forecast for forecast in contents.forecasts if forecast.step]
+    if ahead:
+        for name in dict.fromkeys(forecast.measured.name for forecast in ahead):
+            title = f"{name}: load measured and predicted{unit}"
+            views.append((_plot(_origin(stream.FORECAST, name), title), 2.0))
+        views.append((_plot(stream.ERROR, f"Mean absolute error of the forecasts{unit}"), 1.3))
+    elif any(len(finger.t_ns) > 1 for finger in contents.taxels):
+        views.append((_plot(stream.TOUCH, f"Touch: mean distance of the taxels from rest{unit}"), 3.0))
+    lanes = {span.lane for span in contents.spans} | ({"gaps"} if contents.gaps else set())
+    lanes |= {f"events {event.stream}" for event in contents.events}
+    if lanes:
+        view = rrb.StateTimelineView(origin=stream.SPANS, name="Contacts, labels, gaps", time_view=_linked())
+        views.append((view, min(max(LEAST, LANE * (len(lanes) + 1)), MOST)))
+    tabs = _tabs(contents)
+    if tabs:
+        views.append((rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0], 3.2))
+    return views
+
+
+def _tabs(contents: DrawnContents) -> list[Any]:
+    """Return a tab a stream, one of each finger's taxels, and that of the ground truth."""
+    import rerun.blueprint as rrb
+
+    tabs = []
+    for name in contents.by_interest:
+        views = [
+            _plot(_origin(stream.SERIES, name, curve.title), curve.title)
+            for curve in contents.curves
+            if curve.stream == name
+        ]
+        tabs.append(rrb.Vertical(*views, name=name or "rows") if len(views) > 1 else views[0])
+    for finger in contents.taxels:
+        if len(finger.t_ns) > 1:
+            titles = [
+                stream.channels_title(finger, axis) for axis in (stream.AXES if finger.change.shape[2] == 3 else ("",))
+            ]
+            views = [_plot(_origin(stream.CHANNELS, finger.name, title), title) for title in titles]
+            tabs.append(rrb.Vertical(*views, name=f"{finger.name} taxels"))
+    if contents.truth:
+        views = [_plot(_origin(stream.TRUTH, curve.title), curve.title) for curve in contents.truth]
+        tabs.append(rrb.Grid(*views, name="ground truth"))
+    if contents.events:
+        tabs.append(rrb.TextLogView(origin=stream.EVENTS, name="events"))
+    return tabs
+
+
+def _space(contents: DrawnContents) -> Any:
+    """Return the view of paths and clouds, seen from a side from which all of them are in sight."""
+    import rerun.blueprint as rrb
+
+    places = [path.position_m for path in contents.paths] + [cloud.points_m for cloud in contents.clouds]
+    if contents.clouds:  # the camera that saw the cloud looks along z
+        middle = np.median(np.concatenate([cloud.points_m for cloud in contents.clouds]), axis=0)
+        eye_direction, up = np.array([0.0, 0.0, -1.0]), (0, -1, 0)
+        extent = np.concatenate([cloud.points_m for cloud in contents.clouds])
+    else:
+        extent = np.concatenate(places)
+        middle, eye_direction, up = (extent.min(axis=0) + extent.max(axis=0)) / 2, np.array([0.8, -1.0, 0.6]), (0, 0, 1)
+    low, high = np.quantile(extent, [0.02, 0.98], axis=0)
+    reach_m = max(float(np.linalg.norm(high - low)), 0.05)
+    eye = rrb.EyeControls3D(
+        position=middle + eye_direction / np.linalg.norm(eye_direction) * reach_m, look_target=middle, eye_up=up
+    )
+    return rrb.Spatial3DView(origin=stream.SPACE, name="Space (m)", eye_controls=eye)
+
+
+def _carpet(contents: DrawnContents) -> Any:
+    import rerun.blueprint as rrb
+
+    width, height = stream.carpet_size(contents)
+    bounds = rrb.VisualBounds2D(x_range=(-10, width + 10), y_range=(-5, height + 5))
+    return rrb.Spatial2DView(origin=stream.CARPET, name="All taxels over the recording", visual_bounds=bounds)
+
+
+def _moments(contents: DrawnContents) -> list[tuple[Any, float]]:
+    """Return the views of the moment at the cursor, with their heights."""
+    import rerun.blueprint as rrb
+
+    views: list[tuple[Any, float]] = []
+    maps = [_map(name, one, contents) for name, one in _maps(contents)]
+    if maps:
+        grid = rrb.Grid(*maps, grid_columns=min(len(maps), MAPS_A_ROW)) if len(maps) > 1 else maps[0]
+        views.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
+    if any(len(finger.t_ns) > 1 for finger in contents.taxels):
+        views.append((_carpet(contents), 1.3))
+    if contents.classification is not None:
+        rows = len(contents.classification.leading())
+        bounds = rrb.VisualBounds2D(x_range=(-stream.NAMES_WIDTH, stream.BARS_WIDTH + 0.5), y_range=(-1.9, rows - 0.4))
+        title = f"Predicted {contents.classification.key}, and the largest scores"
+        views.append((rrb.Spatial2DView(origin=stream.NAMED, name=title, visual_bounds=bounds), 1.8))
+    return views
+
+
+def _places(contents: DrawnContents) -> tuple[Any, float]:
+    """Return the tabs with what lies in space, cameras, and the recording's labels, with their height."""
+    import rerun.blueprint as rrb
+
+    views: list[Any] = [_space(contents)] if contents.paths or contents.clouds else []
+    views += [
+        rrb.Spatial2DView(origin=_origin(stream.CAMERAS, camera.stream), name=camera.stream)
+        for camera in contents.frames
+    ]
+    views.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
+    return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
+
+
+def _map(name: str, finger: Taxels, contents: DrawnContents) -> Any:
+    import rerun.blueprint as rrb
+
+    x, y = stream.map_bounds(finger)
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+    return rrb.Spatial2DView(
+        origin=_origin(stream.MAPS, name), name=_map_title(name, finger, contents), visual_bounds=bounds
+    )
+
+
+def _maps(contents: DrawnContents) -> list[tuple[str, Taxels]]:
+    """Return the maps by name, of measured taxels and of what was predicted of them."""
+    names = []
+    for finger in contents.taxels:
+        names.append((finger.name, finger))
+        steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
+        names += [(stream.map_name(finger.name, compared, max(steps)), finger) for compared in stream.COMPARED if steps]
+    return names
+
+
+def _unit(contents: DrawnContents) -> str:
+    """Return the unit of the taxels, empty where they have several."""
+    units = {finger.unit for finger in contents.taxels}
+    return units.pop() if len(units) == 1 else ""
+
+
+def _map_title(name: str, finger: Taxels, contents: DrawnContents) -> str:
+    """Return the title of a map, short enough for three of them in a row."""
+    steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
+    if not steps or name == finger.name:
+        return name if contents.forecasts else f"{name} ({finger.unit})".replace(" ()", "")
+    ahead = f"t+{max(steps)}" if max(steps) else "predicted"
+    return ahead if name == stream.map_name(finger.name, stream.COMPARED[0], max(steps)) else f"error {ahead}"
+
+
+def _plot(origin: str, name: str) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_x=_linked(), plot_legend=rrb.PlotLegend("RightTop"))
+
+
+def _linked() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeAxis(link="LinkToGlobal")
+
+
+def _origin(*parts: str) -> str:
+    import rerun
+
+    return str(rerun.new_entity_path(list(parts)))

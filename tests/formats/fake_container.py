@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.containers.container import EpisodeContents, SourceStream, Time
+from tacpipe.formats.container import EpisodeContents, SourceStream, Time
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Kind
+from tacpipe.formats import container
+from tacpipe.formats.container import Kind
 from tacpipe.formats.table import contained, layout, recordings
 from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.plugins.stage import RecordingOutput

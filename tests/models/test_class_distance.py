@@ -7,9 +7,9 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import calibration
-from tacpipe.models.class_distance import ClassDistance
 from tacpipe.models.minirocket import with_profile
 from tacpipe.models.readout import statistics
+from tacpipe.tasks.material.sensor_calibration import ClassDistance
 
 
 def slides(kinds: tuple[int, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

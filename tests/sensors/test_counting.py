@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.arrays import Int64s
-from tacpipe.sensors.counting import Counted, Counting
+from tacpipe.recording.reading import Counted, Counting
 
 WRAP = 1 << 16
 RATE_HZ = 1000.0

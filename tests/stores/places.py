@@ -17,9 +17,8 @@ from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 from tacpipe.store.addresses import parsed
-from tacpipe.store.backend import Backend
+from tacpipe.store.backend import Backend, Directory
 from tacpipe.store.bucket import Bucket
-from tacpipe.store.directory import Directory
 
 KEY, SECRET = "rig-of-the-lab", "never-to-be-seen-by-anybody"
 IN_THIS_PROCESS = ("folder", "bucket")

@@ -15,7 +15,7 @@ import pytest
 
 import tacpipe
 from tacpipe.traces import drawing, taxels
-from tacpipe.viewer import contents, layout, session
+from tacpipe.viewer import contents, session
 from tests.conftest import Lab
 from tests.traces.test_forecasts import predictions
 from tests.viewer import hand
@@ -165,13 +165,13 @@ def test_the_names_of_a_recording_are_bars_as_long_as_their_scores(tmp_path: Pat
     strips = static(entities["/named/bars"], "LineStrips2D:strips")
     assert [strip[-1][0] - strip[0][0] for strip in strips] == pytest.approx([8.0, 2.0])
     assert static(entities["/named/names"], "Points2D:labels") == ["2   1", "1 (label)   0.25"]
-    origins = [view.origin for view in views(layout.blueprint(drawn).root_container)]
+    origins = [view.origin for view in views(session.blueprint(drawn).root_container)]
     assert "named" in [origin.strip("/") for origin in origins]
 
 
 def test_every_view_of_the_layout_shows_an_entity_that_is_written(tmp_path: Path) -> None:
     drawn, entities = write_and_read(tmp_path)
-    origins = [view.origin for view in views(layout.blueprint(drawn).root_container)]
+    origins = [view.origin for view in views(session.blueprint(drawn).root_container)]
 
     assert len(origins) > 8
     missing = [

@@ -1,4 +1,4 @@
-"""HDF5 files and Zarr stores as containers of streams (`tacpipe.formats.containers.container`)."""
+"""HDF5 files and Zarr stores as containers of streams (`tacpipe.formats.container`)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
+from tacpipe.formats import container
 from tacpipe.formats.arrays import episodes, zarr
 from tacpipe.formats.arrays.episodes import Episode, StreamArrays
 from tacpipe.formats.arrays.tree import (
@@ -25,8 +26,7 @@ from tacpipe.formats.arrays.tree import (
     picture_column,
     plain_attributes,
 )
-from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, EpisodeContents, Share, SourceStream
+from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream
 from tacpipe.formats.table import column_names
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute

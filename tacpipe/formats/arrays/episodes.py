@@ -14,7 +14,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import ArrayDescription, Tree, is_frames, reason_left_out, walk
-from tacpipe.formats.containers.container import Time, TimeUnit
+from tacpipe.formats.container import Time, TimeUnit
 from tacpipe.io import memory
 from tacpipe.printable import plain
 

@@ -19,12 +19,11 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.bags import mcap_file, ros, ros_files
 from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Record, TopicConnection
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
-from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
 from tacpipe.io import config_text, regular
 from tacpipe.io import files as file_system
 from tacpipe.io.spill import Spill, unpack
@@ -152,7 +151,7 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
     about = _bag_description(path / "metadata.yaml")
     listing = about.get("relative_file_paths")
     names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
-    source_files.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
+    container.parts_by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
     bag_files = sorted(file for file in file_system.listed(path) if _file_ending(file) in READERS)

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Int64s
-from tacpipe.formats.containers.container import Batched, Time
+from tacpipe.formats.container import Batched, Time
 from tacpipe.io import spill
 from tacpipe.io.spill import Piece, Spill
 from tacpipe.printable import plain

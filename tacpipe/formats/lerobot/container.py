@@ -20,10 +20,9 @@ import pyarrow.parquet as pq
 
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.arrays.tree import PICTURE as PICTURE
-from tacpipe.formats.containers import container
-from tacpipe.formats.containers.container import Batched, EpisodeContents, Share, SourceStream, Time
+from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import EpisodeDescription, FeatureDescription, LeRobotDescription
 from tacpipe.formats.table.column_names import NO_MEANING, meaning_from_name, meanings
@@ -95,8 +94,8 @@ class LeRobotContainer:
     @functools.cached_property
     def _episodes(self) -> dict[str, EpisodeDescription]:
         episodes = self._about.episodes()
-        source_files.by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
-        return source_files.by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
+        container.parts_by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
+        return container.parts_by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
 
     def _notes(self, episode: EpisodeDescription) -> list[str]:
         """Return, with the first episode, whether there are as many as the dataset states."""

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, parquet, regular
@@ -274,7 +274,7 @@ def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
     if not isinstance(text, str):
         return None
     try:
-        attributes = source_files.json_value(text, path)
+        attributes = container.json_value(text, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
     values = attributes.items() if isinstance(attributes, dict) else ()
@@ -290,7 +290,7 @@ def _read_json(root: Path, name: str) -> dict[str, Any]:
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
     try:
-        content_json = source_files.json_value(content, path)
+        content_json = container.json_value(content, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} is not JSON: {plain(str(error), 200)}. Copy it again.") from error
     if not isinstance(content_json, dict):
@@ -306,7 +306,7 @@ def _read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            entry = source_files.json_value(line, path)
+            entry = container.json_value(line, path)
         except (ValueError, RecursionError) as error:
             raise TacpipeError(
                 f"{path}, line {number} is not JSON: {plain(str(error), 200)}. Copy the file again."

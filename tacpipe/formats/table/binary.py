@@ -22,7 +22,7 @@ import pyarrow.json as pj
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.table import text
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
@@ -107,7 +107,7 @@ class NumpyArchive:
                 places.append((name, (name, None)))
             else:
                 places += [(f"{name}_{at}", (name, at)) for at in range(array.width)]
-        return source_files.by_name(places, self.path, "column")
+        return container.parts_by_name(places, self.path, "column")
 
     def arrays(self) -> Mapping[str, ArrayMember]:
         """Return the arrays that have rows, by name."""
@@ -121,7 +121,7 @@ class NumpyArchive:
                 for info in archive.infolist()
                 if info.filename.endswith(".npy")
             ]
-        return source_files.by_name(((array.name, array) for array in members if array.shape), self.path, "array")
+        return container.parts_by_name(((array.name, array) for array in members if array.shape), self.path, "array")
 
     def _archive(self) -> contextlib.AbstractContextManager[Archive]:
         return _zip_archive(self.path)
@@ -352,7 +352,7 @@ class JsonLines:
                 columns += [(f"{name}_{at}", pc.list_element(column, at)) for at in range(widths[name])]
             else:
                 columns.append((name, column))
-        return pa.table(source_files.by_name(columns, self.path, "column"))
+        return pa.table(container.parts_by_name(columns, self.path, "column"))
 
 
 def _refuse_nested(path: Path, table: pa.Table) -> pa.Table:

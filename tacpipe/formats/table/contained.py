@@ -16,7 +16,7 @@ from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
-    from tacpipe.formats.containers.container import Share
+    from tacpipe.formats.container import Share
     from tacpipe.formats.table import recordings
 
 EPISODE = "recording"  # key of a source's values: the name of the recording within its files
@@ -143,7 +143,7 @@ class _ContainerShares:
 
     def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
         """Return what streams of a container are read from; None: all of its files."""
-        from tacpipe.formats.containers.container import Sharing, open_container
+        from tacpipe.formats.container import Sharing, open_container
 
         streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
@@ -168,11 +168,11 @@ def preview_text(
     kind: layouts.Format | None = None,
 ) -> str:
     """Return what would be read of a source, and what would not, in words."""
-    from tacpipe.formats import source_files
+    from tacpipe.formats.container import describe_unread
     from tacpipe.formats.table import preview
 
     paths = [path for recording in listed_sources for path in member_files(recording.files).values()]
-    left_out = source_files.describe(source, paths, why_unread(layout, source, kind))
+    left_out = describe_unread(source, paths, why_unread(layout, source, kind))
     return "\n".join([preview.describe_sources(layout, source, listed_sources, kind), *left_out])
 
 
@@ -181,7 +181,7 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
 
     The reason is "" for a file of labels, and for a file within a container.
     """
-    from tacpipe.formats.containers.container import KINDS, find_containers
+    from tacpipe.formats.container import KINDS, find_containers
 
     formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(KINDS)
     folders = [path for name in formats for path in find_containers(name, source) if path.is_dir()]
@@ -218,7 +218,7 @@ def read_recording(
 
 def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
     """Return all files of a recording by name: of a path that is a folder each file in it, by ``name/path within``."""
-    from tacpipe.formats.containers.container import container_files
+    from tacpipe.formats.container import container_files
 
     return {
         f"{name}/{inner_path}" if inner_path else name: path

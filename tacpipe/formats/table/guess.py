@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.table import column_names, file_sample, pattern, reading
 from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
 from tacpipe.formats.table.label_table import RECORDING, read_label_table
@@ -85,7 +85,7 @@ def guess_layout(folder: Path) -> str:
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
-        *(f"# {shown(line)}" for line in source_files.describe(folder, read, reason)),
+        *(f"# {shown(line)}" for line in container.describe_unread(folder, read, reason)),
     ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 

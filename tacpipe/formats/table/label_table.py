@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.table.layout import TREES
 from tacpipe.io import config_text, regular
 from tacpipe.plugins.stage import Attribute
@@ -219,7 +219,7 @@ def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
     text = read_text(path)
     try:
-        tree = source_files.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
+        tree = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     entries = (

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import source_files
+from tacpipe.formats import container
 from tacpipe.formats.table import label_table, pattern
 from tacpipe.formats.table.label_table import plain_value, read_rows, read_text
 from tacpipe.formats.table.layout import TREES, LabelSource, Layout
@@ -117,7 +117,7 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
         return _read_single_row(path)
     text = read_text(path)
     try:
-        values = source_files.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
+        values = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     if not isinstance(values, dict):

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from tacpipe.channels import schema
 from tacpipe.errors import UsageError
-from tacpipe.formats.containers.container import KINDS, Time, describe_kind, has_ending
+from tacpipe.formats.container import KINDS, Time, describe_kind, has_ending
 from tacpipe.formats.table import pattern, stamps
 from tacpipe.io import regular
 from tacpipe.plugins import fields

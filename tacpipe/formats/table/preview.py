@@ -16,11 +16,11 @@ import pyarrow.compute as pc
 
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError, is_input_error
-from tacpipe.formats import source_files
-from tacpipe.formats.containers.container import (
+from tacpipe.formats.container import (
     EpisodeContents,
     SourceStream,
     Time,
+    describe_unread,
     find_containers,
     no_container_error,
     open_container,
@@ -253,7 +253,7 @@ def declared_layout(kind: str, source: Path) -> str:
             passed_over.append(plain(str(error), 400))
             continue
         if contents.streams:
-            unread_files = source_files.describe(
+            unread_files = describe_unread(
                 source, paths, lambda path_within: _why_unread(kind, source / path_within, paths)
             )
             return _layout_text(contents, f"tacpipe ingest {kind}", path, [*passed_over, *unread_files])

@@ -18,7 +18,7 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats.containers.container import SourceStream
+from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import columns, rows, stamps
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout

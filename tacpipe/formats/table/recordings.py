@@ -12,8 +12,7 @@ import pyarrow as pa
 
 from tacpipe.datasets.paths import refuse_shared_names, valid_name
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
-from tacpipe.formats import source_files
-from tacpipe.formats.containers.container import (
+from tacpipe.formats.container import (
     EpisodeContents,
     NamedContainer,
     container_names,
@@ -21,6 +20,7 @@ from tacpipe.formats.containers.container import (
     is_container,
     no_container_error,
     open_container,
+    parts_by_name,
 )
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
@@ -281,9 +281,7 @@ def read_streams(
             )
     for (kind, path), container_streams in contained_streams.items():
         contents = open_container(kind, path).read([stream.source for stream in container_streams], episode)
-        stream_by_source = source_files.by_name(
-            ((stream.source, stream) for stream in contents.streams), path, "stream"
-        )
+        stream_by_source = parts_by_name(((stream.source, stream) for stream in contents.streams), path, "stream")
         for stream in container_streams:
             if stream.source in stream_by_source:
                 tables[stream.name] = read_contained_stream(path, stream_by_source[stream.source], stream)
@@ -336,7 +334,7 @@ def read_container(kind: str, path: Path, episode: str | None) -> RecordedStream
     """
     contents = open_container(kind, path).read(None, episode)
     notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]
-    stream_by_name = source_files.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
+    stream_by_name = parts_by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
         name: _with_rate_noted(
             read_contained_stream(path, stream, StreamLayout(name, source=stream.source)), name, notes

@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 
 from tacpipe.arrays import Indices, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.containers.container import SourceStream
+from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import binary, file_sample, stamps
 from tacpipe.formats.table.layout import EXTENSIONS, StreamLayout, extension
 from tacpipe.formats.table.text import TextTable, Workbook

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 
 from tacpipe.arrays import Bools, Int64s, Times
 from tacpipe.errors import UsageError
-from tacpipe.formats.containers.container import Time
+from tacpipe.formats.container import Time
 from tacpipe.printable import excerpt
 
 if TYPE_CHECKING:

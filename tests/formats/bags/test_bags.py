@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags import topics
 from tacpipe.formats.bags.container import open_bag
-from tacpipe.formats.containers.container import EpisodeContents, SourceStream
+from tacpipe.formats.container import EpisodeContents, SourceStream
 from tests.conftest import Lab, sample_data
 from tests.formats.bags import writers
 from tests.formats.bags.writers import START_NS, STEP_NS, Sent

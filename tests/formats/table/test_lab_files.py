@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats.containers.container import Time
+from tacpipe.formats.container import Time
 from tacpipe.formats.table import contained, guess, layout, reading, recordings, stamps
 from tests.formats.table import labs
 

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.containers.container import Time, TimeUnit
+from tacpipe.formats.container import Time, TimeUnit
 from tacpipe.formats.table import reading, stamps
 from tacpipe.formats.table.layout import ColumnRule, StreamLayout
 

@@ -1,18 +1,36 @@
-"""The interface of containers: their kinds, how their files are recognised and opened, their episodes and streams."""
+"""Recognise and open containers: files with several streams and their own description, as a bag, an HDF5 or an XDF file.
+
+A container is read by a `tacpipe.formats.container.Container`, which a format implements: its episodes, what a
+look at it shows, and the streams of one episode read in one pass. Each stream comes as a `SourceStream`: its name inside the
+file (``source``), a name for the stream, where its stamps are (`Time`), and rows whose fields have type, quantity, unit
+and layout in their metadata: a table, or `Batched`, of which memory holds some at a time. What cannot be read is named with
+a reason in `Contents.skipped`, what is missing of a damaged file in `Contents.notes`, and what the file states of itself
+becomes `Contents.attributes`.
+
+The layout file of ``ingest table`` is applied to that: a stream of a layout names the container's with ``source``; rules of
+``columns`` and ``time`` replace what the file declares, and are left out where it is right. A new format is
+
+1. a module with ``opened(path) -> Container``, which imports its library inside functions;
+2. an entry in `tacpipe.formats.container.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
+3. a stage, made by `tacpipe.formats.table.contained.ContainerCommand`, with an entry point ``tacpipe.formats``.
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import json
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 from tacpipe.errors import UsageError
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -283,3 +301,66 @@ def identifiers(sources: Sequence[str]) -> dict[str, str]:
         used.add(candidate.casefold())
         names[source] = candidate
     return names
+
+
+Part = TypeVar("Part")
+
+
+def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> dict[str, Part]:
+    """Return parts by their names. Raises `UsageError`, naming the file, where two of a ``kind`` have the same name.
+
+    >>> parts_by_name([("a", 1), ("b", 2)], Path("x.npz"), "column")
+    {'a': 1, 'b': 2}
+    """
+    parts_by_name: dict[str, Part] = {}
+    for name, part in parts:
+        if name in parts_by_name:
+            raise UsageError(
+                f"{path} has more than one {kind} {plain(name)}. Only one of them could be kept: rename the others, or take "
+                f"them away."
+            )
+        parts_by_name[name] = part
+    return parts_by_name
+
+
+def json_value(text: str | bytes, path: Path) -> Any:
+    """Return a JSON value of a file. Raises `ValueError` or `RecursionError` where it is none, and as `by_name`."""
+    return json.loads(text, object_pairs_hook=lambda pairs: parts_by_name(pairs, path, "entry"))
+
+
+EXAMPLES = 3  # paths named per group
+Reason = Callable[[str], str]  # maps a path within the source to the reason why it is not read, "" if it is
+
+
+def describe_unread(source: Path, read: Collection[Path], reason: Reason, output: Path | None = None) -> list[str]:
+    """Return one sentence per extension and reason for the files below ``source`` that are not in ``read``.
+
+    Hidden files and folders are passed over, and so is the folder ``output``, to which the command writes.
+    """
+    groups: dict[tuple[str, str], list[str]] = {}
+    read_paths = {os.fspath(path) for path in read}
+    for path in _visible(source, output):
+        if path in read_paths:
+            continue
+        path_within = os.path.relpath(path, source)
+        problem = reason(path_within)
+        if problem:
+            extension = os.path.splitext(path_within)[1].lower()  # noqa: PTH122  (once per file, on every hit)
+            groups.setdefault((extension, problem), []).append(path_within)
+    return [
+        f"{len(paths)} {extension or 'extensionless'} file{'s' * (len(paths) != 1)} below {source} "
+        f"{'are' if len(paths) > 1 else 'is'} not read ({listed(paths, EXAMPLES)}): {problem}."
+        for (extension, problem), paths in sorted(groups.items())
+    ]
+
+
+def _visible(source: Path, output: Path | None) -> Iterator[str]:
+    """Yield the path of each file below a folder."""
+    output_path = os.path.realpath(output) if output is not None else None
+    for place, folders, names in file_system.walk(source) if source.is_dir() else ():
+        folders[:] = [
+            name
+            for name in folders
+            if not name.startswith(".") and (output_path is None or os.path.realpath(f"{place}/{name}") != output_path)
+        ]
+        yield from (os.fspath(Path(place, name)) for name in names if not name.startswith("."))
