@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.stats import rankdata
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Ints
 from tacpipe.errors import TacpipeError
@@ -49,6 +47,8 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
     hedge = 1 / (len(labels) + 2)
     targets = np.where(finite, (1 - hedge) * targets + hedge / finite.sum(axis=1, keepdims=True), 0)
     spread = float(np.std(scores[finite])) or 1.0
+
+    from scipy.optimize import minimize_scalar  # slow to import, and quantiles do not need it
 
     def loss(log: float) -> float:
         logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), SMALLEST))
@@ -97,6 +97,8 @@ def auroc(known_scores: AnyFloats, unknown_scores: AnyFloats) -> float:
     >>> auroc(np.array([2.0, 3.0]), np.array([1.0, 2.0]))
     0.875
     """
+    from scipy.stats import rankdata
+
     if not len(known_scores) or not len(unknown_scores):
         return float("nan")
     ranks = rankdata(np.concatenate([known_scores, unknown_scores]))[: len(known_scores)]
