@@ -63,7 +63,7 @@ class AnySkin(Sensor):
     def framer(self) -> Framer:
         """Return a framer of frames of one size with their end, or of lines with as many numbers."""
         if self.mode == "ascii":
-            return LineFramer(self._is_line, every=self._are_lines)
+            return LineFramer(self._is_line, check_all=self._are_lines)
         size = 4 * CHANNELS * self.magnetometers + len(TAIL)
         return ByteFramer(Framing(tail=TAIL, size=size, check=_can_be_read, lock=3, weak=True))
 

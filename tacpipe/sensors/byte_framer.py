@@ -6,7 +6,7 @@ A frame is given out when it is known to be one. Where nothing but the marks spe
 sum of 8 bits, that is once ``confirm`` good frames follow it: the frame before a disturbance may be a part of it. After a
 disturbance a lock takes ``lock`` good frames in a row, all of which are then given out.
 
-A frame of text is recognised by its content. A sensor that checks many texts at once, which is faster, states as ``every``
+A frame of text is recognised by its content. A sensor that checks many texts at once, which is faster, states as ``check_all``
 whether all of them are frames; a text that is none is then found by halving.
 """
 
@@ -58,11 +58,11 @@ class ByteFramer:
         """Take what a link gave; return the frames that are complete now, and what was lost."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
-        return self._scan(ended=False)
+        return self._scan(at_end=False)
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left when nothing more comes: frames with a sum are good, others lack what confirms them."""
-        runs, losses = self._scan(ended=True)
+        runs, losses = self._scan(at_end=True)
         remaining = len(self._text.data)
         if remaining:
             complete = self._locked and bool(self._usual) and remaining >= self._usual
@@ -70,13 +70,13 @@ class ByteFramer:
             self._text.cut(remaining)
         return runs, losses
 
-    def _scan(self, *, ended: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
+    def _scan(self, *, at_end: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
         runs: list[FrameRun] = []
         losses: list[FramingLoss] = []
         place, size = 0, len(self._text.data)
         while place < size:
             if not self._locked:
-                start, retained = self._search(place, ended=ended)
+                start, retained = self._search(place, at_end=at_end)
                 if start is None:
                     place = self._skip(place, retained, losses) if retained - place > self.framing.most else place
                     break
@@ -85,7 +85,7 @@ class ByteFramer:
                 self._ruined.clear()
                 self._broken_at = None
             spans, stop, broken = self._chain(place)
-            unconfirmed = 0 if ended and not broken and self.framing.summed else self.framing.confirm
+            unconfirmed = 0 if at_end and not broken and self.framing.summed else self.framing.confirm
             place = self._give(spans, unconfirmed, runs, place)
             if not broken:
                 break
@@ -197,14 +197,14 @@ class ByteFramer:
         """Return frames of one size as an array (frame, byte), without a copy."""
         return np.frombuffer(self._text.data, np.uint8, count * size, place).reshape(count, size)
 
-    def _search(self, place: int, *, ended: bool) -> tuple[int | None, int]:
+    def _search(self, place: int, *, at_end: bool) -> tuple[int | None, int]:
         """Return the first place from ``place`` on at which ``lock`` good frames follow one another, or None.
 
         And the first place at which they still may, once more bytes are there.
         """
         possible: int | None = None
         size_of_text = len(self._text.data)
-        enough = 1 if ended and self.framing.summed else self.framing.lock
+        enough = 1 if at_end and self.framing.summed else self.framing.lock
         base = self._text.base
         self._ruined = {start for start in self._ruined if start >= base + place}
         for start in self._candidates(place):
@@ -304,14 +304,14 @@ CheckOfAll = Callable[[Sequence[bytes]], bool]
 class TextFramer:
     """Takes each packet of a link for a frame of text: those that ``check`` takes."""
 
-    def __init__(self, check: Check, every: CheckOfAll | None = None) -> None:
-        self.check, self.every = check, every
+    def __init__(self, check: Check, check_all: CheckOfAll | None = None) -> None:
+        self.check, self.check_all = check, check_all
         self.account = Account()
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the packets that are frames, as a list of bytes, and the others as losses."""
         packets = chunks.packets()
-        good = _good(packets, self.check, self.every)
+        good = _good(packets, self.check, self.check_all)
         lost = int(chunks.size[~good].sum())
         self.account.received += len(chunks.data)
         self.account.framed += len(chunks.data) - lost
@@ -331,8 +331,8 @@ class TextFramer:
 class LineFramer:
     """Cuts a stream of text into its lines, without their ends; ``check`` states which are frames."""
 
-    def __init__(self, check: Check, every: CheckOfAll | None = None, most: int = 4096) -> None:
-        self.check, self.every, self.most = check, every, most
+    def __init__(self, check: Check, check_all: CheckOfAll | None = None, most: int = 4096) -> None:
+        self.check, self.check_all, self.most = check, check_all, most
         self.account = Account()
         self._text = Pending()
         self._has_lines = False
@@ -353,7 +353,7 @@ class LineFramer:
             losses = [FramingLoss(int(arrival[0]), START, 0, int(sizes[0]))]
             lines, sizes, arrival = lines[1:], sizes[1:], arrival[1:]
         lines = [line.strip() for line in lines]
-        good = _good(lines, self.check, self.every)
+        good = _good(lines, self.check, self.check_all)
         bad = np.flatnonzero(~good).tolist()
         losses += [FramingLoss(int(arrival[row]), GARBLED, 1, int(sizes[row])) for row in bad]
         self._has_lines = True
@@ -377,14 +377,14 @@ class LineFramer:
         return [FramingLoss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
 
 
-def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> Bools:
+def _good(texts: Sequence[bytes], check: Check, check_all: CheckOfAll | None) -> Bools:
     """Return which texts are frames (text,)."""
-    if every is None or len(texts) < FEW:
+    if check_all is None or len(texts) < FEW:
         return np.fromiter(map(check, texts), bool, len(texts))
-    if every(texts):
+    if check_all(texts):
         return np.ones(len(texts), dtype=bool)
     half = len(texts) // 2
-    return np.concatenate([_good(texts[:half], check, every), _good(texts[half:], check, every)])
+    return np.concatenate([_good(texts[:half], check, check_all), _good(texts[half:], check, check_all)])
 
 
 def _select(texts: list[bytes], good: Bools) -> list[bytes]:

@@ -93,7 +93,7 @@ class KukaRsi(Sensor):
         """Return a framer that takes whole texts with an IPOC and every output."""
         return TextFramer(
             lambda packet: _numbers(self.outputs, packet) is not None,
-            every=lambda packets: _table(self.outputs, tuple(packets)) is not None,
+            check_all=lambda packets: _table(self.outputs, tuple(packets)) is not None,
         )
 
     def decode(self, frames: Sequence[bytes]) -> Samples:

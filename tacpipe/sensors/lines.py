@@ -177,8 +177,8 @@ class Lines(DescribedSensor):
     def framer(self) -> Framer:
         """Return a framer of lines, or of packets, that are well-formed or hold no sample."""
         if self.packets:
-            return TextFramer(self._is_frame, every=self._are_frames)
-        return LineFramer(self._is_frame, every=self._are_frames, most=MOST)
+            return TextFramer(self._is_frame, check_all=self._are_frames)
+        return LineFramer(self._is_frame, check_all=self._are_frames, most=MOST)
 
     def _is_frame(self, line: bytes) -> bool:
         return self._are_frames([line])

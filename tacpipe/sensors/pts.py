@@ -251,31 +251,31 @@ class FreshFramer:
 
     def __init__(self, framer: Framer, counters: Counters, modulus: int, most: int) -> None:
         self._framer, self._counters, self._modulus, self._most = framer, counters, modulus, most
-        self._held: list[FrameRun] | None = []
+        self._pending: list[FrameRun] | None = []
         self.account: Account = framer.account  # delayed frames are pending
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the frames that are known to be of this session, and what was lost."""
         runs, losses = self._framer.feed(chunks)
-        if self._held is None or not (runs or self._held):
+        if self._pending is None or not (runs or self._pending):
             return runs, losses
-        return self._decide(runs, losses, ended=False)
+        return self._decide(runs, losses, at_end=False)
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return what is left, and what is held back."""
         runs, losses = self._framer.flush()
-        return (runs, losses) if self._held is None else self._decide(runs, losses, ended=True)
+        return (runs, losses) if self._pending is None else self._decide(runs, losses, at_end=True)
 
     def _decide(
-        self, runs: list[FrameRun], losses: list[FramingLoss], *, ended: bool
+        self, runs: list[FrameRun], losses: list[FramingLoss], *, at_end: bool
     ) -> tuple[list[FrameRun], list[FramingLoss]]:
-        assert self._held is not None
+        assert self._pending is not None
         self.account.framed -= sum(run.frames.size for run in runs)
-        self._held += runs
-        if not ended and self._held[-1].t_ns[-1] - self._held[0].t_ns[0] < SETTLE_NS:
+        self._pending += runs
+        if not at_end and self._pending[-1].t_ns[-1] - self._pending[0].t_ns[0] < SETTLE_NS:
             return [], losses
-        held, self._held = self._held, None
-        stale, fresh = self._parted(held)
+        pending, self._pending = self._pending, None
+        stale, fresh = self._parted(pending)
         for run in fresh:
             self.account.framed += run.frames.size
         for run in stale:

@@ -79,7 +79,7 @@ class Xela(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer that takes the server's texts, those without this sensor too, and no other."""
-        return TextFramer(self._is_right, every=self._are_right)
+        return TextFramer(self._is_right, check_all=self._are_right)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return counts and forces; NaN where the server sent no forces."""

@@ -105,7 +105,7 @@ def test_looking_at_many_texts_at_once_finds_the_frames_that_looking_at_each_doe
     for kind, chunks in ((TextFramer, packets), (LineFramer, lines)):
         single, batched = (
             kind(bytes.isdigit),
-            kind(bytes.isdigit, every=lambda candidates: all(map(bytes.isdigit, candidates))),
+            kind(bytes.isdigit, check_all=lambda candidates: all(map(bytes.isdigit, candidates))),
         )
         (single_runs, single_losses), (batched_runs, batched_losses) = single.feed(chunks), batched.feed(chunks)
         assert [run.frames for run in single_runs] == [run.frames for run in batched_runs]
