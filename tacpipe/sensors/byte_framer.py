@@ -6,7 +6,7 @@ A frame is given out when it is known to be one. Where nothing but the marks spe
 sum of 8 bits, that is once ``confirm`` good frames follow it: the frame before a disturbance may be a part of it. After a
 disturbance a lock takes ``lock`` good frames in a row, all of which are then given out.
 
-A frame of text is recognised by its content. A sensor that checks many texts at once, which is faster, states as ``check_all``
+A frame of text is recognised by its content. A sensor that checks many texts at once, faster, states as ``check_all``
 whether all of them are frames; a text that is none is then found by halving.
 """
 
