@@ -107,6 +107,9 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         except TacpipeError as error:
             damaged |= {path.as_posix(): str(error).rstrip(".") for path in paths}
             continue
+        if sample.text is not None and not (sample.text.header or sample.text.rows):
+            damaged |= {path.as_posix(): "it has no row" for path in paths}
+            continue
         shared = len(paths) == 1 < len(data) and _is_labels(sample)
         group = _FileGroup(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
         single = sample.text is not None and sample.text.header and len(sample.text.rows) == 1 and len(paths) > 1

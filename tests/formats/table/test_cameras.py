@@ -145,6 +145,15 @@ def test_a_guess_for_videos_reads_them(lab: Lab) -> None:
     assert "gel: 12 rows" in preview.out
 
 
+def test_a_guess_leaves_out_empty_files_next_to_videos(lab: Lab) -> None:
+    write_trials(lab.folder / "lab")
+    for trial in "ab":
+        (lab.folder / "lab" / trial / "slip.txt").touch()
+    text = guess.guess_layout(lab.folder / "lab")
+    assert "[streams.slip]" not in text
+    assert [line for line in text.splitlines() if "slip.txt" in line and "it has no row" in line]
+
+
 def test_damaged_videos_and_images_of_two_sizes_are_one_sentence(lab: Lab) -> None:
     write_trials(lab.folder / "lab")
     path = lab.folder / "lab/b/gel.mp4"
