@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.plugins.constraints import PositiveInt
+from tacpipe.plugins.constraints import NonNegativeFloat, PositiveInt, Unit
 from tacpipe.plugins.stage import RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Bytes, Floats
+    from tacpipe.arrays import AnyFloats, Bytes, Floats
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
     from tacpipe.video.stream import VideoFormat
@@ -52,20 +53,71 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
 
     Example: tacpipe extract difference data/gels -o data/difference
     """
+
+    def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+        if params.rows > video_format.height_px or params.columns > video_format.width_px:
+            raise TacpipeError(
+                f"{place}: frames have {video_format.width_px} x {video_format.height_px} pixels, and the grid "
+                f"{params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
+            )
+        return _stream(columns, _difference_fields(params), _differences(columns, video_format, params))
+
+    return _with_channels(recording, compute)
+
+
+@dataclass(frozen=True)
+class MarkerParams(StreamSelection):
+    """The grid of markers, and their distance on the gel."""
+
+    rows: PositiveInt = 4  # rows of the grid; of a larger one, those next to the centre of the image
+    columns: PositiveInt = 6  # columns of the grid
+    # distance of neighbouring markers on the gel, which makes displacements millimetres; 0: pixels
+    pitch_mm: Annotated[NonNegativeFloat, Unit("mm")] = 0.0
+
+    def check(self) -> None:
+        """Refuse a grid with more markers than a table should have columns."""
+        if self.rows * self.columns > MAX_CELLS:
+            raise UsageError(
+                f"A grid of {self.rows} x {self.columns} markers has more than {MAX_CELLS:,}. Choose fewer rows or columns."
+            )
+
+
+@stage(version=1)
+def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
+    """Track the markers of a gel as tactile channels.
+
+    Each stream of frames becomes a stream with a row per frame: the displacement of each marker along x and y since the
+    first frame, and the fraction of the markers that were detected. The first frame shows the untouched gel, so start a
+    recording before contact. A marker that cannot be seen is null. No row looks ahead. A marker that moves by more than
+    half the distance of its neighbours between two frames may be taken for one of them. Streams without frames stay as
+    they are.
+
+    Example: tacpipe extract markers data/gels -o data/markers
+    """
+
+    def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+        return _stream(columns, _marker_fields(params), _displacements(place, columns, video_format, params))
+
+    return _with_channels(recording, compute)
+
+
+def _with_channels(
+    recording: Recording, compute: Callable[[str, Columns, VideoFormat], pa.RecordBatchReader]
+) -> RecordingOutput:
+    """Return a recording whose streams of frames are replaced; ``compute`` gets how errors name the stream."""
     from tacpipe.video.stream import read_format
 
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
-    formats: dict[str, VideoFormat] = {}
+    has_frames = False
     for name in recording.streams:
         columns = recording.columns(name)
         video_format = read_format(columns)
         if video_format is None:
             streams[name] = _copied(columns)
         else:
-            formats[name] = video_format
-            _require_pixels(recording.name, name, video_format, params)
-            streams[name] = _differences(columns, video_format, params)
-    if not formats:
+            has_frames = True
+            streams[name] = compute(f"Recording {recording.name}, stream {name}", columns, video_format)
+    if not has_frames:
         raise TacpipeError(
             f"Recording {recording.name} has no stream of frames; its streams are {', '.join(recording.streams)}. Give the "
             f"recording of a camera, as `tacpipe ingest` or `tacpipe acquire` wrote it."
@@ -91,15 +143,6 @@ def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
     return means
 
 
-def _require_pixels(recording: str, stream: str, video_format: VideoFormat, params: Params) -> None:
-    """Raise `TacpipeError` where a cell of the grid would be smaller than a pixel."""
-    if params.rows > video_format.height_px or params.columns > video_format.width_px:
-        raise TacpipeError(
-            f"Recording {recording}, stream {stream}: frames have {video_format.width_px} x {video_format.height_px} "
-            f"pixels, and the grid {params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
-        )
-
-
 def _copied(columns: Columns) -> pa.RecordBatchReader:
     """Return a stream as it is, read by batches."""
     import pyarrow as pa
@@ -108,53 +151,104 @@ def _copied(columns: Columns) -> pa.RecordBatchReader:
     return pa.RecordBatchReader.from_batches(columns.schema, batches)
 
 
-def _differences(columns: Columns, video_format: VideoFormat, params: Params) -> pa.RecordBatchReader:
-    """Return the stream of differences of a stream of frames, computed as it is read."""
+def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]) -> pa.RecordBatchReader:
+    """Return a stream of the clocks of ``columns`` and of ``values``, row number and values (field,), as they come."""
     import pyarrow as pa
 
-    from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import BATCH_ROWS
 
     clock_names = [name for name in ("t_ns", "t_device_ns", "seq") if name in columns.column_names]
     clocks = columns.read(clock_names)
-    schema = pa.schema([*clocks.schema, *_fields(params)])
-
-    def table(rows: list[int], values: list[Floats]) -> pa.RecordBatch:
-        table = clocks.take(rows).combine_chunks()
-        cells = np.array(values, np.float32).reshape(len(rows), -1)  # (time, cell and colour)
-        arrays = [*(table.column(name).chunk(0) for name in clock_names), *map(pa.array, cells.T)]
-        return pa.RecordBatch.from_arrays(arrays, schema=schema)
+    schema = pa.schema([*clocks.schema, *fields])
 
     def batches() -> Iterator[pa.RecordBatch]:
-        rows: list[int] = []
-        values: list[Floats] = []
-        reference_sum, reference_count = np.zeros((params.rows, params.columns, len(COLOURS))), 0
-        for row, image in decode_frames(video_format, read_batches(columns)):
-            means = cell_means(image, params.rows, params.columns)
-            if reference_count < params.reference_frames:
-                reference_sum, reference_count = reference_sum + means, reference_count + 1
-            rows.append(row)
-            values.append(means - reference_sum / reference_count)
-            if len(rows) == BATCH_ROWS:
-                yield table(rows, values)
-                rows, values = [], []
-        if rows:
-            yield table(rows, values)
+        for block in _blocks(values, BATCH_ROWS):
+            times = clocks.take([row for row, _ in block]).combine_chunks()
+            channels = np.array([row_values for _, row_values in block], np.float32)  # (time, field)
+            arrays = [pa.array(channel, from_pandas=True) for channel in channels.T]  # NaN is null
+            clock_arrays = [times.column(name).chunk(0) for name in clock_names]
+            yield pa.RecordBatch.from_arrays([*clock_arrays, *arrays], schema=schema)
 
     return pa.RecordBatchReader.from_batches(schema, batches())
 
 
-def _fields(params: Params) -> list[pa.Field]:
+def _differences(columns: Columns, video_format: VideoFormat, params: Params) -> Iterator[tuple[int, AnyFloats]]:
+    """Yield row number and differences (cell and colour,) of each frame."""
+    from tacpipe.video.decoding import decode_frames, read_batches
+
+    reference_sum, reference_count = np.zeros((params.rows, params.columns, len(COLOURS))), 0
+    for row, image in decode_frames(video_format, read_batches(columns)):
+        means = cell_means(image, params.rows, params.columns)
+        if reference_count < params.reference_frames:
+            reference_sum, reference_count = reference_sum + means, reference_count + 1
+        yield row, (means - reference_sum / reference_count).ravel()
+
+
+def _displacements(
+    place: str, columns: Columns, video_format: VideoFormat, params: MarkerParams
+) -> Iterator[tuple[int, AnyFloats]]:
+    """Yield row number and displacements of each frame (marker and axis,), and the fraction of markers detected."""
+    from tacpipe.video.decoding import decode_frames, read_batches
+    from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
+
+    use_one_thread()  # a stage runs on one core per recording
+    tracker: MarkerTracker | None = None
+    for row, image in decode_frames(video_format, read_batches(columns), grey=True):
+        if tracker is None:
+            grid = find_grid(image, params.rows, params.columns)
+            if grid is None:
+                raise TacpipeError(
+                    f"{place}: no grid of dark markers is seen in the first frame. Use `tacpipe extract difference` for a "
+                    f"gel without markers."
+                )
+            tracker = MarkerTracker(grid, image)
+            scale = params.pitch_mm / grid.pitch_px if params.pitch_mm else 1.0
+        positions_px, is_detected = tracker.step(image)
+        exists = ~np.isnan(tracker.grid.positions_px[:, 0])
+        moved = scale * (positions_px - tracker.grid.positions_px)  # (marker, xy)
+        yield row, np.append(moved.ravel(), is_detected[exists].mean())
+
+
+def _blocks(values: Iterator[tuple[int, AnyFloats]], rows: int) -> Iterator[list[tuple[int, AnyFloats]]]:
+    """Yield ``values`` in lists of ``rows``."""
+    while block := list(itertools.islice(values, rows)):
+        yield block
+
+
+def _difference_fields(params: Params) -> list[pa.Field]:
     """Return the fields ``taxel0101_red`` …: row and column from 1 and colour, float32 grey levels."""
     import pyarrow as pa
 
-    def metadata(row: int, column: int, colour: str) -> Mapping[str, str]:
-        place = {"row": str(row), "column": str(column), "taxel": str((row - 1) * params.columns + column)}
-        return {"unit": "count", "quantity": "tactile", **place, "component": colour}
-
     return [
-        pa.field(f"taxel{row:02d}{column:02d}_{colour}", pa.float32(), metadata=metadata(row, column, colour))
+        pa.field(
+            f"taxel{row:02d}{column:02d}_{colour}",
+            pa.float32(),
+            metadata={"unit": "count", **_place(row, column, params.columns), "component": colour},
+        )
         for row in range(1, params.rows + 1)
         for column in range(1, params.columns + 1)
         for colour in COLOURS
     ]
+
+
+def _marker_fields(params: MarkerParams) -> list[pa.Field]:
+    """Return the fields ``taxel0101_x``, ``taxel0101_y`` …, float32 px or mm, and ``detected_ratio``."""
+    import pyarrow as pa
+
+    unit = "mm" if params.pitch_mm else "px"
+    displacements = [
+        pa.field(
+            f"taxel{row:02d}{column:02d}_{axis}",
+            pa.float32(),
+            metadata={"unit": unit, **_place(row, column, params.columns), "axis": axis},
+        )
+        for row in range(1, params.rows + 1)
+        for column in range(1, params.columns + 1)
+        for axis in ("x", "y")
+    ]
+    return [*displacements, pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})]
+
+
+def _place(row: int, column: int, columns: int) -> dict[str, str]:
+    """Return the metadata of a tactile channel at a place of a grid, counted from 1."""
+    return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}

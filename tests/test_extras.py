@@ -96,6 +96,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest gelsight-slip gels -o {o}": "video",
     "extract difference data/gels -o {o}": "video",
+    "extract markers data/gels -o {o}": "video",
     "ingest table workbooks --guess": "xlsx",
     "ingest mcap bags -o {o}": "ros",
     "ingest rosbag bags -o {o}": "ros",

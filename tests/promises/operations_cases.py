@@ -214,6 +214,8 @@ def _publish(name: str, place: Path) -> None:
         grasp_files.write_grasp(place)
     elif name == "gelsight-slip":
         video_files.write_gelsight(place)
+    elif name == "markers":
+        video_files.write_gelsight(place, markers=True)
     elif name == "table":
         place.mkdir()
         for trial in "ab":
@@ -242,6 +244,12 @@ STAGES = (
     *_cases_of_chain("material", {3: "train.material"}),
     *_cases_of_chain("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
     *_cases_of_chain("touch", {3: "train.touch"}),
+    Case(
+        "extract.markers",
+        "extract markers data/gels -o data/m --rows 2 --columns 3",
+        ("ingest gelsight-slip src -o data/gels",),
+        sources=lambda lab: _publish("markers", lab / "src"),
+    ),
     Case(
         "extract.difference",
         "extract difference data/gels -o data/d",

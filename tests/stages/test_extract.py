@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,19 +20,18 @@ from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
 from tests.formats import video_files
 from tests.stage_params import build_params
-from tests.video import videos
+from tests.video import gels, videos
 from tests.video.test_video_files import columns_of
 
 
-def differences(frames: pa.Table, **params: int) -> pa.Table:
+def differences(frames: pa.Table, **params: Any) -> pa.Table:
     """Return the channels of a stream of frames."""
     return extract({"gel": frames}, **params)["gel"]
 
 
-def extract(tables: dict[str, pa.Table], **params: int) -> dict[str, pa.Table]:
-    """Return what the stage makes of a recording of some streams."""
-    stage = load("extract.difference")
-    output = stage.function(build_params("extract.difference", **params), FakeRecording(tables))
+def extract(tables: dict[str, pa.Table], name: str = "extract.difference", **params: Any) -> dict[str, pa.Table]:
+    """Return what a stage makes of a recording of some streams."""
+    output = load(name).function(build_params(name, **params), FakeRecording(tables))
     return {name: table.read_all() for name, table in output.streams.items()}
 
 
@@ -112,3 +112,53 @@ def test_a_recording_without_frames_and_a_grid_that_is_too_fine_are_refused(lab:
     refused = lab.call("extract difference data/gels -o data/d --rows 200 --columns 200")
     assert refused.code == 2
     assert "more than 10,000" in refused.err
+
+
+@pytest.fixture(scope="module")
+def pressed_gel(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
+    """A gel that is pressed in 15 frames, without loss."""
+    places = gels.places()
+    images = np.array(
+        [gels.image(gels.press(places, depth), frame) for frame, depth in enumerate(np.linspace(0, 1, 15))]
+    )
+    return frames_of(videos.write_images(tmp_path_factory.mktemp("gel") / "gel.mkv", "ffv1", images))
+
+
+def test_markers_become_displacements_in_pixels_or_millimetres(pressed_gel: pa.Table) -> None:
+    table = extract({"gel": pressed_gel}, "extract.markers", rows=3, columns=5)["gel"]
+    assert len(of_quantity(table, "tactile")) == 3 * 5 * 2
+    places = gels.places().reshape(7, 9, 2)[2:5, 2:7].reshape(-1, 2)
+    expected = gels.press(places, 1.0) - places
+    names = [f"taxel{row:02d}{column:02d}" for row in (1, 2, 3) for column in range(1, 6)]
+    last = np.array([[table.column(f"{name}_{axis}")[-1].as_py() for axis in "xy"] for name in names])
+    assert np.abs(last - expected).max() < 0.2
+    assert table.column("detected_ratio").to_pylist() == [1.0] * 15
+    field = table.schema.field("taxel0203_x")
+    assert field.metadata[b"unit"] == b"px"
+    in_mm = extract({"gel": pressed_gel}, "extract.markers", rows=3, columns=5, pitch_mm=1.6)["gel"]
+    assert in_mm.schema.field("taxel0203_x").metadata[b"unit"] == b"mm"
+    ratio = in_mm.column("taxel0203_x")[-1].as_py() / table.column("taxel0203_x")[-1].as_py()
+    assert ratio == pytest.approx(1.6 / gels.PITCH_PX, rel=0.01)
+
+
+@pytest.mark.parametrize("stop", [1, 2, 8, 14])
+def test_displacements_do_not_change_when_later_frames_are_cut_off(pressed_gel: pa.Table, stop: int) -> None:
+    complete = extract({"gel": pressed_gel}, "extract.markers")["gel"]
+    assert extract({"gel": pressed_gel.slice(0, stop)}, "extract.markers")["gel"].equals(complete.slice(0, stop))
+
+
+def test_a_marker_that_is_not_there_is_null(tmp_path: Path) -> None:
+    places = np.delete(gels.places(4, 6), 9, axis=0)
+    images = np.array([gels.image(places, frame) for frame in range(3)])
+    frames = frames_of(videos.write_images(tmp_path / "gel.mkv", "ffv1", images))
+    table = extract({"gel": frames}, "extract.markers")["gel"]
+    nulls = [name for name in table.column_names if table.column(name).null_count]
+    assert nulls == ["taxel0204_x", "taxel0204_y"]
+    assert table.column("taxel0204_x").null_count == 3
+
+
+def test_a_gel_without_markers_is_refused_in_a_sentence(video: Path) -> None:
+    with pytest.raises(
+        TacpipeError, match=r"Recording trial, stream gel: no grid of dark markers .* extract difference"
+    ):
+        extract({"gel": frames_of(video)}, "extract.markers")

@@ -45,11 +45,19 @@ def write(
     path: Path, encoder: str, count: int = 30, *, absent: Collection[int] = (), irregular: bool = False, size: int = 1
 ) -> Path:
     """Write a video of `images`, without the frames ``absent``, at 25 frames per second or at ``irregular`` times."""
+    frames = images(count, HEIGHT * size, WIDTH * size)
+    return write_images(path, encoder, frames, absent=absent, irregular=irregular)
+
+
+def write_images(
+    path: Path, encoder: str, frames: Bytes, *, absent: Collection[int] = (), irregular: bool = False
+) -> Path:
+    """Write a video of images (frame, row, column, rgb), as `write`."""
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(encoder, rate=RATE_HZ, options=OPTIONS.get(encoder, {}))
-        stream.height, stream.width = HEIGHT * size, WIDTH * size
+        stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = PIXELS.get(encoder, "yuv420p")
-        for index, image in enumerate(images(count, HEIGHT * size, WIDTH * size)):
+        for index, image in enumerate(frames):
             if index in absent:
                 continue
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
