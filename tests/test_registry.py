@@ -132,7 +132,8 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
 
 
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
-    data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
+    # words of data too: a role, kinds of dataset, a message of HID, a key of Croissant's JSON
+    data = {"split", "train", "report", "export", "extract"}
     stage_names = {*registry.stages(), *registry.commands()} - data
     # the command line has aliases and groups of commands, an export of frames runs synchronize before it, the viewer
     # reads the thresholds of contacts, and a live session reads the params of an earlier version of synchronize

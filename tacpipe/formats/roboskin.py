@@ -23,9 +23,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import walk
@@ -278,9 +275,12 @@ def lag_one(values: AnyArray, axis: int) -> float:
 
     NaN where there are no neighbours or they do not vary.
 
+    >>> import numpy as np
     >>> round(lag_one(np.array([[0.0, 1.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]]), axis=1), 1)
     1.0
     """
+    import numpy as np
+
     moved = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
     before, after = moved[:-1].ravel(), moved[1:].ravel()
     if not before.size or not np.isfinite(moved).all():
@@ -295,6 +295,8 @@ def is_time(values: AnyArray, axis: int, lowest: float = LEAST) -> bool:
 
     False where nothing varies along it: such an array states nothing about its axes.
     """
+    import numpy as np
+
     candidate = axis % values.ndim
     along = [lag_one(values, place) for place in range(values.ndim)]
     other_axes = [
@@ -306,10 +308,13 @@ def is_time(values: AnyArray, axis: int, lowest: float = LEAST) -> bool:
 def scramble(slides: AnyArray) -> AnyArray:
     """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, of the same shape.
 
+    >>> import numpy as np
     >>> measured = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
     >>> scramble(measured).tolist()
     [[[0, 10, 1, 11]], [[2, 12, 3, 13]]]
     """
+    import numpy as np
+
     triangles, taxels, frames = slides.shape[-3:]
     in_turn = np.moveaxis(slides, -3, -1)  # (…, taxel, time, triangle)
     rows = in_turn.reshape(*slides.shape[:-3], taxels, triangles, frames)
@@ -319,9 +324,12 @@ def scramble(slides: AnyArray) -> AnyArray:
 def unscramble(published: AnyArray) -> AnyArray:
     """Return slides as they were measured, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
 
+    >>> import numpy as np
     >>> unscramble(np.array([[[0, 10, 1, 11]], [[2, 12, 3, 13]]])).tolist()
     [[[0, 1, 2, 3]], [[10, 11, 12, 13]]]
     """
+    import numpy as np
+
     triangles, taxels, frames = published.shape[-3:]
     rows = np.swapaxes(published, -3, -2)  # (…, taxel, row, place in the row)
     in_turn = rows.reshape(*published.shape[:-3], taxels, frames, triangles)
