@@ -112,7 +112,7 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
 def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     """Compress tactile channels with principal components.
 
-    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Raises `TacpipeError` where
+    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Raises `TacpipeError` if
     the recording's channels are not those the codec was fitted on.
 
     Example: tacpipe compress pca data/segments --split data/split -o data/latents
@@ -127,7 +127,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     """Compress tactile channels with an autoencoder.
 
     The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training recordings
-    are held out to stop the training. Raises `TacpipeError` where the
+    are held out to stop the training. Raises `TacpipeError` if the
     recording's channels are not those the codec was fitted on.
 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/codes

@@ -153,7 +153,7 @@ def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeE
 
 
 def _rate_hz(name: str, t_ns: Times) -> float:
-    """Return how many rows there are a second. Raises `TacpipeError` where their steps are not even."""
+    """Return how many rows there are a second. Raises `TacpipeError` if their steps are not even."""
     import numpy as np
 
     if len(t_ns) < 2:

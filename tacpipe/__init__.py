@@ -76,7 +76,7 @@ def __dir__() -> list[str]:
 def open(path: str | PathLike[str]) -> Dataset:
     """Return the dataset whose directory or manifest is ``path``; its bytes are read and verified when asked for.
 
-    Raises `UsageError` where there is no dataset, `DamagedError` where its manifest was changed.
+    Raises `UsageError` if there is no dataset, `DamagedError` if its manifest was changed.
     """
     from tacpipe.engine.pipeline import open_dataset
 

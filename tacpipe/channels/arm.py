@@ -55,7 +55,7 @@ TRUTH = "gt_"  # how columns with ground truth begin
 
 @dataclass(frozen=True)
 class Pose:
-    """The columns of an arm's position x, y, z and of its quaternion x, y, z, w; empty where it has none."""
+    """The columns of an arm's position x, y, z and of its quaternion x, y, z, w, or empty if it has none."""
 
     position: tuple[str, ...] = ()
     orientation: tuple[str, ...] = ()
@@ -80,7 +80,7 @@ def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
     ``arm`` names the stream of the arm; without it that is the only one with a position, or else the one named robot.
     An arm without a quaternion has no orientation. Where none is ``needed`` nor named, several streams with a position, as
     markers have, and a position that is not x, y and z are not an arm. Else raises `TacpipeError` for these, and
-    `UsageError` where ``arm`` has no position.
+    `UsageError` if ``arm`` has no position.
     """
     vectors = _vectors(schema, POSITION)
     if not vectors and set(NAMED.columns) <= set(schema.names):
@@ -171,7 +171,7 @@ def profile(streams: Mapping[str, pa.Table], t_ns: Times, *, by_place: bool = Fa
     """Return what the arm did at ``t_ns``, each (time,); empty without an arm.
 
     ``speed_raw_m_s`` and ``speed_m_s`` are the speed of the hand as recorded and after a median of three readings,
-    ``force_n`` the force along z, on which the finger presses, NaN where none was recorded. ``by_place`` derives the speed
+    ``force_n`` the force along z, on which the finger presses, or NaN if none was recorded. ``by_place`` derives the speed
     from positions where nothing else gives it.
     """
     import numpy as np

@@ -71,7 +71,7 @@ def read_clocks(columns: Columns) -> Clocks | None:
 def rate_hz(table: pa.Table | Columns) -> float | None:
     """Return the rate of a stream's rows: by the device's own counter where there is one, else by the median step.
 
-    None where there are no times, or too few rows.
+    None if there are no times, or too few rows.
     """
     import numpy as np
 
@@ -253,7 +253,7 @@ def apart(attributes: Mapping[str, Any]) -> float:
 
 
 def times(table: pa.Table) -> Int64s:
-    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
+    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` if there are none."""
     import numpy as np
 
     if "t_ns" not in table.column_names:

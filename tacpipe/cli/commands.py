@@ -284,7 +284,7 @@ SHOWN = 20  # Largest number of recordings whose changes are printed
 
 
 def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclude: str | None, include: bool) -> None:
-    """Raise `UsageError` where labels come from a table and from the command line."""
+    """Raise `UsageError` if labels come from a table and from the command line."""
     if names or sets or exclude is not None or include:
         raise UsageError(
             "--from names recordings and labels itself; leave out names, --label, --exclude and --include."

@@ -26,7 +26,7 @@ COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # Set by the shell: complete_bash, co
 
 
 def words_to_complete(environment: Mapping[str, str] = os.environ) -> list[str] | None:
-    """Return the words after ``tacpipe`` of the line that the shell completes; None where it completes nothing.
+    """Return the words after ``tacpipe`` of the line that the shell completes, or None if it completes nothing.
 
     The word at the cursor is the last one, unless the line ends in a space.
 

@@ -147,7 +147,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _architecture(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the task and today's name of the architecture that a configuration names; None where it names none."""
+    """Return the task and today's name of the architecture that a configuration names, or None if it names none."""
     task, stored = config.get("task"), config.get("architecture")
     return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
 
@@ -230,7 +230,7 @@ def _history(opened: Dataset) -> list[dict[str, Any]]:
 
 
 def _best(history: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the epoch of least validation loss, None where the history has none."""
+    """Return the epoch of least validation loss, or None if the history has none."""
     validated = [line for line in history if isinstance(line.get("val_loss"), int | float)]
     best = min(validated, key=lambda line: line["val_loss"], default=None)
     return {"epoch": best.get("epoch"), "loss": best["val_loss"]} if best else None

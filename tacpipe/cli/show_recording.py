@@ -110,7 +110,7 @@ class RecordingOverview:
 def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
     """Draw a recording, the only one where none is named, and return the picture's path.
 
-    Raises `UsageError` where the dataset has several recordings and none is named.
+    Raises `UsageError` if the dataset has several recordings and none is named.
     """
     from tacpipe.viewer import contents, figure
 
@@ -125,7 +125,7 @@ def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
 
 
 def overview(dataset: Path, name: str) -> RecordingOverview:
-    """Return the contents of a recording. Raises `UsageError` where the dataset has none of this name."""
+    """Return the contents of a recording. Raises `UsageError` if the dataset has none of this name."""
     from tacpipe.traces import spans
 
     opened = _open(dataset)
@@ -236,7 +236,7 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
 
 
 def _missing_frames(columns: Columns) -> int | None:
-    """Return how many frames are missing by the counter ``seq``, None where the stream has none."""
+    """Return how many frames are missing by the counter ``seq``, or None if the stream has none."""
     if "seq" not in columns.column_names or not columns.num_rows:
         return None
     seq = columns.column("seq").to_numpy()
@@ -262,7 +262,7 @@ def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[flo
     for batch in columns.batches(names):
         repeated = np.ones(batch.num_rows, dtype=bool)  # (time,)
         for name in names:
-            values = batch[name].to_numpy()  # (time,), NaN where there is none
+            values = batch[name].to_numpy()  # (time,), or NaN if there is none
             limits = np.iinfo(batch.schema.field(name).type.to_pandas_dtype())
             saturated += int(((values == limits.max) | (values == limits.min)).sum())
             repeated[1:] &= values[1:] == values[:-1]

@@ -26,7 +26,7 @@ COLOUR = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points in the camera's frame; raises `TacpipeError` where one is not finite."""
+    """Points in the camera's frame; raises `TacpipeError` if one is not finite."""
 
     points_m: Float32s  # (point, xyz), metres
     colours: Bytes | None = None  # (point, rgb), 0 to 255
@@ -55,7 +55,7 @@ class Cloud:
     def of(cls, table: pa.Table) -> Cloud:
         """Return the cloud that a table holds, one row a point, with colours if it has all three columns.
 
-        Raises `TacpipeError` where a coordinate's column is missing.
+        Raises `TacpipeError` if a coordinate's column is missing.
         """
         require_columns(table, POSITION)
         points = np.column_stack([table.column(name).to_numpy() for name in POSITION]).astype(np.float32, copy=False)
@@ -201,7 +201,7 @@ class DepthFrame:
 
     @classmethod
     def of_bytes(cls, content: bytes) -> DepthFrame:
-        """Return the frame that `to_bytes` gave. Raises `TacpipeError` where it is none or was cut off."""
+        """Return the frame that `to_bytes` gave. Raises `TacpipeError` if it is none or was cut off."""
         if len(content) < HEADER.size or not content.startswith(MAGIC):
             raise TacpipeError(f"{len(content)} bytes are not a depth frame; it must begin with {MAGIC.decode()}.")
         _, width, height, coloured, *optics = HEADER.unpack_from(content)

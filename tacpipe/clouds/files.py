@@ -37,7 +37,7 @@ def read(path: Path | str) -> Cloud:
 
 
 def require_metres(path: Path, cloud: Cloud) -> None:
-    """Raise `TacpipeError` where a cloud is larger than `LARGEST_M`."""
+    """Raise `TacpipeError` if a cloud is larger than `LARGEST_M`."""
     extent_m = float(np.ptp(cloud.points_m.astype(np.float64), axis=0).max(initial=0.0))
     if extent_m > LARGEST_M:
         raise TacpipeError(

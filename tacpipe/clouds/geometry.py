@@ -171,7 +171,7 @@ def _principal_axes(points: Floats) -> dict[str, float]:
 
 
 def _profile(points: Floats, opening_m: float) -> dict[str, float]:
-    """Return the height of the slice between the fingers, from the first to the second; 0 where nothing is seen."""
+    """Return the height of the slice between the fingers, from the first to the second, or 0 if nothing is seen."""
     inside = points[np.abs(points[:, 2]) < SLICE_M]
     bins = np.floor((inside[:, 1] / opening_m + 0.5) * BINS).astype(int)
     heights = [float(np.median(at)) if len(at := inside[bins == index, 0]) else 0.0 for index in range(BINS)]
@@ -239,7 +239,7 @@ class Extent:
 
     corners_m: AnyFloats  # (corner, xyz), of the convex hull
     centroid_m: AnyFloats  # (xyz), mean of all points
-    colours: AnyFloats | None  # (lowest and highest, rgb), 0 to 1; None where the cloud has no colours
+    colours: AnyFloats | None  # (lowest and highest, rgb), 0 to 1, or None if the cloud has no colours
 
     @classmethod
     def of(cls, cloud: Cloud) -> Extent:

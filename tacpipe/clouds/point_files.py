@@ -117,7 +117,7 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
 
 
 def require_compressed(path: Path, content: bytes, header: Header) -> None:
-    """Raise `TacpipeError` where compressed points are not as many as their header states, or more than they can be.
+    """Raise `TacpipeError` if compressed points are not as many as their header states, or more than they can be.
 
     In front of them stand their size and that of the points once unpacked, four bytes each.
     """
@@ -174,7 +174,7 @@ def _whole_number(path: Path, keyword: str, words: list[str]) -> int:
 
 
 def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
-    """Return the fields of a point. Raises `TacpipeError` where they are not named, or position and colour are no such."""
+    """Return the fields of a point. Raises `TacpipeError` if they are not named, or position and colour are no such."""
     names = lines["FIELDS"]
     counts = lines.get("COUNT", ["1"] * len(names))
     for keyword, words in (("SIZE", lines["SIZE"]), ("TYPE", lines["TYPE"]), ("COUNT", counts)):
@@ -332,7 +332,7 @@ def _ply_header(path: Path, content: bytes) -> _Header:
 
 
 def _size(element: list[list[str]], form: str) -> int | None:
-    """Return how many bytes an element has, or lines where it is text; None where the header does not give it (lists)."""
+    """Return how many bytes an element has, or lines where it is text, or None if the header does not give it (lists)."""
     (_, *declared), *rows = element
     kinds = [words[1:] for words in rows if words[:1] == ["property"]]
     if len(declared) != 2 or not _is_count(declared[1]):
@@ -367,7 +367,7 @@ def _is_count(word: str) -> bool:
 
 
 def _require(path: Path, header: _Header, available: int, width: int, unit: str) -> None:
-    """Raise `TacpipeError` where too little follows the header for its points, or too much though nothing else may."""
+    """Raise `TacpipeError` if too little follows the header for its points, or too much though nothing else may."""
     needed = header.points * width
     if available < needed or (header.only_vertices and available > needed):
         raise TacpipeError(

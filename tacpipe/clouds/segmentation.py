@@ -42,7 +42,7 @@ class SegmentationLimits:
 def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: int = 0) -> Indices:
     """Return which points of a view (point,) are the grasped object, in their order; the camera is at the origin.
 
-    Raises `TacpipeError` where no table is found, nothing stands on it, nothing that stands there is near
+    Raises `TacpipeError` if no table is found, nothing stands on it, nothing that stands there is near
     the grasp, or that is too long for an object.
     """
     points_m = scene.points_m.astype(np.float64)

@@ -201,7 +201,7 @@ PLUGIN = "plugin"  # field of `codec.json`: the package and version of a codec t
 def load(files: Mapping[str, bytes]) -> FittedCodec:
     """Return the codec that `codec.json` and `codec.safetensors` among ``files`` hold.
 
-    Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` where a file is missing, where the
+    Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` if a file is missing, where the
     kind is not installed, and where its parts do not fit one another.
     """
     missing = [name for name in (DESCRIPTION, TENSORS) if name not in files]
@@ -226,7 +226,7 @@ def load(files: Mapping[str, bytes]) -> FittedCodec:
 def to_files(codec: FittedCodec) -> dict[str, bytes]:
     """Return the files of a fitted codec, with the package that brings it, once they were read back.
 
-    Raises `TacpipeError` where its kind is not that of an entry point, or its parts do not fit one another.
+    Raises `TacpipeError` if its kind is not that of an entry point, or its parts do not fit one another.
     """
     files = dict(codec.to_files())
     read = load(files)
@@ -252,7 +252,7 @@ def check_latents(codec: Codec, latents: AnyFloats, rows: int) -> None:
 
 
 def _tried(read: Callable[[], FittedCodec]) -> FittedCodec:
-    """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` where they do not."""
+    """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` if they do not."""
     with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()
         if codec.representation not in (LEVELS, INCREMENTS) or not all(

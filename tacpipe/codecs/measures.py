@@ -98,7 +98,7 @@ def standard(values: AnyFloats, representation: str) -> tuple[AnyFloats, AnyFloa
     """Return mean and scale of each channel in counts, (channel,) each, of training rows ``values`` (time, channel).
 
     The scale is the standard deviation, and 1 for a channel that never moves. Increments keep the mean 0, so that rows
-    that do not move have latents 0. Raises `TacpipeError` where no channel moves.
+    that do not move have latents 0. Raises `TacpipeError` if no channel moves.
     """
     moves = _moves(values)
     if not moves.any():

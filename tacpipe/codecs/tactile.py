@@ -28,7 +28,7 @@ LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes where a ch
 
 
 def metadata(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a column as text, empty where it has none."""
+    """Return the metadata of a column as text, or empty if it has none."""
     return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
 
 
@@ -49,7 +49,7 @@ def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
 def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
     """Return each channel's level without load in counts, shape (channel,), from its field metadata ``levels``.
 
-    Raises `TacpipeError` where a channel has none.
+    Raises `TacpipeError` if a channel has none.
     """
     levels = []
     for name in channels:
@@ -80,7 +80,7 @@ def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchRead
     """Return the recording's table with its latents, float32 columns, by the codec whose files were ``fitted``.
 
     A codec with ``reads``, the number of rows up to each that its latents depend on, encodes a long recording in pieces,
-    and these are returned as they are made; any other encodes it as a whole. Raises `TacpipeError` where the recording's
+    and these are returned as they are made; any other encodes it as a whole. Raises `TacpipeError` if the recording's
     channels are not those the codec was fitted on.
     """
     codec, stored_columns = codecs.load(fitted), recording.columns()

@@ -149,7 +149,7 @@ def stored(recordings: Mapping[str, Recording], representation: str, frames: int
     """Return the rows of recordings that a codec of a ``representation`` and some ``frames`` is fitted on.
 
     A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Raises
-    `TacpipeError` where there is no recording or no tactile channel.
+    `TacpipeError` if there is no recording or no tactile channel.
     """
     codec.check_representation(representation)
     if not recordings:

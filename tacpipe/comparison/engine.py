@@ -48,7 +48,7 @@ class ComparisonRow:
     values: tuple[float, ...]  # one value for each column of the comparison
     score: Estimate  # the score that charts draw
     spread: float  # standard deviation of the score over runs; NaN for a single one
-    baseline: str  # the best baseline on the same recordings; empty where none was evaluated, and for baselines
+    baseline: str  # the best baseline on the same recordings, or empty if none was evaluated, and for baselines
     gain: Gain  # over it
     p: float  # p of the hypothesis that both are alike (`pairing.swap_test`), not corrected for the number of methods
     n: int  # clusters
@@ -314,7 +314,7 @@ class PairedRuns:
     """Two methods compared over what both were repeated for."""
 
     unit: str  # ``folds``, or ``seeds`` where there is one fold
-    units: int  # units that both methods have; 0 where there are fewer than two
+    units: int  # units that both methods have, or 0 if there are fewer than two
     p: float  # p of the paired t test, NaN below two units and where all differ by as much
 
 

@@ -283,7 +283,7 @@ def report_on(task: str) -> TaskReport:
 
 
 def task_of(result: Dataset) -> str:
-    """Return the name of the task that a result is of; empty where it does not state."""
+    """Return the name of the task that a result is of, or empty if it does not state."""
     return str(json.loads(result.files.get(CONFIG, b"{}")).get("task", ""))
 
 

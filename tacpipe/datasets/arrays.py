@@ -43,19 +43,19 @@ class Arrays:
     columns: tuple[str, ...]  # the channels: names of the columns of `values`, in order
 
     def __getitem__(self, name: str) -> AnyArray:
-        """Return one column, channel or not, in its own type (time,). Raises `KeyError` where it was not read."""
+        """Return one column, channel or not, in its own type (time,). Raises `KeyError` if it was not read."""
         return self.by_column[name]
 
     @property
     def t_ns(self) -> Int64s | None:
-        """The times of the rows in nanoseconds, int64 (time,); None where the stream has none or they were not read."""
+        """The times of the rows in nanoseconds, int64 (time,), or None if the stream has none or they were not read."""
         return self.by_column.get(TIME)
 
     @cached_property
     def values(self) -> AnyArray:
         """The channels side by side (time, channel), in the smallest type that holds each of them; null becomes NaN.
 
-        Raises `UsageError` where no common type holds every value: an integer beyond 2^53 next to a float.
+        Raises `UsageError` if no common type holds every value: an integer beyond 2^53 next to a float.
         """
         channels = {name: self.by_column[name] for name in self.columns}
         kinds: list[Any] = [array.dtype for array in channels.values()]
@@ -81,7 +81,7 @@ class Arrays:
 class Tensors:
     """A stream of one recording as tensors: times apart from the channels, as in `Arrays`, with the same types."""
 
-    t_ns: torch.Tensor | None  # int64 (time,), nanoseconds; None where the stream has none or they were not read
+    t_ns: torch.Tensor | None  # int64 (time,), nanoseconds, or None if the stream has none or they were not read
     values: torch.Tensor  # (time, channel)
     columns: tuple[str, ...]  # the channels: names of the columns of `values`, in order
 
@@ -93,7 +93,7 @@ def arrays_of_table(table: pa.Table) -> Arrays:
 
 
 def to_tensors(arrays: Arrays) -> Tensors:
-    """Return times and channels of ``arrays`` as tensors. Raises `UsageError` where a time is null."""
+    """Return times and channels of ``arrays`` as tensors. Raises `UsageError` if a time is null."""
     import torch
 
     t_ns = arrays.t_ns

@@ -202,7 +202,7 @@ class Dataset:
         return iter(self.recordings.values())
 
     def __getitem__(self, name: str) -> Recording:
-        """Return the recording of this name. Raises `UsageError` where there is none."""
+        """Return the recording of this name. Raises `UsageError` if there is none."""
         if name not in self.recordings:
             raise UsageError(
                 f"There is no recording {name!r} in {self._place}; it has {listed(self.recordings, _NAMED)}."

@@ -74,7 +74,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
 
 
 def _provenance(store: Store, manifest: str, written_s: int, key: str) -> dict[str, Any] | None:
-    """Return how a manifest was made, which was written at its path at ``written_s``; None where no record states it.
+    """Return how a manifest was made, which was written at its path at ``written_s``, or None if no record states it.
 
     ``key`` names the run that made it or what it was labelled in, if its root states that: then no other record is read.
     """

@@ -50,7 +50,7 @@ class Manifest:
 
     @cached_property
     def pages(self) -> Pages | None:
-        """The pages of a large dataset; None where the manifest holds the recordings itself."""
+        """The pages of a large dataset, or None if the manifest holds the recordings itself."""
         recordings, labels, sources = self.recordings, self.labels, self.sources
         if len(recordings) <= pages_of.INLINE:
             return None
@@ -213,7 +213,7 @@ class Manifest:
         return reached
 
     def at(self, path: str) -> Mapping[str, Any] | None:
-        """Return digest and size of the page, shard or file at ``path``, None where there is none."""
+        """Return digest and size of the page, shard or file at ``path``, or None if there is none."""
         if path in self.files:
             file: Mapping[str, Any] = self.files[path]
             return file
@@ -347,7 +347,7 @@ class Found:
 def find(path: Path | str) -> Found:
     """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself).
 
-    Raises `UsageError` where there is none, and `StorageError` where the system fails to read it.
+    Raises `UsageError` if there is none, and `StorageError` if the system fails to read it.
     """
     location = files_of.local(path)
     file = location if location.name == NAME else location / NAME
@@ -365,7 +365,7 @@ def find(path: Path | str) -> Found:
 
 
 def check(manifest: Manifest) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: it may be untrusted.
+    """Raise `ValueError`, `TypeError` or `KeyError` if a manifest holds what none can: it may be untrusted.
 
     Pages are checked when they are read.
     """

@@ -63,7 +63,7 @@ def validated(noun: str) -> Iterator[None]:
 
 
 def task(files: Mapping[str, bytes], place: str = "This") -> Task:
-    """Return the task that a model among ``files`` was trained for. Raises `TacpipeError` where none is."""
+    """Return the task that a model among ``files`` was trained for. Raises `TacpipeError` if none is."""
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
@@ -74,7 +74,7 @@ def task(files: Mapping[str, bytes], place: str = "This") -> Task:
 def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> dict[str, Any]:
     """Return the mapping that a JSON file holds, in which each of ``needed`` (names with dots) is of its kind.
 
-    Raises `TacpipeError` where it holds none, and for what is missing, of another kind, or absurdly large.
+    Raises `TacpipeError` if it holds none, and for what is missing, of another kind, or absurdly large.
     """
     try:
         content = json.loads(files[name])
@@ -97,7 +97,7 @@ def to_json(tree: Mapping[str, Any]) -> bytes:
 
 
 def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
-    """Return the tensors of a safetensors file, all finite. Raises `TacpipeError` where it is none."""
+    """Return the tensors of a safetensors file, all finite. Raises `TacpipeError` if it is none."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -110,7 +110,7 @@ def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
 def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, AnyArray]:
     """Return the arrays of a safetensors file, all finite ``but`` those whose names end so.
 
-    Raises `TacpipeError` where it is none.
+    Raises `TacpipeError` if it is none.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -125,7 +125,7 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, An
 def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
     """Return the network of ``build`` with these ``weights``; it takes no memory until they fit.
 
-    Raises `TacpipeError` where a tensor is missing, too many, or of another shape.
+    Raises `TacpipeError` if a tensor is missing, too many, or of another shape.
     """
     import torch
 

@@ -138,7 +138,7 @@ class PageContent:
         }
 
     def check(self) -> None:
-        """Raise `ValueError`, `TypeError` or `KeyError` where a page holds what none can: it may be untrusted."""
+        """Raise `ValueError`, `TypeError` or `KeyError` if a page holds what none can: it may be untrusted."""
         names = list(self.recordings)
         if names != sorted(names) or not {*self.labels, *self.sources} <= self.recordings.keys():
             raise ValueError("its recordings are not in the order of their names")
@@ -307,7 +307,7 @@ class Pages:
         return max(0, bisect_right(self._firsts, name) - 1)
 
     def object(self, page: Page) -> bytes:
-        """Return the object of a page. Raises `MissingPageError` where it is missing or damaged."""
+        """Return the object of a page. Raises `MissingPageError` if it is missing or damaged."""
         if page.digest in self.fresh:
             return self.fresh[page.digest]
         if self._read is None:
@@ -317,7 +317,7 @@ class Pages:
     def load(self, number: int) -> PageContent:
         """Return the content of a page, checked.
 
-        Raises `MissingPageError` where its object is missing or damaged, and `DamagedError` where it is not what the root
+        Raises `MissingPageError` if its object is missing or damaged, and `DamagedError` if it is not what the root
         states.
         """
         content = self._parsed.get(number)
@@ -455,7 +455,7 @@ class KeyRecordings(Recordings, Written):
 class RecordGroup(NamedTuple):
     """Recordings that follow each other in the order of names, whose results have one record together."""
 
-    page: str  # digest of the page that holds exactly these; empty where recordings are not in pages
+    page: str  # digest of the page that holds exactly these, or empty if recordings are not in pages
     entries: Callable[[], Mapping[str, Entry]]
 
 
@@ -569,7 +569,7 @@ def _refuse_attributes(attributes: Mapping[str, Any]) -> None:
 
 
 def check_contents(contents: Iterable[Mapping[str, Any]]) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` where shards or files have no digest, or no size in bytes."""
+    """Raise `ValueError`, `TypeError` or `KeyError` if shards or files have no digest, or no size in bytes."""
     contents = list(contents)
     check_counts([content["bytes"] for content in contents])
     for name in (content["digest"] for content in contents):

@@ -48,7 +48,7 @@ def safe_path(path: str) -> bool:
 
 
 def check_paths(paths: Sequence[str], taken_paths: Collection[str]) -> None:
-    """Raise `ValueError` where a path is not safe, or is there twice, or among ``taken_paths``."""
+    """Raise `ValueError` if a path is not safe, or is there twice, or among ``taken_paths``."""
     text = "\n".join(paths)  # hundreds at once: a hit does not wait for a thousand calls
     plain = text and text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
     if not plain or max(map(len, paths), default=0) > NAME_BYTES:
@@ -61,7 +61,7 @@ def check_paths(paths: Sequence[str], taken_paths: Collection[str]) -> None:
 
 
 def refuse_shared_paths(paths: Sequence[str]) -> None:
-    """Raise `ValueError` where two paths are one."""
+    """Raise `ValueError` if two paths are one."""
     if len(set(paths)) < len(paths):
         raise ValueError(_SHARED)
 
@@ -72,7 +72,7 @@ _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz01234567
 
 
 def valid_name(text: str) -> str:
-    r"""Return text as the name of a recording, in Unicode's form NFC; empty where nothing of it can stand in a name.
+    r"""Return text as the name of a recording, in Unicode's form NFC, or empty if nothing of it can stand in a name.
 
     Of ASCII letters, digits, dots, dashes and underscores are kept, of other characters all that are printable. What is
     left out becomes a dash. A name of more than 192 bytes is cut and ends in a part of its digest.
@@ -116,7 +116,7 @@ def verified_copy(name: str, path: str, directories: tuple[str, ...], size: int 
     """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
 
     It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.
-    Raises `StorageError` where none has it and one may: the system failed to read what lies there, or memory is short.
+    Raises `StorageError` if none has it and one may: the system failed to read what lies there, or memory is short.
     """
     failed: StorageError | None = None
     for directory in directories:

@@ -40,7 +40,7 @@ def read_roles(content: bytes) -> dict[tuple[str, int], str]:
 
 
 def roles_in_fold(roles: Mapping[tuple[str, int], str], fold: int, place: str) -> dict[str, str]:
-    """Return recording to role in a fold of the split ``place``. Raises `UsageError` where it has no such fold."""
+    """Return recording to role in a fold of the split ``place``. Raises `UsageError` if it has no such fold."""
     folds = sorted({number for _, number in roles})
     if fold not in folds:
         raise UsageError(f"The split {place} has the folds {folds}, not {fold}.")
@@ -53,7 +53,7 @@ _SHOWN, _LABELS = 5, 12  # names or values, and labels, that an error lists
 def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, str] | None:
     """Return recording to role in ``fold`` of an opened split, None without one.
 
-    Raises `UsageError` where it is not a split or has no such fold, and for a role or a fold without a split.
+    Raises `UsageError` if it is not a split or has no such fold, and for a role or a fold without a split.
     """
     if split is None:
         if role is not None or fold:
@@ -78,7 +78,7 @@ def chosen(
 ) -> list[str]:
     """Return the names of the recordings that match a pattern, have the role and meet each condition on a label.
 
-    Raises `UsageError` where none does, and for a label that no recording has.
+    Raises `UsageError` if none does, and for a label that no recording has.
     """
     names = [
         name for name in dataset.recordings if not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)

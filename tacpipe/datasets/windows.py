@@ -166,7 +166,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     @property
     def scaling(self) -> Scaling | None:
-        """Mean and standard deviation of ``columns`` that windows are scaled by; None where they are not scaled."""
+        """Mean and standard deviation of ``columns`` that windows are scaled by, or None if they are not scaled."""
         if self.scale is False:
             return None
         if self._scaling is None:
@@ -310,7 +310,7 @@ def _above_rest(table: pa.Table, matrix: arrays.Arrays, t_ns: Int64s, rest_s: fl
 
 
 def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
-    """Return the channels as (time, channel). Raises `UsageError` where ``dtype`` would round a whole number."""
+    """Return the channels as (time, channel). Raises `UsageError` if ``dtype`` would round a whole number."""
     exact = channels.values
     values = exact.astype(dtype)
     if exact.dtype.kind in "iu" and exact.dtype.itemsize > 2 and not np.array_equal(values.astype(exact.dtype), exact):

@@ -121,7 +121,7 @@ class ByRecording:
     def run(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Entry]:
         """Return the entry of each task of stage ``name``, by recording.
 
-        Raises `TacpipeError` where recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
+        Raises `TacpipeError` if recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
         would run.
         """
         return _after(
@@ -291,7 +291,7 @@ def run_chain_of_model(recordings: Dataset, model: Dataset) -> Dataset:
     """Run the remaining stages of a model's chain on recordings and return the result.
 
     Stored results are reused, and new ones are stored, as with ``tacpipe predict``. Both datasets
-    must be open. Raises `UsageError` where the recordings went through other stages, `TacpipeError` where one of them
+    must be open. Raises `UsageError` if the recordings went through other stages, `TacpipeError` if one of them
     cannot be read.
     """
     assert recordings.path is not None and model.path is not None

@@ -48,7 +48,7 @@ def fill_template(value: Any, values: Values, place: str) -> Any:
 def expand(definition: Mapping[str, Any], values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
     """Yield the stages of a definition: the part of each name after ``@``, the template and its values.
 
-    A definition without ``foreach`` and ``matrix`` is one stage, with an empty part. Raises `UsageError` where
+    A definition without ``foreach`` and ``matrix`` is one stage, with an empty part. Raises `UsageError` if
     ``foreach`` is not a list or mapping, or ``matrix`` not a mapping of lists.
     """
     if "foreach" in definition:

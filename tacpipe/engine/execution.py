@@ -186,7 +186,7 @@ def reader(
 
     It reads from the store; missing objects are adopted from ``dataset_dirs``, or recomputed from their
     record. ``sizes`` are those in bytes that a manifest declares, by digest, or the manifest: nothing much larger is read.
-    Raises `DamagedError` where neither can be done. It can be pickled.
+    Raises `DamagedError` if neither can be done. It can be pickled.
     """
     return _Reader(store, dataset_dirs, sizes)
 

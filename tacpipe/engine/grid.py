@@ -28,7 +28,7 @@ _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 
 
 def folds(text: str) -> tuple[int, ...]:
-    """Return the folds that an option names, in order; raises `UsageError` where it names none.
+    """Return the folds that an option names, in order; raises `UsageError` if it names none.
 
     >>> folds("3"), folds("0-3"), folds("4,0-1,1")
     ((3,), (0, 1, 2, 3), (4, 0, 1))
@@ -46,7 +46,7 @@ def folds(text: str) -> tuple[int, ...]:
 def requests(request: Request, numbers: Sequence[int]) -> list[Request]:
     """Return the request for each fold, its number in all paths that hold `PLACE`.
 
-    Raises `UsageError` where several folds would be written to one place.
+    Raises `UsageError` if several folds would be written to one place.
     """
     if len(numbers) > 1 and PLACE not in str(request.output):
         raise UsageError(

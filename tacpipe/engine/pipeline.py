@@ -68,7 +68,7 @@ def run(request: Request) -> Outcome:
 
 
 def answered(request: Request) -> Outcome | None:
-    """Return what `run` would return where there is nothing to do; None where something is to be computed or written.
+    """Return what `run` would return where there is nothing to do, or None if something is to be computed or written.
 
     It raises what `run` would raise before that. Nothing is computed, and nothing is changed.
     """
@@ -333,7 +333,7 @@ class _RequestRun:
         return keys.of_dataset(source, reads, source.included)
 
     def _roles(self, name: str) -> Any:
-        """Return what identifies the roles of the argument ``name``, None where its option was not given."""
+        """Return what identifies the roles of the argument ``name``, or None if its option was not given."""
         dataset = self.inputs.named_datasets.get(name)
         fold = self.request.fold
         if dataset is None:

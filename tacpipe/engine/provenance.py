@@ -59,7 +59,7 @@ def shared_by(processes: int) -> Iterator[None]:
 
 
 def each_of(processes: int) -> dict[str, str]:
-    """Return the variables that give each of so many processes its part of the cores; none where the environment has one.
+    """Return the variables that give each of so many processes its part of the cores, or None if the environment has one.
 
     Of several processes with as many threads each as there are cores, most threads wait for one another.
     """
@@ -71,7 +71,7 @@ def each_of(processes: int) -> dict[str, str]:
 def jobs() -> int:
     """Return the default number of processes of a command: the value of `JOBS`, else one per usable core.
 
-    Raises `UsageError` where `JOBS` is no number above 0.
+    Raises `UsageError` if `JOBS` is no number above 0.
     """
     setting = os.environ.get(JOBS, "")
     if not setting:
@@ -82,7 +82,7 @@ def jobs() -> int:
 
 
 def jobs_of(commands: int) -> dict[str, str]:
-    """Return the variable that gives each of so many commands its part of the cores; none where the environment has it."""
+    """Return the variable that gives each of so many commands its part of the cores, or None if the environment has it."""
     return {} if JOBS in os.environ else {JOBS: str(max(1, usable_cores() // max(1, commands)))}
 
 
@@ -185,7 +185,7 @@ def _text(value: Any) -> str:
 
 
 def code(stage: AnyStage) -> str | None:
-    """Return the digest of the file that a stage's function is written in; None where it cannot change by itself.
+    """Return the digest of the file that a stage's function is written in, or None if it cannot change by itself.
 
     That is a built-in stage that was installed: it changes with the version of tacpipe alone.
     """

@@ -54,7 +54,7 @@ CONTEXT: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class About:
-    """The publisher's statements about the data; empty where unknown."""
+    """The publisher's statements about the data, or empty if unknown."""
 
     name: str
     description: str

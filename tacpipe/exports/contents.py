@@ -47,12 +47,12 @@ class Column:
 
     @property
     def quantity(self) -> str:
-        """The measured quantity, empty where that is not stated."""
+        """The measured quantity, or empty if that is not stated."""
         return self.about.get("quantity", "")
 
     @property
     def unit(self) -> str:
-        """Its unit, empty where that is not stated."""
+        """Its unit, or empty if that is not stated."""
         return self.about.get("unit", "")
 
 
@@ -67,7 +67,7 @@ class ExportStream:
     rates_hz: Sequence[float]  # lowest and highest; empty without stamps
     differing: Sequence[str] = ()  # recordings in which it has other columns
     shared: Sequence[str] = ()  # columns that it has in all of its recordings, of one type
-    nan: bool = False  # True where a float is NaN somewhere
+    nan: bool = False  # True if a float is NaN somewhere
     all_columns: Sequence[str] = ()  # those that it has in any of its recordings
 
 

@@ -82,7 +82,7 @@ class Scratch(io.RawIOBase):
         return self._file.tell()
 
     def check(self) -> IO[bytes]:
-        """Return the file. Raises `StorageError` where a write failed."""
+        """Return the file. Raises `StorageError` if a write failed."""
         if self._error is not None:
             raise StorageError(
                 f"The folder of temporary files {tempfile.gettempdir()} cannot be written: {self._error.strerror}. Free "

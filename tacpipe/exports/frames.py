@@ -190,7 +190,7 @@ def rounded_channels(table: pa.Table, chosen: Sequence[Channel]) -> list[Channel
 
 
 def common_rate_hz(recordings: Sequence[Recording]) -> float:
-    """Return the rate that all recordings share. Raises `UsageError` where they have several."""
+    """Return the rate that all recordings share. Raises `UsageError` if they have several."""
     rates = sorted({_rate(recording) for recording in recordings})
     if len(rates) > 1:
         raise UsageError(

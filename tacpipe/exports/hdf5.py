@@ -89,7 +89,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
 
 @stage(version=2, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
-    """Return the file of one recording, or nothing where all are in one."""
+    """Return the file of one recording, or nothing if all are in one."""
     if params.structure == "robomimic":
         from tacpipe.exports import arrays
 

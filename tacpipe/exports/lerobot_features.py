@@ -114,7 +114,7 @@ Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a cha
 
 
 def column_statistics(feature: FrameFeature) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield each column of a feature with its statistics; none of text, and NaN where nothing was measured."""
+    """Yield each column of a feature with its statistics; none of text, and NaN if nothing was measured."""
     import numpy as np
 
     if feature.dtype == "string":

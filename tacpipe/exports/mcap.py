@@ -160,7 +160,7 @@ def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table)
 
 
 def _start(recording: Recording, stream: str) -> int | None:
-    """Return the first stamp of a stream; None where it has none."""
+    """Return the first stamp of a stream, or None if it has none."""
     columns = recording.columns(stream)
     if TIME not in columns.column_names or not columns.num_rows:
         return None

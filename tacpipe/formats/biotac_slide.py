@@ -143,7 +143,7 @@ def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
 
 
 def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
-    """Return what was read under the names of its channels. Raises `TacpipeError` where stamps do not increase."""
+    """Return what was read under the names of its channels. Raises `TacpipeError` if stamps do not increase."""
     import numpy as np
     import pyarrow as pa
 

@@ -58,7 +58,7 @@ class Time:
 
     @property
     def is_declared(self) -> bool:
-        """True where a column, a file or a rate is named."""
+        """True if a column, a file or a rate is named."""
         return bool(self.column or self.file) or self.rate_hz is not None
 
 
@@ -144,7 +144,7 @@ class NamedContainer(Protocol):
 
     @property
     def names_itself(self) -> bool:
-        """True where its episodes are named without the container's name before theirs."""
+        """True if its episodes are named without the container's name before theirs."""
 
 
 class Container(Protocol):
@@ -155,7 +155,7 @@ class Container(Protocol):
         """The file, or the folder where the format is one."""
 
     def episodes(self) -> Sequence[str]:
-        """Return the names of the recordings inside, nothing where the whole is one recording."""
+        """Return the names of the recordings inside, or nothing if the whole is one recording."""
 
     def look(self, episode: str | None) -> EpisodeContents:
         """Return what is there without reading all of it: tables have the right fields, and no or the first rows."""
@@ -324,7 +324,7 @@ def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> d
 
 
 def json_value(text: str | bytes, path: Path) -> Any:
-    """Return a JSON value of a file. Raises `ValueError` or `RecursionError` where it is none, and as `by_name`."""
+    """Return a JSON value of a file. Raises `ValueError` or `RecursionError` if it is none, and as `by_name`."""
     return json.loads(text, object_pairs_hook=lambda pairs: parts_by_name(pairs, path, "entry"))
 
 

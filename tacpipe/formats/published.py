@@ -36,7 +36,7 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
 
     A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
     recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
-    Raises `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` where two trials share a name
+    Raises `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` if two trials share a name
     even so.
     """
     if not source.is_dir():

@@ -273,7 +273,7 @@ LEAST = 0.5  # lag-1 autocorrelation that time must have
 def lag_one(values: AnyArray, axis: int) -> float:
     """Return the lag-1 autocorrelation of ``values`` along ``axis``: the correlation of all pairs of neighbours along it.
 
-    NaN where there are no neighbours or they do not vary.
+    NaN if there are no neighbours or they do not vary.
 
     >>> import numpy as np
     >>> round(lag_one(np.array([[0.0, 1.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]]), axis=1), 1)
@@ -293,7 +293,7 @@ def lag_one(values: AnyArray, axis: int) -> float:
 def is_time(values: AnyArray, axis: int, lowest: float = LEAST) -> bool:
     """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``lowest`` or more, and the largest.
 
-    False where nothing varies along it: such an array states nothing about its axes.
+    False if nothing varies along it: such an array states nothing about its axes.
     """
     import numpy as np
 

@@ -183,7 +183,7 @@ def _read_grasp(path: Path) -> Grasp:
 
 
 def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) -> None:
-    """Raise `TacpipeError` where a grasp point lies far from the cloud: then they are of two frames, or two grasps."""
+    """Raise `TacpipeError` if a grasp point lies far from the cloud: then they are of two frames, or two grasps."""
     import numpy as np
 
     for name, point_m in (("first", grasp.g1_m), ("second", grasp.g2_m)):

@@ -70,7 +70,7 @@ def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
 
 
 def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
-    """Return the chunk at a place and where the next one begins; None where there is none."""
+    """Return the chunk at a place and where the next one begins, or None if there is none."""
     length = read_length(data, at)
     if length is None:
         return None
@@ -87,7 +87,7 @@ def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
 
 
 def read_length(data: Content, at: int) -> tuple[int, int] | None:
-    r"""Return a length of 1, 4 or 8 bytes and where it ends; None where there is none.
+    r"""Return a length of 1, 4 or 8 bytes and where it ends, or None if there is none.
 
     >>> read_length(b"\x01\x05...", 0), read_length(b"\x02\x05", 0)
     ((5, 2), None)
@@ -100,7 +100,7 @@ def read_length(data: Content, at: int) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class ChunkSamples:
-    """The samples of one chunk: stamps in seconds as they are written, NaN where none is; and how many are missing."""
+    """The samples of one chunk: stamps in seconds as they are written, or NaN if none is; and how many are missing."""
 
     stamps: Floats  # (sample,)
     values: AnyArray  # (sample, channel)
@@ -108,7 +108,7 @@ class ChunkSamples:
 
 
 def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> ChunkSamples | None:
-    """Return the samples of a chunk of numbers, as many as are whole; None where even their count is not there."""
+    """Return the samples of a chunk of numbers, as many as are whole, or None if even their count is not there."""
     count = read_length(content, 0)
     if count is None:
         return None
@@ -125,7 +125,7 @@ def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> 
 def _parse_regular(
     body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int
 ) -> ChunkSamples | None:
-    """Return samples of which the first ``stamped`` have a stamp and the others none; None where it is not so."""
+    """Return samples of which the first ``stamped`` have a stamp and the others none, or None if it is not so."""
     full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
     bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
     if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:
@@ -153,7 +153,7 @@ def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, cou
 
 
 def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
-    """Return the samples of a chunk of texts, as many as are whole; None where even their count is not there."""
+    """Return the samples of a chunk of texts, as many as are whole, or None if even their count is not there."""
     count = read_length(content, 0)
     if count is None:
         return None
@@ -184,7 +184,7 @@ def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | 
 
 
 def _read_stamp(content: bytes, at: int) -> tuple[float, int] | None:
-    """Return a sample's stamp (NaN where it has none) and where its values begin; None where there is none."""
+    """Return a sample's stamp (NaN if it has none) and where its values begin, or None if there is none."""
     if at >= len(content) or content[at] not in (0, 8) or at + 1 + content[at] > len(content):
         return None
     if not content[at]:

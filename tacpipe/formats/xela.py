@@ -45,7 +45,7 @@ def read_floats(path: Path, names: Sequence[str]) -> Floats:
 
 
 def read_marker(path: Path, name: str) -> tuple[Floats, float]:
-    """Return the pose of a marker (time, 7), NaN where the camera did not see it, and the fraction of such rows.
+    """Return the pose of a marker (time, 7), or NaN if the camera did not see it, and the fraction of such rows.
 
     Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
     """
@@ -72,7 +72,7 @@ def require_unit(path: Path, quaternions: Floats, name: str) -> None:
 
 
 def check_rows(trial: str, rows: Mapping[str, int], tactile: str, missing_allowed: int) -> None:
-    """Raise `TacpipeError` where a file has more rows than the tactile file, or lacks more than is known to happen."""
+    """Raise `TacpipeError` if a file has more rows than the tactile file, or lacks more than is known to happen."""
     for name, count in rows.items():
         difference = count - rows[tactile]
         if difference > 0 or difference < -missing_allowed:
@@ -86,7 +86,7 @@ class TrialMeta:
     """The line of text that describes a trial, read cell by cell with what each must hold."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file. Raises `TacpipeError` where it has not one row below its header."""
+        """Read the file. Raises `TacpipeError` if it has not one row below its header."""
         from tacpipe.formats.csv_table import read_record
 
         self.path = path

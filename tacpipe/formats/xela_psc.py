@@ -110,7 +110,7 @@ def _poses(path: Path) -> Floats:
 
 
 def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
-    """Return seconds as whole nanoseconds (time,). Raises `TacpipeError` where they run backwards."""
+    """Return seconds as whole nanoseconds (time,). Raises `TacpipeError` if they run backwards."""
     import numpy as np
 
     from tacpipe.formats.csv_table import file_row

@@ -53,7 +53,7 @@ class Columns:
         return list(self.schema.names)
 
     def column(self, name: str) -> pa.ChunkedArray:
-        """Return one column. Raises `KeyError` where there is none of this name."""
+        """Return one column. Raises `KeyError` if there is none of this name."""
         place = self._places.get(name)
         if place is None:
             block = self._blocks[name]

@@ -55,7 +55,7 @@ def load_yaml(content: str | bytes) -> Any:
 
 
 def _refuse_large(events: Any) -> None:
-    """Raise `ValueError` where the events of a text represent too much."""
+    """Raise `ValueError` if the events of a text represent too much."""
     import yaml
 
     sizes: dict[str, int] = {}  # number of values of each anchor

@@ -70,7 +70,7 @@ def sync_folders(path: str, top: str) -> None:
 
 
 def listed(folder: Path, pattern: str = "*") -> list[Path]:
-    """Return what lies in a folder, sorted; nothing where there is none.
+    """Return what lies in a folder, sorted, or nothing if there is none.
 
     A folder that cannot be listed is an error here. `Path.glob` passes over it, and what it holds would seem to be gone.
     """
@@ -279,7 +279,7 @@ class Draft(Hashed):
         self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
 
     def write(self, content: bytes | memoryview) -> int:
-        """Write all of ``content``. Raises `StorageError` where the disk does not take it."""
+        """Write all of ``content``. Raises `StorageError` if the disk does not take it."""
         try:
             write_all(self._handle, content)
         except OSError as error:
@@ -305,7 +305,7 @@ class Draft(Hashed):
 def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Draft]:
     """Yield a new file at ``path``, in the store ``root``; after the block it is removed unless it was moved away.
 
-    ``mode`` is less what the umask takes. Raises `StorageError` where the file system does not allow it.
+    ``mode`` is less what the umask takes. Raises `StorageError` if the file system does not allow it.
     """
     try:
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120

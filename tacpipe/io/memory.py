@@ -144,7 +144,7 @@ class _Guard(MetaPathFinder):
 
 
 def require_library(name: str) -> None:
-    """Raise `ShortageError` where loading a library of `LIBRARIES` takes more than is left under a limit."""
+    """Raise `ShortageError` if loading a library of `LIBRARIES` takes more than is left under a limit."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     needed = LIBRARIES[name] + A_CORE * max(0, cores - 2)
     if limited() and available() < needed:
@@ -163,7 +163,7 @@ def raising_shortage() -> Iterator[None]:
 
 
 def require(needed: int, source: str, *, error: type[TacpipeError] = TacpipeError) -> None:
-    """Raise ``error``, a `TacpipeError`, where ``source`` needs more memory than is left."""
+    """Raise ``error``, a `TacpipeError`, if ``source`` needs more memory than is left."""
     if needed <= AT_HAND:
         return
     limit = int(available() * KEPT)
@@ -176,7 +176,7 @@ def require(needed: int, source: str, *, error: type[TacpipeError] = TacpipeErro
 
 
 def require_block(size: int, source: str) -> None:
-    """Raise `TacpipeError` where a chunk, a page or a record of a file declares more than `MOST_BLOCK` bytes."""
+    """Raise `TacpipeError` if a chunk, a page or a record of a file declares more than `MOST_BLOCK` bytes."""
     if size > MOST_BLOCK:
         raise TacpipeError(
             f"{source} declares {readable_size(size)} in one piece, and at most {readable_size(MOST_BLOCK)} are read at "
@@ -186,7 +186,7 @@ def require_block(size: int, source: str) -> None:
 
 @contextlib.contextmanager
 def bounded(max_bytes: int, source: str) -> Iterator[None]:
-    """Raise `TacpipeError` where the block takes more than ``max_bytes`` of further memory, on Linux.
+    """Raise `TacpipeError` if the block takes more than ``max_bytes`` of further memory, on Linux.
 
     It is for libraries that unpack what a file holds without a look at how much that is.
     """

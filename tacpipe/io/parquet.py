@@ -108,7 +108,7 @@ def from_parquet(content: bytes | Path, columns: Sequence[str] | None = None) ->
     """Return the table of a Parquet file's bytes, or of the file at a path, with field metadata; of ``columns`` if given.
 
     Raises `DamagedError` when the bytes are no Parquet file, and where what they declare is not there, and
-    `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
+    `ShortageError` if it is more than the memory that is left, which a sound file may hold too.
     """
     return ParquetTable(content).read(columns)
 
@@ -121,7 +121,7 @@ def require_claims(
     max_bytes: int | None = None,
     rows: int | None = None,
 ) -> None:
-    """Raise `TacpipeError` where columns of an untrusted file declare more than may be read at once, or than is there.
+    """Raise `TacpipeError` if columns of an untrusted file declare more than may be read at once, or than is there.
 
     That is ``max_bytes`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
     `memory.MOST_BLOCK` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.

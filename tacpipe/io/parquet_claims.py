@@ -65,7 +65,7 @@ class Claims:
     """Count the bytes that the columns of one file declare, each column once.
 
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
-    Raises `ValueError` where the footer contradicts itself, and where a column that is asked for declares another number
+    Raises `ValueError` if the footer contradicts itself, and where a column that is asked for declares another number
     of values than its pages hold, or pages that the file does not have.
     """
 

@@ -50,7 +50,7 @@ class IrregularError(TacpipeError):
 def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
     """Return a file opened for reading; ``follow`` is whether ``path`` may be a symbolic link.
 
-    Raises `IrregularError` where it is not a regular file, `OSError` as `open` does.
+    Raises `IrregularError` if it is not a regular file, `OSError` as `open` does.
     """
     handle, _ = _open(path, follow=follow)
     return io.BufferedReader(io.FileIO(handle))
@@ -59,7 +59,7 @@ def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
 def content(path: Path | str, max_bytes: int | None = None, *, follow: bool = True) -> bytes:
     """Return what a regular file of at most ``max_bytes`` bytes holds, by default of as many as memory takes.
 
-    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` where memory is short, which
+    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` if memory is short, which
     states nothing of the file.
     """
     handle, size = _open(path, follow=follow)
@@ -89,7 +89,7 @@ def blocks(path: Path | str, max_bytes: int, *, follow: bool = True) -> Iterator
 def json_value(path: Path | str, max_bytes: int = JSON_BYTES) -> Any:
     """Return the JSON value that a file of a store holds.
 
-    Raises as `content` does, and `ValueError` or `RecursionError` where it is not JSON.
+    Raises as `content` does, and `ValueError` or `RecursionError` if it is not JSON.
     """
     text = content(path, max_bytes, follow=False)
     expect_parsed(path, len(text))
@@ -97,7 +97,7 @@ def json_value(path: Path | str, max_bytes: int = JSON_BYTES) -> Any:
 
 
 def expect_parsed(path: Path | str, size: int) -> None:
-    """Raise `StorageError` where this computer has too little memory left to parse ``size`` bytes of JSON."""
+    """Raise `StorageError` if this computer has too little memory left to parse ``size`` bytes of JSON."""
     memory.require(size * JSON_IN_MEMORY, f"{path}, parsed,", error=StorageError)
 
 
@@ -120,7 +120,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def expect_inside(folder: Path, paths: Iterable[Path]) -> None:
-    """Raise `UsageError` where one of the ``paths`` below a folder lies elsewhere, by a symbolic link.
+    """Raise `UsageError` if one of the ``paths`` below a folder lies elsewhere, by a symbolic link.
 
     With the environment variable `FOLLOW_LINKS` links are followed.
     """
@@ -162,7 +162,7 @@ def naming(path: Path | str) -> Iterator[None]:
 
 
 def require(path: Path | str, mode: int) -> None:
-    """Raise `IrregularError` where ``mode``, of `os.stat`, is not that of a regular file."""
+    """Raise `IrregularError` if ``mode``, of `os.stat`, is not that of a regular file."""
     if not stat.S_ISREG(mode):
         kind = next((name for is_one, name in KINDS if is_one(mode)), "something else")
         raise IrregularError(

@@ -141,7 +141,7 @@ class SpilledGroups:
         self._group = _RowGroup(source.schema, rows)
 
     def next(self) -> pa.Table:
-        """Return the next group; one without rows where there is none. Raises `StorageError` where the disk is full."""
+        """Return the next group; one without rows where there is none. Raises `StorageError` if the disk is full."""
         self._group.clear()
         while self._group.count < self._rows and (batch := self._next_batch()) is not None:
             room = self._rows - self._group.count

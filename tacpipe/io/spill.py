@@ -57,7 +57,7 @@ class Spill:
     def add(self, table: pa.Table, orders: Sequence[str] = ()) -> Piece:
         """Put a table aside; ``orders`` are columns of numbers without nulls.
 
-        Raises `StorageError` where the disk is full.
+        Raises `StorageError` if the disk is full.
         """
         sink = pa.BufferOutputStream()
         with pa.ipc.new_stream(sink, table.schema) as writer:
@@ -90,7 +90,7 @@ class Spill:
 def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
     """Write what the file at ``path`` unpacks to into a temporary file.
 
-    Raises `StorageError` where that is more than nine tenths of the free disk, before that is full.
+    Raises `StorageError` if that is more than nine tenths of the free disk, before that is full.
     """
     folder = tempfile.gettempdir()
     free_bytes = room = int(shutil.disk_usage(folder).free * KEPT)
@@ -116,7 +116,7 @@ class Gathered:
         self._pieces: list[Piece] = []
 
     def add(self, table: pa.Table) -> None:
-        """Add rows. Raises `StorageError` where the disk is full."""
+        """Add rows. Raises `StorageError` if the disk is full."""
         self._pieces.append(self._spill.add(table.combine_chunks()))
 
     def rows(self) -> pa.Table | pa.RecordBatchReader:
@@ -210,7 +210,7 @@ class MappedArrays:
         return not self._segments
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> AnyArray:
-        """Return an array to be filled. Raises `StorageError` where the disk is full."""
+        """Return an array to be filled. Raises `StorageError` if the disk is full."""
         kind = np.dtype(dtype)
         size = int(np.prod(shape)) * kind.itemsize
         if size <= self._in_memory:

@@ -40,7 +40,7 @@ class Engine(ABC):
 
     @property
     def offset_ns(self) -> int | None:
-        """The difference of the recording's UTC and the monotonic clock; None where no recording runs."""
+        """The difference of the recording's UTC and the monotonic clock, or None if no recording runs."""
         return self._offset_ns
 
     @property

@@ -62,7 +62,7 @@ class Message:
         return {"version": VERSION, "kind": self.declaration.kind, **fields}
 
     def numbers(self, about: Description) -> Float32s:
-        """Return the numbers (column,) that `Description.columns` names, NaN where a value is None."""
+        """Return the numbers (column,) that `Description.columns` names, or NaN if a value is None."""
         parts = []
         for value in self.declaration.recorded(LSL):
             content = value.read(self)
@@ -147,7 +147,7 @@ def to_json(content: Mapping[str, Any]) -> bytes:
 
 
 def packets(message: Message, sensor: Live, seq: int) -> list[bytes]:
-    """Return the packets of a message for one stream, numbered from ``seq`` on; none where it has no row for it."""
+    """Return the packets of a message for one stream, numbered from ``seq`` on, or None if it has no row for it."""
     values = message.stream_blocks(sensor.output)
     if values is None:
         return []

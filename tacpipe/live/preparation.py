@@ -76,7 +76,7 @@ def prepare(rig: Rig, rig_file: str, options: Mapping[str, Any]) -> PreparedSess
 
 
 def open_model(path: str) -> LiveModel:
-    """Return the model at a path. Raises `UsageError` where it is no model, or its task does not run live."""
+    """Return the model at a path. Raises `UsageError` if it is no model, or its task does not run live."""
     from tacpipe.datasets import model_files
     from tacpipe.engine.pipeline import open_dataset
 
@@ -103,7 +103,7 @@ def with_absolute_paths(settings: Settings) -> Settings:
 def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
     """Return a rig with further streams of the sensor ``live``, given by their options, at free ports of this computer.
 
-    Raises `UsageError` where the rig has a stream of such a name, and for messages too large for a packet.
+    Raises `UsageError` if the rig has a stream of such a name, and for messages too large for a packet.
     """
     conflicting = [name for name in streams if name in rig.streams]
     if conflicting:

@@ -54,7 +54,7 @@ class Latencies:
         self.max_ms = max(self.max_ms, latency_ms)
 
     def quantile_ms(self, fraction: float) -> float:
-        """Return the latency that this fraction does not exceed, to 2.3 % above it; 0 where there is none.
+        """Return the latency that this fraction does not exceed, to 2.3 % above it, or 0 if there is none.
 
         >>> latencies = Latencies()
         >>> for latency_ms in (1.0, 2.0, 3.0, 40.0):
@@ -171,7 +171,7 @@ def send(connection: socket.socket, content: dict[str, Any]) -> None:
 
 
 def open_engine(options: SessionOptions) -> Engine:
-    """Return the engine of a session. Raises `UsageError` where model, rig and settings do not belong together."""
+    """Return the engine of a session. Raises `UsageError` if model, rig and settings do not belong together."""
     from tacpipe.live.preparation import open_model
     from tacpipe.recording import rig as rigs
 

@@ -162,7 +162,7 @@ def parse_option(name: str, text: Any, annotation: Any) -> Any:
     >>> parse_option("steps", "1,5", tuple[int, ...]), parse_option("settle_ms", "3", float)
     ((1, 5), 3.0)
 
-    Raises `UsageError` where the annotation does not allow it.
+    Raises `UsageError` if the annotation does not allow it.
     """
     if not isinstance(text, str):
         return text
@@ -206,7 +206,7 @@ class LiveTask(ABC):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the plan of a session, from the configuration of the model, without torch.
 
-        Raises `UsageError` for settings that do not suit model or rig, `TacpipeError` where the model was trained on rows
+        Raises `UsageError` for settings that do not suit model or rig, `TacpipeError` if the model was trained on rows
         that look ahead, unless the settings allow it.
         """
 
@@ -214,19 +214,19 @@ class LiveTask(ABC):
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
         """Return the engine that turns the samples of ``sensors``, by stream, into messages, in the model's process.
 
-        Raises `UsageError` where model, rig and settings do not belong together.
+        Raises `UsageError` if model, rig and settings do not belong together.
         """
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
         """Return what a session publishes for recordings as they were recorded (``predict --causal``).
 
-        Raises `UsageError` where the task has no such predictions.
+        Raises `UsageError` if the task has no such predictions.
         """
         raise UsageError(f"Models of the task {self.declaration.kind} have no causal predictions; leave --causal out.")
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
         """Return metrics of what sessions published in their recordings (``evaluate --live``).
 
-        Raises `UsageError` where the task has no such metrics.
+        Raises `UsageError` if the task has no such metrics.
         """
         raise UsageError(f"Sessions of the task {self.declaration.kind} are not evaluated; leave --live out.")

@@ -21,7 +21,7 @@ EARLIER_VERSIONS = {"synchronize": (2,)}  # today's stage reads their params and
 
 
 def stage_params(step: Mapping[str, Any]) -> Any:
-    """Return the params of a stage of a chain. Raises `UsageError` where it has another version now."""
+    """Return the params of a stage of a chain. Raises `UsageError` if it has another version now."""
     name = step["stage"]
     stage = registry.load(name)
     if step["version"] not in (stage.version, *EARLIER_VERSIONS.get(name, ())):

@@ -174,7 +174,7 @@ RECORDER, MODEL = 20, 10  # priorities: the recording never waits for the model
 
 
 def check() -> None:
-    """Raise `UsageError` where the system does not allow real-time scheduling."""
+    """Raise `UsageError` if the system does not allow real-time scheduling."""
     try:
         _set(0, RECORDER)
     except (OSError, AttributeError) as error:

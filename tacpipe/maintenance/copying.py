@@ -68,7 +68,7 @@ def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, 
 
 
 def _expect_formed(manifest: Manifest, name: str) -> None:
-    """Raise `DamagedError` where a page of a manifest holds what none can: it may be untrusted."""
+    """Raise `DamagedError` if a page of a manifest holds what none can: it may be untrusted."""
     try:
         manifest_of.check_pages(manifest)
     except (ValueError, TypeError, KeyError) as error:
@@ -214,7 +214,7 @@ def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
 
 
 def _expect_room(target: AnyStore, needed: int) -> None:
-    """Raise `StorageError` where the disk of a store has less room than what is to be copied there takes."""
+    """Raise `StorageError` if the disk of a store has less room than what is to be copied there takes."""
     room = target.room()
     if room is not None and needed > room:
         raise StorageError(
@@ -224,7 +224,7 @@ def _expect_room(target: AnyStore, needed: int) -> None:
 
 
 def _named_digests(record: Mapping[str, Any]) -> set[str]:
-    """Return the digests of what a record names; none where it has not the form of a record: a store may hold anything."""
+    """Return the digests of what a record names, or None if it has not the form of a record: a store may hold anything."""
     identity, provenance = record["identity"], record["provenance"]
     try:
         formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)

@@ -221,7 +221,7 @@ def _closure(
     """Return the digests of manifests, of those they descend from, and of all objects that these name.
 
     Manifests of recordings are added to ``recording_manifests``. A page that was ``walked`` is not read again. Raises
-    `DamagedError` where something damaged is needed to know that, as a page of a manifest that a directory shows.
+    `DamagedError` if something damaged is needed to know that, as a page of a manifest that a directory shows.
     """
     objects: set[str] = set()
     manifests: set[str] = set()
@@ -286,7 +286,7 @@ def content(path: Path) -> tuple[bytes | None, bool]:
 
 
 def _sound(content: bytes, path: Path) -> manifest_of.Found:
-    """Return the manifest that lies at a path. Raises `DamagedError` where it is not sound."""
+    """Return the manifest that lies at a path. Raises `DamagedError` if it is not sound."""
     dataset = manifest_of.Found(path, content)
     try:
         dataset.manifest  # noqa: B018  (is it sound?)

@@ -132,7 +132,7 @@ def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | N
 
 
 def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str) -> None:
-    """Raise `UsageError` where the manifest of ``before`` is none of those that the pushing project has ``seen``."""
+    """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen``."""
     manifest = str(before["manifest"])
     if manifest in seen:
         return
@@ -158,7 +158,7 @@ def lasting(store: AnyStore, manifest: str) -> bool:
 def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
     """Keep no longer what ``wanted`` names: all snapshots of ``PROJECT:PATH``, or one by `SHORTEST` or more of its digits.
 
-    Returns whether there was any. Raises `UsageError` where several are meant.
+    Returns whether there was any. Raises `UsageError` if several are meant.
     """
     all_roots = roots(store)
     matching = _roots_of_project(wanted, all_roots) or [root for root in all_roots if root["path"] == wanted]

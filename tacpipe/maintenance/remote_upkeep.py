@@ -281,7 +281,7 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
 
 
 def _manifest_or_none(store: RemoteStore, name: str) -> Manifest | None:
-    """Return the manifest that an object is, None where it is not one."""
+    """Return the manifest that an object is, or None if it is not one."""
     try:
         if store.begins(name, pages.BEGINS):
             return unnamed.from_page(store.read(name))

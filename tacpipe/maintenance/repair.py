@@ -33,7 +33,7 @@ _COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders
 class Soundness:
     """Counts of objects and records that were read, the faults among them, and the repairs."""
 
-    there: bool = True  # False where there is no store yet
+    there: bool = True  # False if there is no store yet
     objects: int = 0
     records: int = 0
     foreign: list[str] = field(

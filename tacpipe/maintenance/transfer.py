@@ -37,7 +37,7 @@ def named_store(remote: Path | str) -> AnyStore:
 
 
 def remote_store(remote: Path | str) -> AnyStore:
-    """Return the store at a path or an address, which is only read. Raises `UsageError` where none is."""
+    """Return the store at a path or an address, which is only read. Raises `UsageError` if none is."""
     store = named_store(remote)
     if isinstance(store, RemoteStore):
         if not store.check():
@@ -74,7 +74,7 @@ def push(
     its bytes, and replaced where it is damaged. A name there belongs to this project, which with ``project`` becomes the one
     that is called so there. What was pushed before stays as a snapshot.
 
-    Raises `UsageError` where another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
+    Raises `UsageError` if another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
     a shard that is damaged here and cannot be recomputed.
     """
     target, transferred = named_store(remote), Transferred()
@@ -146,7 +146,7 @@ def bring(
 
 @contextlib.contextmanager
 def _announced(store: Store, manifest: str) -> Iterator[bool]:
-    """Hold off `gc` in a store that is read and yield True; False where it may not be written, which a push does not need.
+    """Hold off `gc` in a store that is read and yield True, or False if it may not be written, which a push does not need.
 
     Then a collection at the same time is not held off: what it removes before it was copied ends the push.
     """
@@ -214,7 +214,7 @@ def _predecessor(
 
 
 def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> None:
-    """Raise `TacpipeError` where a push of the same name wrote its root over this one's at the same time.
+    """Raise `TacpipeError` if a push of the same name wrote its root over this one's at the same time.
 
     The lease excludes that, but for file systems without locks; in a bucket it takes three pushes during one of them.
     """

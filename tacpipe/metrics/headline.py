@@ -22,7 +22,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class HeadlineRow:
-    """The errors of one predictor, one value a column of the headline; NaN where one is not defined."""
+    """The errors of one predictor, one value a column of the headline, or NaN if one is not defined."""
 
     name: str
     values: tuple[float, ...]
@@ -42,7 +42,7 @@ class Headline:
     model: HeadlineRow
     baselines: tuple[HeadlineRow, ...]  # the best first
     measure: str  # kind of gain: "skill" (1 − error / error of the best baseline) or "points" (of percent)
-    gain: float  # gain of the model over the best baseline; NaN where it is not defined
+    gain: float  # gain of the model over the best baseline, or NaN if it is not defined
     low: float  # 95 % interval of the gain; NaN with fewer than three clusters
     high: float
     clusters: int  # units of the interval
@@ -56,7 +56,7 @@ class Headline:
 
     @property
     def best(self) -> HeadlineRow | None:
-        """The best baseline, None where none was evaluated."""
+        """The best baseline, or None if none was evaluated."""
         return self.baselines[0] if self.baselines else None
 
     @property
@@ -66,7 +66,7 @@ class Headline:
 
     @property
     def verdict(self) -> str:
-        """How the model compares with the best baseline (`verdict_of`); empty where none was evaluated."""
+        """How the model compares with the best baseline (`verdict_of`), or empty if none was evaluated."""
         return verdict_of(self.low, self.high, self.clusters, self.effective)
 
     @property
@@ -112,7 +112,7 @@ def read(content: bytes) -> list[Headline]:
 def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
     """Return ``better`` or ``worse`` where the interval of a gain excludes 0, ``unclear`` where it does not.
 
-    Empty where an interval is not sure to hold 95 %: with fewer than `FEWEST` clusters, or where these are as certain as
+    Empty if an interval is not sure to hold 95 %: with fewer than `FEWEST` clusters, or where these are as certain as
     fewer equal ones would be (``effective``), and without an interval.
     """
     if clusters < FEWEST or round(effective, 6) < FEWEST or math.isnan(low) or math.isnan(high):
@@ -168,7 +168,7 @@ def amount(headline: Headline) -> str:
 
 
 def bounds(headline: Headline) -> str:
-    """Return the interval of the gain, empty where it is not defined."""
+    """Return the interval of the gain, or empty if it is not defined."""
     if math.isnan(headline.low):
         return ""
     return f"{signed(headline.low, headline.measure)} to {signed(headline.high, headline.measure)}"

@@ -32,7 +32,7 @@ Statistic = Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to values (dra
 
 
 class Estimate(NamedTuple):
-    """A value and its 95 % interval; NaN where it is not defined, ends also with fewer than `LEAST` clusters."""
+    """A value and its 95 % interval, or NaN if it is not defined, ends also with fewer than `LEAST` clusters."""
 
     mean: float
     low: float
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Interval:
-    """Values with the ends of their 95 % intervals, each (value,); ends are NaN where they are not defined."""
+    """Values with the ends of their 95 % intervals, each (value,); ends are NaN if they are not defined."""
 
     mean: AnyFloats
     low: AnyFloats
@@ -156,7 +156,7 @@ def largest_quantile(influences: Sequence[AnyFloats], freedom: float) -> float:
 
 
 def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-    """Return 1 - model / baseline: 1 is perfect, 0 no better than the baseline, below 0 worse. NaN where it never errs.
+    """Return 1 - model / baseline: 1 is perfect, 0 no better than the baseline, below 0 worse. NaN if it never errs.
 
     >>> skill(np.array([1.0, 3.0]), np.array([2.0, 2.0])).tolist()
     [0.5, -0.5]
@@ -166,7 +166,7 @@ def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
 
 
 def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-    """Return the logarithm of a ratio of errors, 1 - `skill`, bounded below; NaN where the baseline never errs."""
+    """Return the logarithm of a ratio of errors, 1 - `skill`, bounded below, or NaN if the baseline never errs."""
     ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), SMALLEST))
     return ratio
 
@@ -268,12 +268,12 @@ class Difference(NamedTuple):
     """The result of a paired test: second less first."""
 
     difference: float  # mean over pairs, in the unit of what was given
-    t: float  # infinite where all pairs differ alike; NaN where none does
-    p: float  # two-sided; NaN where no pair differs
+    t: float  # infinite where all pairs differ alike, or NaN if none does
+    p: float  # two-sided, or NaN if no pair differs
 
 
 def wilson(correct: int, n: int) -> tuple[float, float]:
-    """Return the bounds of the 95 % interval of the share ``correct`` of ``n``; both NaN where ``n`` is 0.
+    """Return the bounds of the 95 % interval of the share ``correct`` of ``n``; both NaN if ``n`` is 0.
 
     Wilson, Probable inference, the law of succession, and statistical inference, 1927: all true shares whose own chance
     would make the observed one no rarer than 1 in 20.
@@ -299,7 +299,7 @@ def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
     McNemar, Note on the sampling error of the difference between correlated proportions or percentages, 1947, exact: of
     the slides that only one of them gets right, either would have half.
 
-    It is 1 where they are right on the same slides. Raises `TacpipeError` where the slides are not as many.
+    It is 1 where they are right on the same slides. Raises `TacpipeError` if the slides are not as many.
 
     >>> right = np.ones(10, bool)
     >>> wrong_on_six = np.arange(10) >= 6
@@ -325,7 +325,7 @@ def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArr
     It compares two ways of training over repeats that share split and seed (Student, The probable error of a mean,
     1908).
 
-    Raises `TacpipeError` where there are fewer than two pairs.
+    Raises `TacpipeError` if there are fewer than two pairs.
 
     >>> paired_t([0.90, 0.91, 0.92], [0.92, 0.94, 0.93]).difference
     0.02

@@ -40,7 +40,7 @@ class Measure:
     ranked_by: str  # name of ``error``
     name: str  # kind of gain: "skill" or "points"
     cluster: str  # name of the clusters of recordings, in the plural
-    error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, NaN where not defined
+    error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, or NaN if not defined
     gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to (draw,)
     values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to a value a column
     score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # maps errors (draw,) to the values of charts (draw,)
@@ -58,7 +58,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Gain:
-    """The gain of a predictor over another, its 95 % interval and the number of clusters; NaN where undefined."""
+    """The gain of a predictor over another, its 95 % interval and the number of clusters, or NaN if undefined."""
 
     mean: float
     low: float
@@ -98,7 +98,7 @@ class Pair:
 
 
 def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, str] | None = None) -> Pair | None:
-    """Return a predictor next to a baseline on the recordings that they share; None where they share none.
+    """Return a predictor next to a baseline on the recordings that they share, or None if they share none.
 
     Where the baseline was not evaluated with a seed of the predictor, its mean over its own seeds counts. ``clusters`` maps
     a recording to what it is left out with, by default itself.
@@ -224,7 +224,7 @@ def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = Non
 
 
 def difference(measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None) -> Gain:
-    """Return what the first predictor gains over the second on the recordings of both; NaN where they share none."""
+    """Return what the first predictor gains over the second on the recordings of both, or NaN if they share none."""
     compared = pair(measure, first, second, clusters)
     return gain(measure, [compared] if compared else [])
 
@@ -328,7 +328,7 @@ def value_intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> 
 def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval | None:
     """Return by how much several values of one predictor exceed those of another on the recordings of both.
 
-    None where they share none.
+    None if they share none.
     """
     pairs, names = _side_by_side(first, second, None)
     width = pairs.shape[2] // 2

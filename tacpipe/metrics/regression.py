@@ -20,7 +20,7 @@ BATCH = 10  # grasps over which the letter (RA-L 2020) takes each RMSE before it
 def squared_sums(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return the sum over values of each grasp's squared error, (grasp, value) to (grasp,).
 
-    Raises `TacpipeError` where the two are not of one such shape.
+    Raises `TacpipeError` if the two are not of one such shape.
     """
     error = _error(true, predicted)
     total: AnyFloats = np.einsum("gv,gv->g", error, error)
@@ -59,7 +59,7 @@ def mae(true: AnyFloats, predicted: AnyFloats) -> float:
 
 
 def r2(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the fraction of variance that is explained, each value's about its own mean; NaN where nothing varies.
+    """Return the fraction of variance that is explained, each value's about its own mean, or NaN if nothing varies.
 
     1 is perfect; 0 is as good as the mean of these very grasps, which nobody knows beforehand: a constant that was fitted
     elsewhere falls below it.

@@ -168,7 +168,7 @@ class _Block(nn.Module):
 
 
 def spread(rows: Tensor) -> Tensor:
-    """Return the standard deviation of ``rows`` (row, column) over rows, (column,); 0 where there is one row."""
+    """Return the standard deviation of ``rows`` (row, column) over rows, (column,), or 0 if there is one row."""
     return rows.std(0) if len(rows) > 1 else torch.zeros_like(rows[0])
 
 
@@ -309,7 +309,7 @@ class TaxelwiseForecast(ChangeForecast):
 def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
     """Return how many sensors, taxels a sensor and axes a taxel there are.
 
-    Raises `TacpipeError` where channels do not lie sensor by sensor and taxel by taxel, or sensors differ in size.
+    Raises `TacpipeError` if channels do not lie sensor by sensor and taxel by taxel, or sensors differ in size.
     """
     streams = list(dict.fromkeys(channel.get("stream", "") for channel in layout))
     axes = list(dict.fromkeys(channel.get("axis", "") for channel in layout))

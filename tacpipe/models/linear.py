@@ -72,7 +72,7 @@ class FittedBaselines:
 
     mean_count: AnyFloats  # (channel,)
     phi: float
-    lag: int  # rows; 0 where a single past frame shows no trend
+    lag: int  # rows, or 0 if a single past frame shows no trend
     shared_weight: AnyFloats  # (context - 1, horizon)
     shared_bias: AnyFloats  # (horizon,), counts
     ridge: Map
@@ -82,7 +82,7 @@ class FittedBaselines:
     def fit(cls, training: Windows, validation: Windows) -> FittedBaselines:
         """Return the baselines fitted on ``training``, each (past, motion, ahead); ``validation`` picks the alphas.
 
-        Raises `TacpipeError` where a part has no windows, arrays do not fit one another or a value is not finite.
+        Raises `TacpipeError` if a part has no windows, arrays do not fit one another or a value is not finite.
         """
         _check("training", training)
         _check("validation", validation)

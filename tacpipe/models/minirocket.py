@@ -77,7 +77,7 @@ class Rocket:
     def transform(self, x: AnyFloats) -> AnyFloats:
         """Return the features of slides (slide, time, channel): shares from 0 to 1, (slide, feature), float32.
 
-        Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
+        Raises `TacpipeError` if slides are not like those that were fitted, or values are not finite.
         """
         _check(x)
         if x.shape[1:] != (self.frames, self.channels.shape[-1]):
@@ -118,7 +118,7 @@ class Rocket:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Rocket:
-        """Return the transform that `to_tensors` described. Raises `ValueError` where its parts do not fit one another."""
+        """Return the transform that `to_tensors` described. Raises `ValueError` if its parts do not fit one another."""
         names = ("dilations", "each", "channels", "biases")
         rocket = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
         count = len(rocket.dilations)
@@ -246,7 +246,7 @@ class MinirocketClassifier:
     def scores(self, x: AnyFloats) -> AnyFloats:
         """Return the scores of slides (slide, time, channel), (slide, class), float32; the highest wins.
 
-        Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
+        Raises `TacpipeError` if slides are not like those that were fitted, or values are not finite.
         """
         wide = with_profile(x)
         return self.readout.scores(np.concatenate([self.patterns.transform(wide), _strength(wide)], axis=1))

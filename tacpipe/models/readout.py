@@ -47,7 +47,7 @@ class Readout:
         """Return the readout of training slides (slide, feature) and their classes (slide,).
 
         ``shares`` (feature,) states how much each feature counts beside the others once they are standardised; all alike
-        without it, and 0 is as good as no feature. Raises `TacpipeError` where arrays do not fit one another, a value
+        without it, and 0 is as good as no feature. Raises `TacpipeError` if arrays do not fit one another, a value
         is not finite, or there are fewer than two classes.
         """
         classes = np.unique(labels).astype(np.int32)
@@ -168,7 +168,7 @@ class Level:
     def fit(cls, x: AnyFloats, labels: Ints) -> Level:
         """Return the analysis of training slides (slide, time, channel) and their classes (slide,).
 
-        A channel that never changes counts for nothing. Raises `TacpipeError` where arrays do not fit one another, a
+        A channel that never changes counts for nothing. Raises `TacpipeError` if arrays do not fit one another, a
         value is not finite, there are fewer than two classes, or no class has two slides.
         """
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
@@ -280,7 +280,7 @@ class StatisticsClassifier:
     def scores(self, x: AnyFloats) -> AnyFloats:
         """Return the scores of slides (slide, time, channel), (slide, class), float32; the highest wins.
 
-        Raises `TacpipeError` where slides have other channels than those that were fitted, or values are not finite.
+        Raises `TacpipeError` if slides have other channels than those that were fitted, or values are not finite.
         """
         return self.readout.scores(read(x, self.view))
 

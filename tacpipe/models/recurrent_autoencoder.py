@@ -176,7 +176,7 @@ class NetworkOutput(NamedTuple):
 
     latents: Tensor  # (slide, latent)
     scores: Tensor  # (slide, class)
-    frames: Tensor | None  # the reconstructed slides (time, slide, channel); None where there is no decoder
+    frames: Tensor | None  # the reconstructed slides (time, slide, channel), or None if there is no decoder
 
 
 class RecurrentAutoencoder(nn.Module):

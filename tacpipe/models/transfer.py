@@ -69,7 +69,7 @@ class Transfer:
     def fit(cls, slides: Labelled, other_sensors: Sequence[Labelled] = ()) -> Transfer:
         """Return the classes of a sensor, fitted on its labelled ``slides`` and on those of ``other_sensors``.
 
-        Raises `TacpipeError` where arrays do not fit one another, values are not finite, no class has two slides, the
+        Raises `TacpipeError` if arrays do not fit one another, values are not finite, no class has two slides, the
         sensor has fewer than two classes, or fewer than `SHARED` of those of another sensor.
         """
         for part in (slides, *other_sensors):
@@ -148,7 +148,7 @@ def _mapped(source: AnyFloats, target: AnyFloats, features: AnyFloats) -> AnyFlo
 
 
 def _means(slides: Labelled, classes: Ints) -> AnyFloats:
-    """Return the mean features of each class (class, feature), NaN where a class has no slide."""
+    """Return the mean features of each class (class, feature), or NaN if a class has no slide."""
     means = np.full((len(classes), slides.features.shape[1]), np.nan)
     for index, label in enumerate(classes):
         if (slides.labels == label).any():
@@ -241,7 +241,7 @@ class Bands:
         """Return ``number`` bands, alike on a logarithmic scale, that all sensors can be read in.
 
         They begin at `PERIODS` in the shortest slide's way and end at the fraction `HIGHEST` of the lowest frequency that
-        a sensor could separate from others. Raises `TacpipeError` where nothing lies between.
+        a sensor could separate from others. Raises `TacpipeError` if nothing lies between.
 
         >>> Bands.common([Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)]).edges_per_m[[0, -1]].round(3).tolist()
         [40.0, 300.0]

@@ -19,7 +19,7 @@ class ForecastWindows(NamedTuple):
 
     touch: Tensor  # (context, window, feature): latents in their codec's unit, or counts above rest
     arm: Tensor  # (context + horizon, window, 13): position m, quaternion xyzw, velocity m/s, angular velocity rad/s
-    finger: Tensor  # (context, window): width between the fingers, m; 0 where it is not recorded
+    finger: Tensor  # (context, window): width between the fingers, m, or 0 if it is not recorded
 
     @property
     def context(self) -> int:

@@ -111,7 +111,7 @@ def plugin(kind: Kind) -> str | None:
 
 
 def check_installed(base: Any, values: Mapping[str, Any], kind: Kind | None) -> None:
-    """Raise `TacpipeError` where stored params are of an architecture whose package is not installed, or cannot be loaded.
+    """Raise `TacpipeError` if stored params are of an architecture whose package is not installed, or cannot be loaded.
 
     ``kind`` is the class that they name, if there is one.
     """
@@ -136,7 +136,7 @@ def warn_of_version(values: Mapping[str, Any], kind: Kind) -> None:
 
 
 def check_version(values: Mapping[str, Any], kind: Kind) -> None:
-    """Raise `TacpipeError` where stored params were computed with another version of the package than is installed."""
+    """Raise `TacpipeError` if stored params were computed with another version of the package than is installed."""
     before, now = values.get(PLUGIN), plugin(kind)
     if before != now:
         raise TacpipeError(

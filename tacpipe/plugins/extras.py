@@ -62,7 +62,7 @@ def require(needed_by: str, *modules: str) -> None:
 
 
 def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> MissingModuleError | None:
-    """Return the sentence for a module that is not installed; None where the import failed for another reason.
+    """Return the sentence for a module that is not installed, or None if the import failed for another reason.
 
     ``plugin`` is the package that ``needed_by`` comes from, for modules that tacpipe's own extras do not bring.
     """

@@ -43,7 +43,7 @@ def hints(kind: type[Any]) -> Mapping[str, Any]:
 
 
 def bare(annotation: Any) -> Any:
-    """Return an annotation without constraints, and without None where that is the only alternative.
+    """Return an annotation without constraints, and without None if that is the only alternative.
 
     >>> bare(Annotated[int, "of 1 or more"]), bare(float | None)
     (<class 'int'>, <class 'float'>)
@@ -59,7 +59,7 @@ def bare(annotation: Any) -> Any:
 
 
 def choices(kind: type[Any], name: str) -> tuple[Any, ...]:
-    """Return the choices of the field ``name`` of a dataclass; empty where it is not a Literal."""
+    """Return the choices of the field ``name`` of a dataclass, or empty if it is not a Literal."""
     annotation = bare(hints(kind).get(name))
     return get_args(annotation) if get_origin(annotation) is Literal else ()
 
@@ -84,7 +84,7 @@ def metadata(annotation: Any) -> tuple[Any, ...]:
 def check(value: Any, annotation: Any, name: str, place: str = "") -> Any:
     """Return ``value`` in the type of ``annotation``: an int becomes a float if a float is expected.
 
-    ``name`` and ``place`` identify the value in messages. Raises `UsageError` where it is not allowed.
+    ``name`` and ``place`` identify the value in messages. Raises `UsageError` if it is not allowed.
     """
     fitted = _fit(value, annotation, f"{place}, {name}" if place else name)
     if fitted is REFUSED:

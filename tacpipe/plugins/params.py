@@ -44,7 +44,7 @@ def _members(union: Any) -> tuple[Kind, ...]:
 
 
 def tag(stage: AnyStage) -> str | None:
-    """Return the name of the field that chooses among several kinds of params; None where there is one kind."""
+    """Return the name of the field that chooses among several kinds of params, or None if there is one kind."""
     alternatives = kinds(stage)
     if len(alternatives) == 1:
         return None
@@ -142,7 +142,7 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
     """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
 
     A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
-    Raises `TacpipeError` where a stage that works recording by recording has no such field, and where another version of
+    Raises `TacpipeError` if a stage that works recording by recording has no such field, and where another version of
     an architecture's package is installed: its result would be stored under a name that is not its own.
     """
     kind, current = _current(kinds(stage), values)
@@ -171,7 +171,7 @@ def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def kind_of(stage: AnyStage, values: Mapping[str, Any]) -> Kind | None:
-    """Return the kind that stored params are of; None where the tag names no kind, as of a plug-in that is not installed."""
+    """Return the kind that stored params are of, or None if the tag names no kind, as of a plug-in that is not installed."""
     return _current(kinds(stage), values)[0]
 
 
@@ -243,7 +243,7 @@ def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _current(alternatives: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
-    """Return the kind that stored params are of, and these by today's names and choices; None where there is no such kind.
+    """Return the kind that stored params are of, and these by today's names and choices, or None if there is no such kind.
 
     A name that the kind does not have is that of another kind, or stays as it is.
     """

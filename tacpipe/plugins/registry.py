@@ -124,7 +124,7 @@ def package_of_stage(name: str) -> str | None:
 
 @functools.cache
 def package_code(package: str) -> str | None:
-    """Return the digest of all code of a plug-in package, or of tacpipe itself; None where it is not installed.
+    """Return the digest of all code of a plug-in package, or of tacpipe itself, or None if it is not installed.
 
     The code is that of the first call: a process does not import a module again that was edited since.
     """
@@ -393,7 +393,7 @@ def _package(target: str) -> str | None:
             ),
             None,
         )
-    except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises where metadata is missing
+    except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises if metadata is missing
         return None
 
 

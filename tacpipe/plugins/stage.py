@@ -6,7 +6,7 @@ states by its annotation what the stage reads:
 =================  ==================================================================================================
 ``Recording``      one recording at a time; the stage is run, keyed and stored for each recording alone
 ``Dataset``        all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
-                   may be empty where it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
+                   may be empty if it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
                    given, before they went through the stages that ``first`` names
 ``Datasets``       several datasets side by side, as a tuple
 ``Model``          a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out

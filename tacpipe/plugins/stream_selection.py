@@ -33,7 +33,7 @@ class StreamSelection:
     def narrow(self, recording: Any) -> Any:
         """Return a recording with the selected streams; of a synchronized one with the columns of these streams.
 
-        Raises `TacpipeError` where the recording has no stream of a name, or where no stream is left.
+        Raises `TacpipeError` if the recording has no stream of a name, or where no stream is left.
         """
         if not (self.streams or self.without):
             return recording

@@ -118,7 +118,7 @@ def table(
 
 
 def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
-    """Return a fold of those blocks that are there; none where none is."""
+    """Return a fold of those blocks that are there, or None if none is."""
     shown_blocks = [
         block for block in blocks if block is not None and not (isinstance(block, SmallPrint) and not block.text)
     ]

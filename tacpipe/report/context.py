@@ -55,7 +55,7 @@ class ReportResult:
 
     @cached_property
     def history(self) -> Sequence[Tree]:
-        """The lines of ``history.jsonl``, one per epoch; empty where nothing was trained by epochs."""
+        """The lines of ``history.jsonl``, one per epoch, or empty if nothing was trained by epochs."""
         lines = self.dataset.files.get("history.jsonl", b"").splitlines()
         return [json.loads(line) for line in lines if line.strip()]
 
@@ -90,7 +90,7 @@ class ReportResult:
 
 
 def read_json(result: Dataset, name: str) -> Tree:
-    """Return what a JSON file of a result holds; empty where there is none of the name."""
+    """Return what a JSON file of a result holds, or empty if there is none of the name."""
     tree: Tree = json.loads(result.files[name]) if name in result.files else {}
     return tree
 
@@ -181,7 +181,7 @@ def loss_chart(
 
 
 def without_gaps(values: Sequence[float | None]) -> list[float]:
-    """Return one value an epoch, NaN where an epoch states none; empty where no epoch states any.
+    """Return one value an epoch, or NaN if an epoch states none, or empty if no epoch states any.
 
     >>> without_gaps([None, 1]), without_gaps([None, None])
     ([nan, 1.0], [])

@@ -126,7 +126,7 @@ def render(datasets: Sequence[Dataset], *, title: str = "", traces: int = 2) -> 
 
     Without a ``title``, it is made of what the tasks on the page predict.
     Results are reported by task, in the order in which tasks first come, with datasets that are not results next to those
-    whose task can use them. Raises `TacpipeError` where none can, and without any result.
+    whose task can use them. Raises `TacpipeError` if none can, and without any result.
     """
     with model_files.validated("the results"):
         return _rendered(datasets, title, traces)

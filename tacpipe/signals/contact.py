@@ -261,7 +261,7 @@ def contact_row(pressure: Floats, t_ns: Times, limits: ContactLimits) -> int:
 def settled_rows(pressure: Floats, t_ns: Times, contact: int, limits: ContactLimits) -> slice:
     """Return the first ``settle_s`` of rows, from the row ``contact`` on, in which the pressure of each finger rests.
 
-    ``pressure`` is (time, finger). Raises `TacpipeError` where it never does.
+    ``pressure`` is (time, finger). Raises `TacpipeError` if it never does.
     """
     rows = _rows(t_ns, limits.settle_s)
     windows = sliding_window_view(pressure[contact:], rows, axis=0)  # (start, finger, row)
@@ -277,7 +277,7 @@ def settled_rows(pressure: Floats, t_ns: Times, contact: int, limits: ContactLim
 
 
 def _rows(t_ns: Times, duration_s: float) -> int:
-    """Return how many rows last ``duration_s``, one or more. Raises `TacpipeError` where a stream has no more than these."""
+    """Return how many rows last ``duration_s``, one or more. Raises `TacpipeError` if a stream has no more than these."""
     rows = 1
     if len(t_ns) > 1:
         rows = max(1, round(duration_s * 1e9 / float(np.median(np.diff(t_ns)))))

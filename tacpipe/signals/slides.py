@@ -48,7 +48,7 @@ def trigger_row(pressure: AnyArray, threshold: float) -> int:
 def touched_rows(load: Floats, on: float, off: float, unit: str = "") -> Rows:
     """Return the rows from the first ``load`` (time,) of ``on`` or more to the last of ``off`` or more.
 
-    Raises `TacpipeError` where there is none.
+    Raises `TacpipeError` if there is none.
 
     >>> touched_rows(np.array([0.0, 1.0, 5.0, 3.0, 6.0, 2.0, 0.0]), on=4.0, off=2.0)
     (2, 6)
@@ -67,7 +67,7 @@ def sliding_rows(speed_m_s: Floats, first: int, least_m_s: float, steady_rows: i
     """Return the rows from ``first`` on between which ``speed_m_s`` (time,) begins and ceases to be ``least_m_s``.
 
     It counts once it lasts for ``steady_rows``, so that a single fast reading of an arm at rest begins nothing. What is
-    slower in between belongs to the slide. None where the arm never moves so fast.
+    slower in between belongs to the slide. None if the arm never moves so fast.
 
     >>> sliding_rows(np.array([0.0, 9.0, 0.0, 3.0, 3.0, 1.0, 3.0, 3.0, 0.0]), 0, least_m_s=2.0, steady_rows=2)
     (3, 8)
@@ -127,7 +127,7 @@ def measured(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, flo
 
 
 def departures(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]) -> list[str]:
-    """Return in words each way in which a slide differs from its protocol; none where it does not.
+    """Return in words each way in which a slide differs from its protocol, or None if it does not.
 
     >>> wanted = Protocol(0.025, 0.1, 5.0, 2.0, 150.0)
     >>> departures(wanted, 8.0, {"pressure_mean_count": 1.0, "speed_m_s": 0.03})

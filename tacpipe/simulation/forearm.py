@@ -1,6 +1,6 @@
 """A patch of iCub RoboSkin on a slide: six triangular modules of ten taxels each, of which the object presses some.
 
-The compensated readings of the iCub are floats, 0 where nothing presses, clipped at 255. The object lies on a patch that
+The compensated readings of the iCub are floats, or 0 if nothing presses, clipped at 255. The object lies on a patch that
 wanders over the triangles as the curved forearm rolls on it; taxels outside are idle: a dead zone hides their noise. In
 the published slides 51 % of the readings are zero.
 

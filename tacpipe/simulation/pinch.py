@@ -29,7 +29,7 @@ def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:
 
     ``curvatures_1_m`` are the surface's two principal curvatures (..., 2). Each adds to the tip's own; the radius is
     the geometric mean of both relative ones, equation (4.25) with R_e = (R' R'')^(1/2). For a sphere of radius R it is
-    1 / (1/tip + 1/R). Raises `ValueError` where the surface is hollowed out so much that the tip does not reach its
+    1 / (1/tip + 1/R). Raises `ValueError` if the surface is hollowed out so much that the tip does not reach its
     ground.
     """
     relative = 1 / tip_m + np.asarray(curvatures_1_m, np.float64)
@@ -44,7 +44,7 @@ def effective_modulus_pa(skin_pa: float, compliance_1_pa: float) -> float:
 
 
 def contact_radius_m(force_n: ArrayLike, radius_m: ArrayLike, modulus_pa: float) -> Floats:
-    """Return a = (3 F R / 4 E*)^(1/3), metres, equation (4.22); 0 where there is no force."""
+    """Return a = (3 F R / 4 E*)^(1/3), metres, equation (4.22), or 0 if there is no force."""
     return np.asarray(np.cbrt(3 * np.asarray(force_n, np.float64) * np.asarray(radius_m) / (4 * modulus_pa)))
 
 

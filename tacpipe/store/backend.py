@@ -43,7 +43,7 @@ class Backend(Protocol):
     place: str  # Name in messages
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
-        """Keep ``content``, whole or in blocks, under a name that nothing has; return False where something has it.
+        """Keep ``content``, whole or in blocks, under a name that nothing has; return False if something has it.
 
         Of several that create one name at once one wins. Nobody ever sees a part of the content.
         """
@@ -51,14 +51,14 @@ class Backend(Protocol):
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
         """Return the content of at most ``max_bytes`` bytes.
 
-        Raises `FileNotFoundError` where there is none, and `IrregularError` for one that is larger or is not content.
+        Raises `FileNotFoundError` if there is none, and `IrregularError` for one that is larger or is not content.
         """
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
         """Yield the content block by block; raises as `read` does."""
 
     def stat(self, name: str) -> Entry | None:
-        """Return what the place states of a name, None where nothing has it; raises `IrregularError` as `read` does."""
+        """Return what the place states of a name, or None if nothing has it; raises `IrregularError` as `read` does."""
 
     def list(self, folder: str) -> Iterator[Entry]:
         """Yield what has the form of a store's names within ``folder``, at any depth, in no order.
@@ -67,7 +67,7 @@ class Backend(Protocol):
         """
 
     def move(self, name: str, to: str) -> bool:
-        """Give content another name, and replace what has that; return False where nothing has ``name``.
+        """Give content another name, and replace what has that; return False if nothing has ``name``.
 
         Whoever looks finds it under the one name, the other, or both.
         """
@@ -80,7 +80,7 @@ def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes
     """Return the parsed content of a file, which is read again if the first answer cannot be parsed.
 
     Returns None only if the second answer agrees with the first: an answer may be damaged on its way. Raises
-    `StorageError` if they differ, and `FileNotFoundError` where no such file exists.
+    `StorageError` if they differ, and `FileNotFoundError` if no such file exists.
     """
     answers: list[bytes | str] = []
     for _ in range(2):
@@ -121,7 +121,7 @@ class Directory:
     ) -> bool:
         """Write a file of the store whole or not at all, over what was there; return False if ``exclusive`` lost the race.
 
-        Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
+        Raises `StorageError` if its folder is a symbolic link: what is replaced there may be anybody's.
         """
         self.refuse_linked(path)
         with readable_errors(self._root):
@@ -183,7 +183,7 @@ class Directory:
             Path(self.path(name)).unlink(missing_ok=True)
 
     def refuse_linked(self, path: Path | str) -> None:
-        """Raise `StorageError` where a file of the store lies in a folder that is a symbolic link."""
+        """Raise `StorageError` if a file of the store lies in a folder that is a symbolic link."""
         if layout.is_linked(self.place, path):
             raise StorageError(
                 f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."

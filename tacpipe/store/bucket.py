@@ -73,7 +73,7 @@ class Bucket:
         return True
 
     def _create(self, name: str, content: bytes) -> bool:
-        """Create a name with one request. Raises `StorageError` where the server refuses that, and nothing has the name."""
+        """Create a name with one request. Raises `StorageError` if the server refuses that, and nothing has the name."""
         import obstore
 
         tries = 0

@@ -79,7 +79,7 @@ class CachedStore(Store):
 
     @property
     def bucket(self) -> RemoteStore:
-        """The store in the bucket, which need not have begun yet. Raises `UsageError` where it has another format."""
+        """The store in the bucket, which need not have begun yet. Raises `UsageError` if it has another format."""
         if self._remote is None:
             key = os.getpid(), self.root
             if key not in _buckets:
@@ -188,7 +188,7 @@ class CachedStore(Store):
                 advance()
 
     def _bring(self, name: str, size: int | None = None) -> None:
-        """Bring an object, verified. Raises `MissingError` where the bucket has not it, or has it damaged.
+        """Bring an object, verified. Raises `MissingError` if the bucket has not it, or has it damaged.
 
         What is damaged there twice in a row is moved to quarantine there: then it is missing for everybody, and recomputed.
         """

@@ -131,7 +131,7 @@ def is_linked(root: str, path: str | Path) -> bool:
 
 
 def _is_link(path: str | Path) -> bool:
-    """Return whether a symbolic link lies at a path. Raises `OSError` where the system fails to look."""
+    """Return whether a symbolic link lies at a path. Raises `OSError` if the system fails to look."""
     try:
         return stat.S_ISLNK(os.lstat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -166,7 +166,7 @@ def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
 
 
 def _mark(root: Path) -> str | None:
-    """Return the format that a store names, None where there is no mark. Raises `UsageError` for what cannot be a store."""
+    """Return the format that a store names, or None if there is no mark. Raises `UsageError` for what cannot be a store."""
     try:
         with regular.opened(root / MARK) as file:
             return file.read(64).strip().decode(errors="replace")

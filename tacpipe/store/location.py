@@ -39,7 +39,7 @@ def locate(*datasets: Path) -> Store:
     """Return the store for a command that reads or writes ``datasets``, the output first.
 
     ``TACPIPE_STORE`` names it, else it lies in `project`. With an address, the cache folder of the bucket is used as a
-    store. Raises `UsageError` where something else lies there, as `layout.check` does, for an
+    store. Raises `UsageError` if something else lies there, as `layout.check` does, for an
     address that is not one of a bucket, and for a store of another user that ``TACPIPE_STORE`` does not name.
     """
     setting = os.environ.get("TACPIPE_STORE")
@@ -130,7 +130,7 @@ def _refuse_other_owner(root: Path) -> None:
 def _marks(path: Path) -> bool:
     """Return whether a mark is there; a link to a disk that is not mounted counts.
 
-    Raises `StorageError` where the system fails to look: without the mark another store would be used.
+    Raises `StorageError` if the system fails to look: without the mark another store would be used.
     """
     try:
         return present(path)

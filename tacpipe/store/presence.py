@@ -62,7 +62,7 @@ class Note:
     body: int  # Offset of the rows in the file
 
     def rows(self, shelf: str) -> list[Row] | None:
-        """Return the objects that were noted on a shelf; None where the note is damaged."""
+        """Return the objects that were noted on a shelf, or None if the note is damaged."""
         content = self.content(shelf)
         if content is None:
             return None
@@ -73,7 +73,7 @@ class Note:
         return rows
 
     def content(self, shelf: str) -> bytes | None:
-        """Return the rows of a shelf as they are kept; None where the note is damaged."""
+        """Return the rows of a shelf as they are kept, or None if the note is damaged."""
         _, begin, count, expected_digest = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
         content = b""
         with contextlib.suppress(OSError, TacpipeError), regular.opened(self.file, follow=False) as reading:
@@ -91,7 +91,7 @@ def encode_note(rows: Iterable[Row]) -> bytes:
 
 
 def read_note(store: Store, directory: Path) -> Note | None:
-    """Return the note on a directory; None where there is none, or none that can be read."""
+    """Return the note on a directory, or None if there is none, or none that can be read."""
     file = _file(store, directory)
     with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
         with regular.opened(file, follow=False) as reading:
@@ -178,7 +178,7 @@ class Look:
 
         Of a folder of objects that changed, or whose state is not noted, each object is looked at. The directory is listed
         where it changed, and for whoever is about to change it and `succeed`: ``listed``. Else the note is written anew
-        where that saves the next look something. False where it is not known: then each file is to be looked at.
+        where that saves the next look something. False if it is not known: then each file is to be looked at.
         """
         head = note.head
         if not head.boot or head.boot != _boot() or self._directory_state is None:
@@ -283,7 +283,7 @@ class Look:
         return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
 
     def _stored(self, name: str) -> Row:
-        """Return digest, size and inode of an object. Raises `KeyError` where it is not a file next to the directory."""
+        """Return digest, size and inode of an object. Raises `KeyError` if it is not a file next to the directory."""
         status = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
         if (
             not stat.S_ISREG(status.st_mode)
@@ -305,15 +305,15 @@ class Look:
         return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
 
     def _settled(self) -> Callable[[State | None], State | None]:
-        """Return a function of what a folder's state was as the look began, which is None where it had changed just before.
+        """Return a function of what a folder's state was as the look began, which is None if it had changed just before.
 
-        Then the next change might have the same time. Raises `TacpipeError` where a change leaves no time in its folder.
+        Then the next change might have the same time. Raises `TacpipeError` if a change leaves no time in its folder.
         """
         before_ns = self._clock_ns() - (time.monotonic_ns() - self._begun_ns) - SETTLED_NS
         return lambda state: state if state is not None and max(state[-2:]) < before_ns else None
 
     def _clock_ns(self) -> int:
-        """Return the time by the file system's clock. Raises `TacpipeError` where a change leaves no time in its folder."""
+        """Return the time by the file system's clock. Raises `TacpipeError` if a change leaves no time in its folder."""
         folder = self._store.root / "tmp"
         before = _state(folder)
         draft = Path(self._store.draft())

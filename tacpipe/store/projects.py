@@ -123,7 +123,7 @@ def new_id() -> str:
 def join(store: Store, folder: Path, project: Project) -> None:
     """Make ``project`` the identity of the project in ``folder``, as on a second computer.
 
-    Raises `UsageError` where the environment names another one.
+    Raises `UsageError` if the environment names another one.
     """
     configured = from_environment()
     if configured is not None and configured != project:

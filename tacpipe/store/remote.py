@@ -206,7 +206,7 @@ class RemoteStore:
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
 
-        Raises `MissingError` where it is not there or its bytes do not hash to its name, and `StorageError` where the place
+        Raises `MissingError` if it is not there or its bytes do not hash to its name, and `StorageError` if the place
         fails.
         """
         return b"".join(self.blocks(name, size))
@@ -244,7 +244,7 @@ class RemoteStore:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
 
     def quarantine(self, name: str) -> bool:
-        """Move a damaged object out of the way, for whoever wants to know why; return False where it is gone already."""
+        """Move a damaged object out of the way, for whoever wants to know why; return False if it is gone already."""
         return self.files.move(layout.object_name(name), f"quarantine/{name}.{time.time_ns()}")
 
     def asides(self, name: str = "") -> Iterator[Entry]:

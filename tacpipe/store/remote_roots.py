@@ -86,7 +86,7 @@ class RemoteRoots:
         return self._succeed({**root, **succeeded, **flags, _NUMBER: number})
 
     def write(self, root: Root) -> None:
-        """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` where another one came first."""
+        """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` if another one came first."""
         if not self._succeed(root):
             raise TacpipeError(
                 f"{root['path']} was pushed to {self.files.place} meanwhile. Run the same command again."

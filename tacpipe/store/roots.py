@@ -165,7 +165,7 @@ def decoded(value: Any) -> Root | None:
 
 
 def project_id(root: Mapping[str, Any]) -> str:
-    """Return the id of the project that pushed a root; empty where none did, or before projects had one."""
+    """Return the id of the project that pushed a root, or empty if none did, or before projects had one."""
     return str(root.get("project", {}).get("id", ""))
 
 

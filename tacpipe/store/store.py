@@ -78,7 +78,7 @@ class Store:
         return self.files.path(layout.record_name(key))
 
     def check(self) -> bool:
-        """Return whether there is a store; False where one may be begun. Raises `UsageError` as `layout.check` does."""
+        """Return whether there is a store, or False if one may be begun. Raises `UsageError` as `layout.check` does."""
         return layout.check(self.root)
 
     def prepare(self) -> None:
@@ -128,7 +128,7 @@ class Store:
 
     @property
     def run(self) -> str:
-        """The lease of the run at work, for the processes that work for it; empty where nobody stated so."""
+        """The lease of the run at work, for the processes that work for it, or empty if nobody stated so."""
         return "" if self._run is None else self._run.path
 
     def announce(self, names: Iterable[str]) -> None:
@@ -172,7 +172,7 @@ class Store:
         }
 
     def room(self) -> int | None:
-        """Return how many bytes the disk has left, None where that is not known."""
+        """Return how many bytes the disk has left, or None if that is not known."""
         disk = shutil.disk_usage(self.root)
         return disk.free if disk.total else None
 
@@ -234,7 +234,7 @@ class Store:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
 
         Raises `MissingError` if it is not there, if it is so much larger than declared that it is not read, or if its bytes
-        do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` where the system fails to
+        do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` if the system fails to
         read it (EIO, EMFILE, EACCES, …) or memory is short, which states nothing of the object.
         """
         return self._read(name, size)
@@ -282,7 +282,7 @@ class Store:
         return MissingError(f"Object {name[:12]} was damaged and {outcome}.")
 
     def quarantine(self, path: str | Path) -> bool:
-        """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
+        """Move a damaged file out of the way, for whoever wants to know why; return False if nothing may be moved."""
         if layout.is_linked(self._root, path):
             return False
         kind = "root-" if Path(path).parent.name == "roots" else ""
@@ -357,7 +357,7 @@ class Store:
     def read_record(self, key: str) -> dict[str, Any]:
         """Return the record of ``key``.
 
-        Raises `AbsentError` where there is none, and `MissingError` where it is damaged: it is then in ``quarantine/``.
+        Raises `AbsentError` if there is none, and `MissingError` if it is damaged: it is then in ``quarantine/``.
         """
         path = self.record_path(key)
         try:
@@ -432,7 +432,7 @@ def record_content(
 
 
 def parse_record(content: bytes, key: str) -> dict[str, Any] | None:
-    """Return the record of ``key`` that JSON holds, None where it is damaged. Raises `ValueError` where it is not JSON.
+    """Return the record of ``key`` that JSON holds, or None if it is damaged. Raises `ValueError` if it is not JSON.
 
     The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
     """

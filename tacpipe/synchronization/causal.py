@@ -35,7 +35,7 @@ class GridRows(NamedTuple):
     """Some rows of a grid, in order; `newest_ns`, `gap` and `values` are by stream."""
 
     t_ns: Times  # (row,)
-    has_samples: Bools  # (row,), True where each stream has a sample; other rows are empty
+    has_samples: Bools  # (row,), or True if each stream has a sample; other rows are empty
     newest_ns: Mapping[str, Times]  # (row,), of the sample that is held
     gap: Mapping[str, Bools]  # (row,)
     values: Mapping[str, Floats]  # (row, column)

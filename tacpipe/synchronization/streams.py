@@ -101,7 +101,7 @@ class TimedStream:
     name: str
     columns: Columns
     t_ns: Times  # (time,)
-    repeated: Bools  # (time,), True where a sample repeats the one before
+    repeated: Bools  # (time,), or True if a sample repeats the one before
     arrival_ns: Times  # (time,), when the samples arrived, whatever the clock of `t_ns`
     attributes: dict[str, Attribute] = field(default_factory=dict)  # attributes of the fit of its clock
     unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
@@ -136,7 +136,7 @@ class TimedStream:
 
     @property
     def truth(self) -> bool:
-        """True where the whole stream is ground truth."""
+        """True if the whole stream is ground truth."""
         return all(name.startswith(TRUTH) for name in self.channels)
 
 
@@ -203,7 +203,7 @@ def _by_device(recording: str, stream: str, columns: Columns, arrival_ns: Times)
 
 
 def _certain(columns: Columns) -> Bools | None:
-    """Return which rows have an arrival that was recorded in time, None where all have."""
+    """Return which rows have an arrival that was recorded in time, or None if all have."""
     if UNCERTAIN not in columns.column_names:
         return None
     certain: Bools = columns.column(UNCERTAIN).to_numpy() == 0
@@ -265,7 +265,7 @@ def _repeated_rows(columns: Columns) -> Bools:
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
     """Return the name of the stream that sets the grid: the ``requested`` one, or the first with a tactile channel.
 
-    Raises `TacpipeError` where there is none.
+    Raises `TacpipeError` if there is none.
     """
     if requested:
         if requested not in schemas:
@@ -293,7 +293,7 @@ def grid(
 
     A uniform grid is on the phase of the master's first sample. With ``hold_values`` it ends where the last stream does,
     because nobody knows yet which sample of a stream is its last, and it has one point where stamps are equal.
-    Raises `TacpipeError` where no point is left.
+    Raises `TacpipeError` if no point is left.
     """
     import numpy as np
 

@@ -88,7 +88,7 @@ class Task(ABC):
 
     @property
     def requirements(self) -> Requirements | None:
-        """The streams, quantities and labels that recordings must have; None where the task does not state them."""
+        """The streams, quantities and labels that recordings must have, or None if the task does not state them."""
         return self.train.requirements
 
     @abstractmethod
@@ -110,12 +110,12 @@ class Task(ABC):
 
     @property
     def calibration(self) -> Calibration | None:
-        """How uncertainty is measured; None where it is not."""
+        """How uncertainty is measured, or None if it is not."""
         return None
 
     @property
     def live(self) -> LiveTask | None:
-        """The task's part of a live session; None where its models do not run live."""
+        """The task's part of a live session, or None if its models do not run live."""
         return None
 
     @property
@@ -127,12 +127,12 @@ class Task(ABC):
     def grasp_predictor(self) -> GraspPredictor | None:
         """A function of a loaded model, a cloud and a grasp that returns predicted values by column with their unit.
 
-        ``tacpipe candidates`` calls it; None where models predict recordings only.
+        ``tacpipe candidates`` calls it, or None if models predict recordings only.
         """
         return None
 
     def demo(self, output: Path) -> Demo | None:
-        """Return the task's part of ``tacpipe demo``, which writes below ``output``; None where it has no part."""
+        """Return the task's part of ``tacpipe demo``, which writes below ``output``, or None if it has no part."""
         return None
 
 
@@ -171,7 +171,7 @@ def percents(levels: AnyFloats) -> tuple[int, ...]:
 def quantiles_of(uncertainty: Uncertain | None, requested: Sequence[int]) -> tuple[Uncertain, list[int]]:
     """Return the uncertainty of a model, and the indices of the ``requested`` quantiles, in percent.
 
-    Raises `TacpipeError` where the model has none, or not these.
+    Raises `TacpipeError` if the model has none, or not these.
     """
     if uncertainty is None:
         raise TacpipeError(

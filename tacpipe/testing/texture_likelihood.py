@@ -38,7 +38,7 @@ class SlideTrack:
 
     texture_n: Floats
     noise_n2: Floats  # variance
-    taper: Floats  # its squares add up to one; 0 where nothing was measured
+    taper: Floats  # its squares add up to one, or 0 if nothing was measured
 
 
 def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.SlideRig) -> float:

@@ -137,7 +137,7 @@ class Classification:
 
 
 def of_row(row: pa.Table, attributes: Mapping[str, Any]) -> Classification | None:
-    """Return the names in a recording's row of `tacpipe predict`, or of `tacpipe evaluate`; None where it has none.
+    """Return the names in a recording's row of `tacpipe predict`, or of `tacpipe evaluate`, or None if it has none.
 
     The quantity of a column (``label``, ``prediction``, ``score``) states what it holds. A row of `predict` names the
     recording in a column of the label's own name; the label is then the recording's.

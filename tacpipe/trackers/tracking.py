@@ -44,7 +44,7 @@ class Tracker(Protocol):
         """Add the metrics of an epoch, from 1: losses, learning rate, and what else is validated."""
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """End the run: its model or results are at ``path``, with these figures; None where they were not made."""
+        """End the run: its model or results are at ``path``, with these figures, or None if they were not made."""
 
 
 def flat_params(nested: Mapping[str, Any]) -> dict[str, Scalar]:
@@ -208,7 +208,7 @@ class Tracking:
             self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), values))
 
     def _call(self, option: str, call: Callable[[], Any]) -> Any:
-        """Return what the call returns; None where it fails, which ends the tracker. Standard output is the command's."""
+        """Return what the call returns, or None if it fails, which ends the tracker. Standard output is the command's."""
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 return call()
@@ -223,7 +223,7 @@ class Tracking:
 
 
 def _rate(model_params: Mapping[str, Any], epoch: int) -> dict[str, float]:
-    """Return the learning rate of an epoch of a stored model; nothing where its params do not state it."""
+    """Return the learning rate of an epoch of a stored model, or nothing if its params do not state it."""
     peak, epochs = model_params.get("learning_rate"), model_params.get("epochs")
     if not isinstance(peak, int | float) or not isinstance(epochs, int) or epochs < 1:
         return {}

@@ -29,7 +29,7 @@ _chosen: ContextVar[Device] = ContextVar("device", default=AUTO)
 def chosen(device: Device) -> Iterator[None]:
     """Train networks in the block on ``device``; ``auto`` is CUDA where there is a GPU.
 
-    Raises `UsageError` where this computer lacks the device, and under ``torchrun``.
+    Raises `UsageError` if this computer lacks the device, and under ``torchrun``.
     """
     _refuse_torchrun()
     if device != AUTO:
@@ -64,7 +64,7 @@ def gpu_for(worker: int) -> dict[str, str]:
 
 
 def _check(device: Device) -> None:
-    """Raise `UsageError` where this computer has no such device."""
+    """Raise `UsageError` if this computer has no such device."""
     import torch
 
     available = {CPU: True, CUDA: torch.cuda.is_available(), MPS: torch.backends.mps.is_available()}

@@ -32,7 +32,7 @@ class TrainedNetwork:
 
     @property
     def name(self) -> str:
-        """Its number among several, empty where it is the only one."""
+        """Its number among several, or empty if it is the only one."""
         return f"network {self.number} of {self.count}" if self.count > 1 else ""
 
 

@@ -122,7 +122,7 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], state: Mapping
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Return tensors and state of the checkpoint in ``folder``; None where there is none or it is damaged."""
+    """Return tensors and state of the checkpoint in ``folder``, or None if there is none or it is damaged."""
     path = folder / FILE
     try:
         signed = regular.content(path, follow=False)
@@ -279,7 +279,7 @@ def train(
     ``weight_decay`` is Adam's: this fraction of each weight is added to its gradient. Weights that need no gradient stay.
     Resumes from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
     ``number`` of ``count`` and ``labels`` are what followers are given of one of several networks.
-    Raises `TacpipeError` where the loss is no longer finite.
+    Raises `TacpipeError` if the loss is no longer finite.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(schedule.seed)

@@ -53,7 +53,7 @@ class MinMax:
 def fit(values: Floats) -> MinMax:
     """Return the scaling fitted on training rows ``values``, shape (time, dimension).
 
-    Raises `TacpipeError` where there is no row or a value is not finite.
+    Raises `TacpipeError` if there is no row or a value is not finite.
     """
     if not len(values):
         raise TacpipeError("A scaling cannot be fitted on 0 rows. Give training recordings that hold windows.")
@@ -75,7 +75,7 @@ class Affine:
     logarithm: bool = False  # log(1 + x), for counts of a heavy tail
 
     def apply(self, values: Floats) -> Floats:
-        """Return ``values`` (…, channel) scaled, as float32. Raises `TacpipeError` where a logarithm meets -1 or less."""
+        """Return ``values`` (…, channel) scaled, as float32. Raises `TacpipeError` if a logarithm meets -1 or less."""
         if self.logarithm:
             if (values <= -1).any():
                 raise TacpipeError(f"The logarithm of 1 + {values.min():g} is not defined. Choose another scaling.")

@@ -40,7 +40,7 @@ def decode_frames(
 
     ``batches`` are rows of a stream in presentation order, from a key frame on; rows are counted from the first of them.
     Frames come in the order of rows. A row that has no picture, as an empty packet, is left out. Few frames are in memory
-    at once. Raises `TacpipeError` where a frame cannot be decoded or has another size, `MissingModuleError` without PyAV.
+    at once. Raises `TacpipeError` if a frame cannot be decoded or has another size, `MissingModuleError` without PyAV.
     """
     for row, frame in _decode(video_format, batches):
         image: Bytes = frame.to_ndarray(format=GREY if grey else RGB)
@@ -138,7 +138,7 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
 
 
 def open_decoder(video_format: VideoFormat) -> Any:
-    """Return a decoder of PyAV, on one thread. Raises `TacpipeError` where FFmpeg has none for the codec."""
+    """Return a decoder of PyAV, on one thread. Raises `TacpipeError` if FFmpeg has none for the codec."""
     with extras.explain_missing(NEEDED_BY):
         import av
     try:

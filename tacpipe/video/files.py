@@ -68,7 +68,7 @@ class VideoScan:
     def counter(self) -> Int64s | None:
         """Return the number of each frame, shape (frame,), with gaps where frames are missing.
 
-        None where frames have no common rate.
+        None if frames have no common rate.
         """
         rate = self.video_format.nominal_rate_hz
         return None if rate is None else _grid(self.pts, self.video_format.time_base, rate)
@@ -228,7 +228,7 @@ def packet_stream(
 def write_file(path: Path, video_format: VideoFormat, batches: Iterable[pa.Table]) -> None:
     """Write rows of a stream of frames, from a key frame on, as the video file ``path``, whose ending states its kind.
 
-    Packets are copied. Times begin at 0. Raises `TacpipeError` where the kind of file cannot hold the codec.
+    Packets are copied. Times begin at 0. Raises `TacpipeError` if the kind of file cannot hold the codec.
     """
     with extras.explain_missing("Writing video"):
         import av
@@ -348,7 +348,7 @@ def _grows(stamps: Sequence[int | None]) -> bool:
 
 
 def _grid(pts: Int64s, time_base: Fraction, rate: Fraction) -> Int64s | None:
-    """Return the number of each frame at a common rate, (frame,), from 0; None where the times do not fit the rate.
+    """Return the number of each frame at a common rate, (frame,), from 0, or None if the times do not fit the rate.
 
     They do not fit either where most frames would be missing: FFmpeg guesses such rates for frames at irregular times.
     """

@@ -33,7 +33,7 @@ class MarkerGrid:
 
     rows: int
     columns: int
-    positions_px: Floats  # (marker, xy); NaN where no marker was detected
+    positions_px: Floats  # (marker, xy), or NaN if no marker was detected
     pitch_px: float  # distance of neighbours
 
 
@@ -122,7 +122,7 @@ class MarkerTracker:
         self.unconfirmed = np.zeros(len(self.positions_px), np.int64)
 
     def step(self, grey: Bytes) -> tuple[Floats, Bools]:
-        """Return the positions in the next image, px (marker, xy), NaN where missing, and which were detected (marker,)."""
+        """Return the positions in the next image, px (marker, xy), or NaN if missing, and which were detected (marker,)."""
         expected, is_confirmed = self._predict(grey)
         detections = detect(grey)
         detected = self._match(expected, detections, np.full(len(expected), -1))

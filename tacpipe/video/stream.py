@@ -78,7 +78,7 @@ class VideoFormat:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[bytes, bytes]) -> VideoFormat:
-        """Return the format that the metadata of a packet column states. Raises `TacpipeError` where it states none."""
+        """Return the format that the metadata of a packet column states. Raises `TacpipeError` if it states none."""
         texts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
         try:
             return cls(
@@ -167,7 +167,7 @@ def in_decode_order(
 def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int, int]:
     """Return the smallest range of rows that contains rows ``start`` to ``stop`` (exclusive) and can be decoded alone.
 
-    It begins at a key frame, and no frame in it needs one that is presented after it. Raises `TacpipeError` where no key
+    It begins at a key frame, and no frame in it needs one that is presented after it. Raises `TacpipeError` if no key
     frame precedes ``start``.
     """
     if not 0 <= start < stop <= len(dts):

@@ -380,7 +380,7 @@ def _maps(contents: DrawnContents) -> list[tuple[str, Taxels]]:
 
 
 def _unit(contents: DrawnContents) -> str:
-    """Return the unit of the taxels, empty where they have several."""
+    """Return the unit of the taxels, or empty if they have several."""
     units = {finger.unit for finger in contents.taxels}
     return units.pop() if len(units) == 1 else ""
 

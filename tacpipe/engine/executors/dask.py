@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 def local_versions(stage: str) -> dict[str, Any]:
     """Return the versions that must agree for a task of ``stage`` to be computed by another process.
 
-    Raises `UsageError` where there is no such stage.
+    Raises `UsageError` if there is no such stage.
     """
     stage_object = registry.load(registry.stage_name(stage))
     environment = provenance.describe_provenance(0.0)
@@ -81,7 +81,7 @@ _abandoned: list[contextlib.ExitStack] = []  # clusters of an interrupted comman
 def connected(address: str, jobs: int) -> Iterator[Dask]:
     """Yield workers: of the scheduler at ``address`` (``host:port``, this computer's), or ``jobs`` that are started here.
 
-    Raises `UsageError` for another computer's scheduler, `TacpipeError` where none answers, and `MissingModuleError`
+    Raises `UsageError` for another computer's scheduler, `TacpipeError` if none answers, and `MissingModuleError`
     without Dask.
     """
     if not address:
@@ -134,7 +134,7 @@ class Dask:
     ) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
 
-        Raises `TacpipeError` where there is no worker, where one is unlike this process or cannot reach the store, where
+        Raises `TacpipeError` if there is no worker, where one is unlike this process or cannot reach the store, where
         workers die over a task again and again, and where the scheduler is gone.
         """
         if not tasks:

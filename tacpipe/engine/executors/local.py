@@ -220,7 +220,7 @@ class Executor(Protocol):
     def run(self, compute: Callable[[Any], Any], tasks: Sequence[Any], preload: Sequence[str]) -> Iterator[Any]:
         """Yield ``compute(task)`` of every task (`tacpipe.engine.keys.WorkerTask`), in any order.
 
-        ``preload`` are modules that a worker will need. Raises `TacpipeError` where tasks cannot be computed there; what
+        ``preload`` are modules that a worker will need. Raises `TacpipeError` if tasks cannot be computed there; what
         was finished is in the store by then. Where the iterator is closed, nothing that waits is begun. What a result
         names is announced in the lease of the tasks' run before the result is yielded.
         """

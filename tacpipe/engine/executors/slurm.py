@@ -39,7 +39,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     """Yield ``jobs`` workers, `JOBS` for 0, each a job in the partition ``address``, or in the configured one.
 
     It waits for the first of them; others join when Slurm starts them. The jobs are cancelled when the block ends. Raises
-    `TacpipeError` where jobs cannot be submitted or all of them end before one has started work, and
+    `TacpipeError` if jobs cannot be submitted or all of them end before one has started work, and
     `MissingModuleError` without dask-jobqueue.
     """
     with extras.explain_missing("The executor slurm"), _interrupts():
@@ -166,7 +166,7 @@ def _reason(text: str) -> str:
 
 
 def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
-    """Return when one job has begun to work. Raises `TacpipeError` where all have ended before."""
+    """Return when one job has begun to work. Raises `TacpipeError` if all have ended before."""
     began_s, is_noted = time.monotonic(), False
     while not client.scheduler_info(n_workers=-1)["workers"]:
         if not _waiting(numbers):

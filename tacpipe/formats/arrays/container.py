@@ -48,13 +48,13 @@ class ArrayContainer:
     open_tree: Callable[[], AbstractContextManager[Tree]]
 
     def episodes(self) -> Sequence[str]:
-        """Return the names of the recordings inside, none where the whole is one."""
+        """Return the names of the recordings inside, or None if the whole is one."""
         with self.open_tree() as tree:
             return [episode.name for episode in episodes.find_episodes(tree) if episode.name is not None]
 
     @property
     def names_itself(self) -> bool:
-        """True where the file states the names of its recordings."""
+        """True if the file states the names of its recordings."""
         with self.open_tree() as tree:
             return all(episode.name_is_stated for episode in episodes.find_episodes(tree))
 

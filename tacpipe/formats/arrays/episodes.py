@@ -38,7 +38,7 @@ class Episode:
     total: int = 0  # rows of all of them
     ends_group: str | None = None  # the group of the array that states where they end
     labels: Mapping[str, Any] = field(default_factory=dict)
-    name_is_stated: bool = False  # True where the file states its name
+    name_is_stated: bool = False  # True if the file states its name
 
     def inside(self, path: str) -> str:
         """Return the path of a group or an array within the recording's group."""
@@ -70,7 +70,7 @@ def _episode_name(group: str, names: Mapping[str, int]) -> str:
 
 
 def find_episode(tree: Tree, name: str | None) -> Episode:
-    """Return the recording of this name, without a look at the others. Raises `TacpipeError` where there is none."""
+    """Return the recording of this name, without a look at the others. Raises `TacpipeError` if there is none."""
     if name is None:
         (*others, episode) = find_episodes(tree)
         if others or episode.name is not None:
@@ -88,7 +88,7 @@ def find_episode(tree: Tree, name: str | None) -> Episode:
 
 
 def _episodes_from_ends(tree: Tree) -> list[Episode]:
-    """Return the recordings that an array cuts all others into; none where there is no such array."""
+    """Return the recordings that an array cuts all others into, or None if there is no such array."""
     for path in ENDS:
         group = path.rpartition("/")[0]
         array = (
@@ -167,7 +167,7 @@ class StreamArrays:
     source: str
     arrays: Sequence[ArrayDescription]
     time: ArrayDescription | None
-    frames: bool = False  # True where its one array holds encoded pictures
+    frames: bool = False  # True if its one array holds encoded pictures
 
     @property
     def all_arrays(self) -> Sequence[ArrayDescription]:
@@ -176,7 +176,7 @@ class StreamArrays:
 
     @property
     def clock(self) -> str:
-        """The column with the stamps: an array, or a field of a compound one; empty where there is none."""
+        """The column with the stamps: an array, or a field of a compound one, or empty if there is none."""
         if self.time is not None:
             return self.time.name
         kind = self.arrays[0].dtype
@@ -219,7 +219,7 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
 
 
 def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
-    """Return why an array is left out; empty where it is not."""
+    """Return why an array is left out, or empty if it is not."""
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
     one_each = array.group == episode.ends_group and array.shape == (episode.count,)
@@ -318,7 +318,7 @@ def parent_groups(group: str) -> list[str]:
 
 
 def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
-    """Return the last stamp of a stream as its file holds it, without sign; 0 where there is none."""
+    """Return the last stamp of a stream as its file holds it, without sign, or 0 if there is none."""
     array = part.time or part.arrays[0]
     last = episode.start + row_count(episode, part)
     last_row = np.asarray(tree.read(array, max(last - 1, 0), last))
@@ -327,7 +327,7 @@ def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
 
 
 def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
-    """Return the unit of stamps, as an attribute, the name or their size shows it; None where nothing does."""
+    """Return the unit of stamps, as an attribute, the name or their size shows it, or None if nothing does."""
     attributes = part.time.attributes if part.time is not None else {}
     declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
     suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)

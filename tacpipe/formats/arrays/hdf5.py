@@ -89,7 +89,7 @@ class Hdf5Tree:
             return self._attributes_by_group[group]
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-        """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
+        """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` if they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
         limit_bytes = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
         place = f"{self.path}, {plain(array.path, 200)},"
@@ -174,7 +174,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
 
 @contextlib.contextmanager
 def _open_truncated(path: Path, available: int, size: int) -> Iterator[Hdf5Tree]:
-    """Open a file that has ``available`` of ``size`` bytes. Raises `TacpipeError` where that is not enough."""
+    """Open a file that has ``available`` of ``size`` bytes. Raises `TacpipeError` if that is not enough."""
     with regular.failing(path), regular.opened(path) as file:
         try:
             file_h5 = h5py.File(_PaddedFile(file, available, size), "r")
@@ -217,7 +217,7 @@ class _PaddedFile(io.RawIOBase):
 
 
 def _expect_there(dataset: h5py.Dataset, available: int) -> None:
-    """Raise `OSError` where bytes of an array lie behind the end of a file that is cut short: they would read as zeros."""
+    """Raise `OSError` if bytes of an array lie behind the end of a file that is cut short: they would read as zeros."""
     if dataset.chunks is None:
         offset = dataset.id.get_offset()
         ends = [offset + dataset.id.get_storage_size()] if offset is not None else []

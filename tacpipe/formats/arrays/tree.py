@@ -36,7 +36,7 @@ class ArrayDescription:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    chunk_rows: int = 0  # rows of a chunk, 0 where the file has none
+    chunk_rows: int = 0  # rows of a chunk, or 0 if the file has none
     problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
     time_axis: int = 0  # the dimension of the file's array that is the first of ``shape``
 
@@ -71,7 +71,7 @@ class Tree(Protocol):
         """Return the arrays in a group, and the paths of the groups in it."""
 
     def is_group(self, path: str) -> bool:
-        """Return True where a group has this path."""
+        """Return True if a group has this path."""
 
     def identity(self, group: str) -> Any:
         """Return a value that is equal for all paths of one group; links can give a group several paths."""
@@ -83,7 +83,7 @@ class Tree(Protocol):
         """Return the rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
-        """Return the files that hold rows of an array, by path within the store; None where all lies in one file."""
+        """Return the files that hold rows of an array, by path within the store, or None if all lies in one file."""
 
     def encoding_metadata(self, array: ArrayDescription) -> Any:
         """Return how the rows of an array are encoded, as JSON, without their number."""
@@ -163,7 +163,7 @@ def is_image(array: ArrayDescription) -> bool:
 
 
 def reason_left_out(array: ArrayDescription) -> str:
-    """Return why an array is not read as columns, as in "NAME …"; empty where it is.
+    """Return why an array is not read as columns, as in "NAME …", or empty if it is.
 
     >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
     'holds decoded pictures (480 x 640 x 3), which are not read'
@@ -218,7 +218,7 @@ MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # how pic
 
 
 def picture_encoding(content: bytes) -> str:
-    r"""Return the encoding of a picture by its first bytes; empty where it is none of these.
+    r"""Return the encoding of a picture by its first bytes, or empty if it is none of these.
 
     >>> picture_encoding(b"\xff\xd8\xff\xe0"), picture_encoding(b"abc")
     ('jpeg', '')

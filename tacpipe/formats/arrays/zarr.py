@@ -168,7 +168,7 @@ class ZarrTree:
         )
 
     def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
-        """Return metadata and attributes of a group or an array; None where there is neither."""
+        """Return metadata and attributes of a group or an array, or None if there is neither."""
         if path not in self._nodes:
             self._nodes[path] = self._read_node(path)
         return self._nodes[path]
@@ -230,7 +230,7 @@ def allow_missing_chunks(*, filled: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def open_zarr(path: Path) -> Iterator[ZarrTree]:
-    """Open a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
+    """Open a Zarr store, folder or zip file. Raises `TacpipeError` if it is neither."""
     names = None
     if not path.is_dir():
         try:

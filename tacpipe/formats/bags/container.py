@@ -39,13 +39,13 @@ class ExportedStream:
     """A stream as it was before it was exported."""
 
     stream: str
-    derived: bool  # True where the topic only repeats another one
+    derived: bool  # True if the topic only repeats another one
     columns: Mapping[str, tuple[str, Mapping[str, str]]]  # column name and metadata by field of the message
     time: Mapping[str, str]  # metadata of ``t_ns``
 
 
 def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
-    """Return the stream that the metadata of a channel describe, None where tacpipe did not write them."""
+    """Return the stream that the metadata of a channel describe, or None if tacpipe did not write them."""
     metadata_json = _json_object(metadata.get(EXPORT_KEY, ""))
     if "derived_from" in metadata_json:
         return ExportedStream("", True, {}, {})
@@ -139,7 +139,7 @@ class Bag:
 
 
 def open_bag(path: Path) -> Bag:
-    """Return the bag at ``path``. Raises `MissingModuleError` where a library is missing."""
+    """Return the bag at ``path``. Raises `MissingModuleError` if a library is missing."""
     extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard", "google.protobuf")
     return Bag(path)
 

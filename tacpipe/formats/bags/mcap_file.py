@@ -36,7 +36,7 @@ _CHUNK = struct.Struct("<QQQI")  # first and last time, size and check sum of wh
 
 
 def read_records(path: Path) -> Iterator[Record]:
-    """Yield the records of an MCAP file. Raises `TacpipeError` where it is not one."""
+    """Yield the records of an MCAP file. Raises `TacpipeError` if it is not one."""
     with regular.failing(path), regular.opened(path) as file:
         yield from read_stream(path, file)
 
@@ -88,7 +88,7 @@ def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
 
 
 def _declared_message_count(file: BinaryIO) -> int | None:
-    """Return how many messages the summary states; None where there is none, or where it is damaged."""
+    """Return how many messages the summary states, or None if there is none, or where it is damaged."""
     try:
         while True:
             kind, length = _read_head(file)

@@ -111,7 +111,7 @@ _GEOMETRY = _geometry_meanings()
 def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
     """Return name, quantity, unit and component of a value, and the length of the path of the type that defines them.
 
-    None where no enclosing type defines the value.
+    None if no enclosing type defines the value.
     """
     for depth, kind in reversed(leaf.enclosing):
         meaning = _GEOMETRY.get((kind, leaf.path[depth:]))

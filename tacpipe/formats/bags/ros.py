@@ -33,7 +33,7 @@ def normalize_type_name(name: str) -> str:
 def parse_definitions(name: str, kind: Definition, text: str) -> Types:
     """Return the fields of a message type and of those inside it, from its definition.
 
-    Raises `TopicError` where the text is no definition. An empty one is looked up among ROS's own types.
+    Raises `TopicError` if the text is no definition. An empty one is looked up among ROS's own types.
     """
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
@@ -80,7 +80,7 @@ class RosDecoder:
     _shapes: dict[bytes, list[MessageShape]] = field(default_factory=dict)  # keyed by the first bytes: the byte order
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages, grouped by shape; raises `TopicError` where they are not of the type."""
+        """Yield the columns of messages, grouped by shape; raises `TopicError` if they are not of the type."""
         self._meaning = meaning = self._meaning or meanings.meaning_of_type(self.name)
         marks = np.array([bytes(message[:2]) for message in messages] if self.cdr else [b""] * len(messages))
         try:

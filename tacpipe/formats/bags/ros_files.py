@@ -104,7 +104,7 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 def read_sqlite_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` where it is no bag."""
+    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` if it is no bag."""
     with regular.failing(path), regular.opened(path) as file:
         magic = file.read(len(SQLITE_MAGIC))
     if magic != SQLITE_MAGIC:
@@ -149,7 +149,7 @@ def _connect(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
-    """Raise `TacpipeError` where what holds topics or messages is no table: a view or a module runs queries of the file."""
+    """Raise `TacpipeError` if what holds topics or messages is no table: a view or a module runs queries of the file."""
     definitions = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name in ("topics", "messages"):
         if not str(definitions.get(name, "")).upper().startswith("CREATE TABLE"):
@@ -178,7 +178,7 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def read_bag_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a bag. Raises `TacpipeError` where it is not a bag of version 2.0."""
+    """Yield the records of a bag. Raises `TacpipeError` if it is not a bag of version 2.0."""
     with regular.failing(path), regular.opened(path) as file:
         magic = file.read(len(BAG_MAGIC))
         if magic != BAG_MAGIC:

@@ -34,7 +34,7 @@ class TopicStream:
     suffix: str
     content: Batched
     time: Time
-    note: str  # remark about the stamps; empty where there is none
+    note: str  # remark about the stamps, or empty if there is none
 
 
 class TopicRows:
@@ -48,7 +48,7 @@ class TopicRows:
         self._absent: set[str] = set()  # columns that not every row has
         self._headers_set = self._headers_unset = False
         self._apart_ns = 0  # largest distance of header stamps from log times
-        self._published_apart = False  # True where a publish time differs from its log time
+        self._published_apart = False  # True if a publish time differs from its log time
         self._frames: set[str] = set()  # names of frames, two at most
 
     def describe(self, about: Mapping[str, Mapping[str, str]]) -> int:
@@ -169,7 +169,7 @@ class MessageDecoder(Protocol):
     """A decoder that turns the messages of a topic into columns."""
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` where they cannot be decoded."""
+        """Yield the columns of messages; raises `TopicError` if they cannot be decoded."""
 
 
 class TopicDecoder:
@@ -185,7 +185,7 @@ class TopicDecoder:
         self.count = 0
 
     def add(self, message: bytes, log_ns: int, publish_ns: int) -> None:
-        """Add a message. Raises `TopicError` where a full batch cannot be decoded."""
+        """Add a message. Raises `TopicError` if a full batch cannot be decoded."""
         self._messages.append(message)
         self._log_ns.append(log_ns)
         self._publish_ns.append(publish_ns)
@@ -195,7 +195,7 @@ class TopicDecoder:
             self._flush()
 
     def finish(self) -> list[TopicStream]:
-        """Return the streams of the topic. Raises `TopicError` where they cannot be decoded."""
+        """Return the streams of the topic. Raises `TopicError` if they cannot be decoded."""
         self._flush()
         return [rows.finish(suffix) for suffix, rows in self._streams.items()]
 
@@ -239,7 +239,7 @@ _STAMPS = ("header.stamp", "timestamp", "stamp")  # whole numbers under these pa
 def block_from_rows(rows: Sequence[Mapping[str, Any]], types: Mapping[str, pa.DataType]) -> Block:
     """Return messages, each its values by path, as columns; ``types`` are those of paths that a schema declares.
 
-    Raises `TopicError` where they have too many paths.
+    Raises `TopicError` if they have too many paths.
     """
     names = list(dict.fromkeys(name for row in rows for name in row))
     if len(names) > MAX_COLUMNS:
@@ -275,7 +275,7 @@ class Json:
     schema: str
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` where one is not a JSON object."""
+        """Yield the columns of messages; raises `TopicError` if one is not a JSON object."""
         encoded = self._encoded()
         rows: list[dict[str, Any]] = []
         for message in messages:
@@ -308,7 +308,7 @@ class Json:
 
 
 def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON. Raises `TopicError` where two of its entries have the same name."""
+    """Return an object of JSON. Raises `TopicError` if two of its entries have the same name."""
     value = dict(pairs)
     if len(value) < len(pairs):
         raise TopicError("a message has two entries of the same name")
@@ -360,7 +360,7 @@ class Protobuf:
     schema: bytes
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` where they are not of the type."""
+        """Yield the columns of messages; raises `TopicError` if they are not of the type."""
         from google.protobuf.message import DecodeError
 
         types: dict[str, pa.DataType] = {}

@@ -65,7 +65,7 @@ class Encoding:
     order: str = "<"  # byte order in numpy's notation
     start: int = 0  # offset of the message, from which alignment counts
     aligned: bool = False
-    terminated: bool = False  # True where texts end with a zero byte
+    terminated: bool = False  # True if texts end with a zero byte
 
 
 ROS1 = Encoding()
@@ -136,7 +136,7 @@ def group_by_shape(
 ) -> Iterator[tuple[MessageShape, npt.NDArray[np.int64], Matrix]]:
     """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
 
-    New shapes are added to ``earlier_shapes``. Raises `WireError` where a message is not of its type.
+    New shapes are added to ``earlier_shapes``. Raises `WireError` if a message is not of its type.
     """
     sizes = np.fromiter(map(len, messages), np.int64, len(messages))
     different, first = np.unique(sizes, return_index=True)
@@ -175,7 +175,7 @@ def _matching_rows(shape: MessageShape, matrix: Matrix) -> npt.NDArray[np.bool_]
 
 
 def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) -> MessageShape:
-    """Return the shape of a message. Raises `WireError` where its bytes do not fit its type."""
+    """Return the shape of a message. Raises `WireError` if its bytes do not fit its type."""
     shape = MessageShape(encoding, len(message), first=message)
     try:
         end = _Walk(message, types, shape).message(name, (), (), encoding.start)

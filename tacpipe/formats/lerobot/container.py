@@ -70,7 +70,7 @@ class LeRobotContainer:
 
     @property
     def names_itself(self) -> bool:
-        """True where the episodes have the names of the recordings that they were exported from."""
+        """True if the episodes have the names of the recordings that they were exported from."""
         return all(episode.original is not None for episode in self._episodes.values())
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
@@ -193,7 +193,7 @@ class LeRobotContainer:
     ) -> SourceStream:
         """Return the frames of an episode in its video, with the stamps ``t_ns`` (frame,) of its rows.
 
-        Raises `TacpipeError` where the video cannot be read, ends before the episode, or cannot be cut at its ends.
+        Raises `TacpipeError` if the video cannot be read, ends before the episode, or cannot be cut at its ends.
         """
         path = regular.inside(self.path, episode.videos[key])
         frames = _scan_video(path, path.stat().st_mtime_ns)
@@ -225,7 +225,7 @@ class LeRobotContainer:
         return SourceStream(key, name, CLOCK, Batched(schema, len(t_ns), read), episode.length)
 
     def _frames(self, episode: EpisodeDescription, keys: Sequence[str]) -> pa.Table:
-        """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
+        """Return the rows of an episode. Raises `TacpipeError` if its file is damaged or has other columns or rows."""
         path = regular.inside(self.path, episode.file)
         with description.parquet_errors(path), regular.opened(path) as source:
             file = pq.ParquetFile(source, page_checksum_verification=True)

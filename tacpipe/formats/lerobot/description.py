@@ -46,7 +46,7 @@ class FeatureDescription:
     key: str
     dtype: str
     shape: tuple[int, ...]
-    names: tuple[str, ...] = ()  # names of its values; empty where their number is not that of the values
+    names: tuple[str, ...] = ()  # names of its values, or empty if their number is not that of the values
     units: tuple[str, ...] = ()
     quantities: tuple[str, ...] = ()
 
@@ -63,7 +63,7 @@ class FeatureDescription:
 class EpisodeDescription:
     """One episode: what it is called, the file with its frames, tasks, and what else is stated of it.
 
-    ``original`` are the attributes of the recording that it was exported from, None where it was not.
+    ``original`` are the attributes of the recording that it was exported from, or None if it was not.
     """
 
     name: str

@@ -127,7 +127,7 @@ class NumpyArchive:
         return _zip_archive(self.path)
 
     def _expect_same_length(self, arrays: Mapping[str, ArrayMember]) -> None:
-        """Raise `TacpipeError` where arrays of one stream have different numbers of rows."""
+        """Raise `TacpipeError` if arrays of one stream have different numbers of rows."""
         lengths = {name: array.rows for name, array in arrays.items()}
         if len(set(lengths.values())) > 1:
             first, second = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
@@ -215,7 +215,7 @@ class ArrayMember:
 
     @property
     def width(self) -> int | None:
-        """How many values a row has, None where it is one value and no list of one."""
+        """How many values a row has, or None if it is one value and no list of one."""
         return math.prod(self.row_shape) if self.row_shape else None
 
     @property
@@ -225,7 +225,7 @@ class ArrayMember:
 
     @contextlib.contextmanager
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:
-        """Yield a function that returns the next rows (time, value); raises `ValueError` where there are fewer."""
+        """Yield a function that returns the next rows (time, value); raises `ValueError` if there are fewer."""
         with archive.open(self.member) as file:
             _read_header(file)
             if self.columnwise or self.time_axis:
@@ -330,7 +330,7 @@ class JsonLines:
         yield table
 
     def _widths(self, block: pa.Table, widths: dict[str, int]) -> None:
-        """Add the length of the lists of each column to ``widths``. Raises `TacpipeError` where lengths differ."""
+        """Add the length of the lists of each column to ``widths``. Raises `TacpipeError` if lengths differ."""
         for field in block.schema:
             if pa.types.is_list(field.type):
                 lengths = set(pc.list_value_length(block.column(field.name)).to_pylist())

@@ -166,7 +166,7 @@ XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Quantity, unit and component of one column; empty where a name does not show them."""
+    """Quantity, unit and component of one column, or empty if a name does not show them."""
 
     quantity: str = ""
     unit: str = ""
@@ -297,7 +297,7 @@ def declared_metadata(attributes: Mapping[str, object]) -> dict[str, str]:
 
 
 def declared_texts(attributes: Mapping[str, object], key: str, count: int) -> list[str]:
-    """Return the text that an attribute states for each of ``count`` columns, nothing where it states another number.
+    """Return the text that an attribute states for each of ``count`` columns, or nothing if it states another number.
 
     >>> declared_texts({"columns": ["a", "b"]}, "columns", 2), declared_texts({"columns": ["a"]}, "columns", 2)
     (['a', 'b'], [])

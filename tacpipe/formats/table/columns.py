@@ -99,7 +99,7 @@ def choose_columns(
 def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: StreamLayout) -> list[ChosenColumn]:
     """Return columns that are cells of an array with the metadata of their place in its shape, and named by it.
 
-    Raises `TacpipeError` where a rule matches another number of columns than its shape has cells.
+    Raises `TacpipeError` if a rule matches another number of columns than its shape has cells.
     """
     by_rule: dict[ColumnRule, list[ChosenColumn]] = {}
     for column in columns_read:

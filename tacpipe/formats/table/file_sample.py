@@ -48,7 +48,7 @@ class Dialect:
     units: tuple[str, ...] = ()  # units of the columns, if the row below the header holds them
 
     def number(self, cell: str) -> float | None:
-        """Return the number that a cell holds, an int where it is written as one, None where it holds none.
+        """Return the number that a cell holds, an int where it is written as one, or None if it holds none.
 
         >>> detect_dialect(["a;b", "1,5;x"]).number("1,5"), detect_dialect(["1,2.0"]).number("2.0")
         (1.5, 2.0)
@@ -185,7 +185,7 @@ class FileSample:
 
 
 def read_sample(path: Path) -> FileSample:
-    """Return the columns and first rows of a file. Raises `TacpipeError` where it cannot be read."""
+    """Return the columns and first rows of a file. Raises `TacpipeError` if it cannot be read."""
     kind = EXTENSIONS[extension(path)]
     if kind == "csv":
         encoding = detect_encoding(path)

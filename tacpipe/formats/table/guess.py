@@ -53,7 +53,7 @@ class _FileGroup:
 
 
 def guess_layout(folder: Path) -> str:
-    """Return the text of a layout for the files below ``folder``. Raises `UsageError` where no file can be a stream."""
+    """Return the text of a layout for the files below ``folder``. Raises `UsageError` if no file can be a stream."""
     all_paths = [
         Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names
     ]

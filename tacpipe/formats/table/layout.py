@@ -139,7 +139,7 @@ class StreamLayout:
 
     @property
     def contained(self) -> bool:
-        """True where the stream is one of several in a container."""
+        """True if the stream is one of several in a container."""
         return self.format in KINDS
 
     def format_of(self, path: Path) -> Format:
@@ -215,7 +215,7 @@ class Layout:
 
     @property
     def found_by_format(self) -> bool:
-        """True where recordings are the containers in a folder, rather than files that match patterns."""
+        """True if recordings are the containers in a folder, rather than files that match patterns."""
         return all(not stream.files for stream in self.streams)
 
     @property
@@ -308,7 +308,7 @@ def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], pla
 
 
 def _refuse_unknown(value: Any, place: str) -> None:
-    """Raise `UsageError` where entries still hold what a guess could not know, naming the first few."""
+    """Raise `UsageError` if entries still hold what a guess could not know, naming the first few."""
     unknown_entries = list(_unknown_entries(value, place))
     if unknown_entries:
         ending = f"; and {len(unknown_entries) - MAX_NAMED} more" if len(unknown_entries) > MAX_NAMED else ""

@@ -32,7 +32,7 @@ _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 @functools.lru_cache(maxsize=1024)
 def compile_pattern(pattern: str) -> re.Pattern[str]:
-    """Return the regular expression of a pattern. Raises `UsageError` where a brace has no partner."""
+    """Return the regular expression of a pattern. Raises `UsageError` if a brace has no partner."""
     parts, names = [], set()
     for name, folders, any_text, literal, stray in _PART.findall(pattern):
         if stray:
@@ -88,7 +88,7 @@ def placeholders(pattern: str) -> tuple[str, ...]:
 
 
 def fill_pattern(pattern: str, values: Mapping[str, str]) -> str:
-    """Return a pattern with its placeholders replaced. Raises `UsageError` where one has no value.
+    """Return a pattern with its placeholders replaced. Raises `UsageError` if one has no value.
 
     >>> fill_pattern("{object}-{trial}", {"object": "cup", "trial": "3"})
     'cup-3'

@@ -71,7 +71,7 @@ class Steps:
         np.add.at(self._counts, at, counts)
 
     def median_ns(self) -> float:
-        """Return the median, 0 where there is no step."""
+        """Return the median, or 0 if there is no step."""
         self._count()
         total = int(self._counts.sum())
         if not total:
@@ -237,7 +237,7 @@ def declared_layout(kind: str, source: Path) -> str:
     """Return the text of the layout that states what the first container at or below ``source`` with a stream declares.
 
     Given back with ``--layout`` it reads the same. Comments name the containers before it, and files that are no container.
-    Raises `UsageError` where there is no container, `TacpipeError` where none holds a stream.
+    Raises `UsageError` if there is no container, `TacpipeError` if none holds a stream.
     """
     paths = find_containers(kind, source)
     if not paths:

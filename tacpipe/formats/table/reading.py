@@ -46,7 +46,7 @@ class LongTable:
     spill: Spill
 
     def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[tuple[Times, list[pa.Array]]]:
-        """Yield stamps in ns and one column per chosen channel, NaN where there is no value, moment by moment.
+        """Yield stamps in ns and one column per chosen channel, or NaN if there is no value, moment by moment.
 
         Raises `TacpipeError` for two values of a channel at one moment, and as `columns.convert_column` does.
         """
@@ -72,7 +72,7 @@ class LongTable:
             raise TacpipeError(f"{place} {error}.") from error
 
     def _expect_single(self, cells: AnyArray, codes: AnyArray, table: pa.Table) -> None:
-        """Raise `TacpipeError` where two rows have the same moment and channel, ``cells``."""
+        """Raise `TacpipeError` if two rows have the same moment and channel, ``cells``."""
         order = np.argsort(cells, kind="stable")
         doubled = np.flatnonzero(np.diff(cells[order]) == 0)
         if not len(doubled):
@@ -284,7 +284,7 @@ def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
 def _add_stamps_of_file(
     blocks: Iterable[Block], stamps_ns: Times, file: RowFile, stream: StreamLayout
 ) -> Iterator[Block]:
-    """Yield blocks with stamps of another file. Raises `TacpipeError` where their number is not that of the rows."""
+    """Yield blocks with stamps of another file. Raises `TacpipeError` if their number is not that of the rows."""
     row_count = 0
     for _, arrays in blocks:
         count = len(arrays[0])
@@ -301,7 +301,7 @@ def _unequal_lengths(file: RowFile, stream: StreamLayout, rows_there: str, stamp
 
 
 def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
-    """Raise `TacpipeError` where stamps run backwards; ``last_ns`` is that above them, after ``before`` rows."""
+    """Raise `TacpipeError` if stamps run backwards; ``last_ns`` is that above them, after ``before`` rows."""
     steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
     backwards = np.flatnonzero(steps_ns < 0)
     if not len(backwards):
@@ -380,7 +380,7 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
 def image_paths(folder: Path) -> list[Path]:
     """Return the images that lie directly in a folder, by name, numbers in order of their value.
 
-    Raises `TacpipeError` where there is none.
+    Raises `TacpipeError` if there is none.
     """
     paths = [
         Path(place, name) for place, _, names in file_system.walk(folder) if Path(place) == folder for name in names
@@ -413,7 +413,7 @@ def _stamps_of_names(images: Sequence[Path], stream: StreamLayout) -> Times:
 
 
 def last_number(path: Path) -> str | None:
-    """Return the last number in the name of an image as text, None where it has none.
+    """Return the last number in the name of an image as text, or None if it has none.
 
     >>> last_number(Path("left_1744849152.25.jpg")), last_number(Path("a.png"))
     ('1744849152.25', None)

@@ -47,7 +47,7 @@ class RecordingFiles:
 def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
     """Return the recordings below ``folder``, sorted by name.
 
-    Raises `UsageError` where none is found, where one lacks a stream that is not optional, where two files of one stream
+    Raises `UsageError` if none is found, where one lacks a stream that is not optional, where two files of one stream
     belong to one recording, and where two recordings get one name.
     """
     if layout.found_by_format:
@@ -104,7 +104,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
 def find_contained(layout: Layout, kind: Format, source: Path) -> list[RecordingFiles]:
     """Return the recordings in the containers of a format at or below ``source``, sorted by name.
 
-    They are named after their file, and after the episode where it holds several. Raises `UsageError` where there is no
+    They are named after their file, and after the episode where it holds several. Raises `UsageError` if there is no
     container, and where two recordings get one name.
     """
     paths = find_containers(kind, source)
@@ -330,7 +330,7 @@ def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> 
 def read_container(kind: str, path: Path, episode: str | None) -> RecordedStreams:
     """Return all readable streams of a container, or of its ``episode``; the notes name the others.
 
-    The attribute ``skipped`` of the recording names them too. Raises `TacpipeError` where nothing can be read.
+    The attribute ``skipped`` of the recording names them too. Raises `TacpipeError` if nothing can be read.
     """
     contents = open_container(kind, path).read(None, episode)
     notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]

@@ -159,7 +159,7 @@ class TextTable:
         )
 
     def _expect_width(self, line: int, cells: Sequence[str]) -> None:
-        """Raise `TacpipeError` where a row has another number of cells than the layout names columns."""
+        """Raise `TacpipeError` if a row has another number of cells than the layout names columns."""
         if len(cells) != len(self.stream.names):
             raise TacpipeError(
                 f"{self.path}, line {line} has {len(cells)} cells, and header in [streams.{self.stream.name}] names "
@@ -192,7 +192,7 @@ class TextTable:
     def _without_comments(
         self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
     ) -> Iterator[tuple[bytes | memoryview, ...]]:
-        """Yield pieces that end with a line without what matches ``drop``; nothing where no line holds anything."""
+        """Yield pieces that end with a line without what matches ``drop``, or nothing if no line holds anything."""
         if drop is not None:
             pieces = (drop.sub(b"", b"".join(pieces)),)
         if any(_NOT_BLANK.search(piece) for piece in pieces):

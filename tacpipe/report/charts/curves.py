@@ -27,7 +27,7 @@ def colour_of(number: int, count: int) -> str:
 
 
 def legend_of(count: int) -> Spec | None:
-    """Return the legend of so many names, None where there is one."""
+    """Return the legend of so many names, or None if there is one."""
     if count < 2:
         return None
     return {"title": None, "orient": "bottom", "direction": "vertical" if count < 7 else "horizontal", "labelLimit": 330,
@@ -74,7 +74,7 @@ def text_of(value: float) -> str:
 
 
 def short(value: float) -> float | None:
-    """Return a number with as many digits as can be seen; None where it is not defined, as JSON has it."""
+    """Return a number with as many digits as can be seen, or None if it is not defined, as JSON has it."""
     value = float(value)
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 

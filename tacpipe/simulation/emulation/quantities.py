@@ -84,7 +84,7 @@ def look(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def metadata_of(field: pa.Field, key: str) -> str | None:
-    """Return what a field's metadata states under ``key``; None where it is silent."""
+    """Return what a field's metadata states under ``key``, or None if it is silent."""
     value = (field.metadata or {}).get(key.encode())
     return None if value is None else value.decode()
 

@@ -68,7 +68,7 @@ class HostPort:
 
     @property
     def fault(self) -> str:
-        """True where the host used another speed at the last write."""
+        """True if the host used another speed at the last write."""
         return byte_faults.BAUD if self.endpoint.garbling else byte_faults.SOUND
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:

@@ -2,7 +2,7 @@
 
 A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
 so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
-``truth`` k rows later, k being the ``horizon``; NaN where there is none. ``groups`` (time,) numbers recordings or
+``truth`` k rows later, k being the ``horizon``, or NaN if there is none. ``groups`` (time,) numbers recordings or
 contacts, equal neighbours belong together, and nothing is given across them. Each feature is evaluated by itself.
 
 - A *change* is a run of rows t in which |z_t - z_{t-k}| is beyond 3 times its standard deviation sd in calibration data,
@@ -49,7 +49,7 @@ FALSE_ALARMS_PER_MINUTE = 1.0  # rate for each feature, where nothing happens
 
 @dataclass(frozen=True)
 class Anticipation:
-    """How well changes were predicted, over all features; NaN where nothing states."""
+    """How well changes were predicted, over all features, or NaN if nothing states."""
 
     events: int
     recall: float  # fraction of the events that an alarm leads
@@ -372,12 +372,12 @@ class Loads:
 
     @property
     def rate_hz(self) -> float:
-        """Rows a second; 1 where no recording has two."""
+        """Rows a second, or 1 if no recording has two."""
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
 
 
 def _number(value: float | int) -> float | int | None:
-    """Return ``value`` to 9 digits, None where it is not finite."""
+    """Return ``value`` to 9 digits, or None if it is not finite."""
     if isinstance(value, int):
         return value
     return float(f"{value:.9g}") if math.isfinite(value) else None

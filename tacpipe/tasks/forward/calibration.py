@@ -32,7 +32,7 @@ def calibrate(
 ) -> dict[str, bytes]:
     """Return the files of a model with quantiles of its error, fitted on training and corrected on calibration recordings.
 
-    Raises `UsageError` where the model was trained or stopped by a calibration recording, and `TacpipeError` where the
+    Raises `UsageError` if the model was trained or stopped by a calibration recording, and `TacpipeError` if the
     recordings are not what the model reads or hold no window, and for too few of them.
     """
     check_levels(request.quantiles)

@@ -46,7 +46,7 @@ STEP = 10  # ahead, that is drawn; the last one where the model predicts fewer
 
 @dataclass
 class QuantileSums:
-    """Sums of each predictor's quantiles by recording, and forecasts to draw; empty where a model has no quantiles."""
+    """Sums of each predictor's quantiles by recording, and forecasts to draw, or empty if a model has no quantiles."""
 
     forecaster: Forecaster
     sums: dict[str, dict[str, Sums]] = field(default_factory=dict)  # recording -> predictor -> sums
@@ -192,7 +192,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
     Every window without a gap counts, in contact or not. Errors in counts are against the tactile channels themselves,
     whatever the codec lost. Recordings that the model was trained or stopped on are recognised by their digests and reported
-    apart, and so are objects that it was trained on and others. Raises `TacpipeError` where the recordings are not what
+    apart, and so are objects that it was trained on and others. Raises `TacpipeError` if the recordings are not what
     the model reads.
     """
     forecaster = Forecaster.load(model)

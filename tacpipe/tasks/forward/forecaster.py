@@ -98,7 +98,7 @@ class Forecaster:
 
     @property
     def pose(self) -> Pose:
-        """The columns of the arm that it was trained on; none where it was trained without one."""
+        """The columns of the arm that it was trained on, or None if it was trained without one."""
         stored_pose = self.config["inputs"].get("pose")
         return NAMED if stored_pose is None else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
 
@@ -131,7 +131,7 @@ class Forecaster:
         """The columns that `windows` adds behind those of window and plan, and that recordings need not hold.
 
         Velocity and angular velocity, from the joints of a known arm, else as differences of the pose. A window then ends
-        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, 0 where they have none. A model
+        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, or 0 if they have none. A model
         without an arm has no velocities.
         """
         return (*tracks.VELOCITY, *tracks.TURNING) if self.pose.position else ()
@@ -175,7 +175,7 @@ class Forecaster:
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task.
+        """Return the forecaster among a model's files. Raises `TacpipeError` if they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
         that recordings went through the same.

@@ -68,7 +68,7 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
 
 
 def look_ahead_notes(config: Mapping[str, Any]) -> list[str]:
-    """Return how far the rows that a model was trained on look ahead; nothing where they do not."""
+    """Return how far the rows that a model was trained on look ahead, or nothing if they do not."""
     ahead = config.get("look_ahead") or {"max_ms": 0.0}
     if not ahead["max_ms"]:
         return []

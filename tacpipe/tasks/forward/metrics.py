@@ -77,7 +77,7 @@ class ForecastErrorSums:
 
 @dataclass
 class Trial:
-    """The errors on one recording by predictor; empty where it holds no window."""
+    """The errors on one recording by predictor, or empty if it holds no window."""
 
     name: str
     seen: bool  # True if the model was trained or validated on the recording

@@ -105,7 +105,7 @@ def rows_of_tracks(
 ) -> Rows:
     """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
 
-    The rows lie in files of ``mapped``; None: in memory. Raises `StorageError` where its disk is full.
+    The rows lie in files of ``mapped``; None: in memory. Raises `StorageError` if its disk is full.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
@@ -167,7 +167,7 @@ def shape(params: ForwardModelParams, codec: codecs.Codec) -> ForecastShape:
 def build(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
     """Return the network that ``params`` build, of random weights, for the codec's features; several as an `Ensemble`.
 
-    Raises `TacpipeError` where they build something else.
+    Raises `TacpipeError` if they build something else.
     """
     members = [_member(params, codec) for _ in range(params.members)]
     return members[0] if len(members) == 1 else Ensemble(members)
@@ -196,7 +196,7 @@ def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
 
 @torch.no_grad()
 def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindows, features: int) -> None:
-    """Raise `TacpipeError` where a network returns something else than features to come for a few ``windows``."""
+    """Raise `TacpipeError` if a network returns something else than features to come for a few ``windows``."""
     sample = ForecastWindows(*(part[:, :TRIED] for part in windows))
     training = network.training
     features_ahead = network.eval()(sample)
@@ -258,7 +258,7 @@ class _Parts(nn.Module):
 
 @torch.no_grad()
 def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
-    """Return the recording, None where there is none that gives the same bits."""
+    """Return the recording, or None if there is none that gives the same bits."""
     parts = _Parts(forecaster).eval()
     examples = _tried(forecaster)
     try:

@@ -162,7 +162,7 @@ class ForwardModel(Forecaster):
         and ``tacpipe.open(OUTPUT).table()`` reads: ``recording``, ``t_ns`` (when it was known) and for each channel and each
         of ``steps`` the counts above rest that many rows later, as ``xela1_taxel01_z_t5``, float32; a row a window.
         ``.to_pandas()`` makes a frame of it. ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as
-        ``xela1_taxel01_z_t5_q90``. Raises `UsageError` where the recordings did not go through the stages that
+        ``xela1_taxel01_z_t5_q90``. Raises `UsageError` if the recordings did not go through the stages that
         the model was trained behind, `TacpipeError` for a step beyond the horizon.
 
         **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last, has

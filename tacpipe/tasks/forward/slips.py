@@ -55,7 +55,7 @@ def shear(levels: AnyFloats, layout: Layout) -> Floats:
 
 
 def pressing(levels: AnyFloats, layout: Layout) -> Floats:
-    """Return the load that presses on each skin (…, skin), 0 where a sensor does not measure it."""
+    """Return the load that presses on each skin (…, skin), or 0 if a sensor does not measure it."""
     loads = [np.abs(_mean(levels, layout, skin, PRESSING)) for skin in skins(layout)]
     return np.stack(loads, axis=-1) if loads else np.zeros((*levels.shape[:-1], 0))
 
@@ -84,7 +84,7 @@ def floors(spread: AnyFloats, layout: Layout) -> Floats:
 def rise_and_fall(ahead: AnyFloats, now: AnyFloats, layout: Layout, divisors: AnyFloats) -> Floats:
     """Return the score (window,) of forecasts ``ahead`` (window, step, channel) at levels ``now`` (window, channel).
 
-    The largest of all skins counts; ``divisors`` (skin,) is what `floors` gives. NaN where a forecast is not finite, and for
+    The largest of all skins counts; ``divisors`` (skin,) is what `floors` gives. NaN if a forecast is not finite, and for
     channels none of which lies along a skin.
     """
     if not skins(layout):
@@ -97,7 +97,7 @@ def rise_and_fall(ahead: AnyFloats, now: AnyFloats, layout: Layout, divisors: An
 
 
 def _mean(levels: Any, layout: Layout, skin: str, axis: str) -> Floats:
-    """Return the mean (…,) of the channels of a skin along an axis, 0 where it has none."""
+    """Return the mean (…,) of the channels of a skin along an axis, or 0 if it has none."""
     chosen = [index for index, channel in enumerate(layout) if _on(channel, skin) and channel.get("axis") == axis]
     if not chosen:
         return np.zeros(levels.shape[:-1])
@@ -182,7 +182,7 @@ class LeadSums(TypedDict):
 
 
 def summed(parts: Sequence[Leads]) -> LeadSums:
-    """Return what alarms were worth together; None where there is nothing to divide by.
+    """Return what alarms were worth together, or None if there is nothing to divide by.
 
     >>> both = summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])
     >>> both["events"], both["led"], both["median_lead_ms"], both["false_alarms_per_hour"], both["minutes"]
@@ -281,7 +281,7 @@ class SlipAlarms:
         """Return by predictor what its alarm is worth on the recordings that state where they slip.
 
         Levels are set for ``per_hour`` false alarms: for each fifth of the recordings on the others, so that no recording
-        sets its own. Nothing where fewer than two recordings state it, or none slips.
+        sets its own. Nothing if fewer than two recordings state it, or none slips.
         """
         labelled = [place for place, recording in enumerate(self.recordings) if recording.slips is not None]
         if len(labelled) < 2 or not any(

@@ -86,7 +86,7 @@ class Levels:
 
 
 def above_rest(table: pa.Table | Columns, channels: Sequence[str]) -> Levels:
-    """Return the levels of the channels above rest. Raises `TacpipeError` where one has no rest level."""
+    """Return the levels of the channels above rest. Raises `TacpipeError` if one has no rest level."""
     rest_counts = tactile.rest_counts(table.schema, channels)
     narrow = all(_is_narrow(table.schema.field(name).type) for name in channels)
     stored = np.empty((table.num_rows, len(channels)), np.float32 if narrow else np.float64)
@@ -108,7 +108,7 @@ COLUMNS = ("slip", "slip_slip", "gt_slip")
 
 
 def slips_of(table: pa.Table | Columns) -> Bools | None:
-    """Return where the object slips (time,), by label or the simulator's truth; None where nothing states that."""
+    """Return where the object slips (time,), by label or the simulator's truth, or None if nothing states that."""
     for name in COLUMNS:
         if name in table.column_names:
             return np.asarray(table.column(name).to_numpy()) > 0
@@ -138,12 +138,12 @@ class Track:
     usable: Bools  # (time,)
     latent: AnyFloats | Levels  # (time, latent), float32
     arm: AnyFloats  # (time, 13): `ARM`
-    finger: AnyFloats  # (time,), m; 0 where it is not recorded
+    finger: AnyFloats  # (time,), m, or 0 if it is not recorded
     tactile: AnyFloats | Levels  # (time, channel), float64
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
     object: str | None = None  # the grasped object, where a label names it
     slips: Bools | None = None  # (time,), where it slips, if that is known; for evaluation alone
-    # (time, 6), velocities that a plan of these poses has; None where they are those of ``arm``
+    # (time, 6), velocities that a plan of these poses has, or None if they are those of ``arm``
     plan_velocity: AnyFloats | None = None
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
@@ -208,7 +208,7 @@ def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -
 def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
     """Return the codec among a dataset's files, or the one that leaves channels as they are where there is none.
 
-    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` where table and files do not belong
+    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` if table and files do not belong
     together.
     """
     latents = tactile.columns(table.schema, "latent")
@@ -337,7 +337,7 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
 
 
 def _opening(table: pa.Table | Columns) -> AnyFloats:
-    """Return the width between the fingers (time,), m; 0 where none is recorded, or several."""
+    """Return the width between the fingers (time,), m, or 0 if none is recorded, or several."""
     column = opening(table.schema)
     if not column:
         return np.zeros(table.num_rows)
@@ -353,7 +353,7 @@ def opening(schema: pa.Schema) -> str:
 
 
 def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats) -> AnyFloats | None:
-    """Return the hand's linear and angular velocity (time, 6) from its joints; None where they are not a known arm's."""
+    """Return the hand's linear and angular velocity (time, 6) from its joints, or None if they are not a known arm's."""
     names, speeds = joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
@@ -363,7 +363,7 @@ def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats
 
 
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the columns of the angles and speeds of the arm's joints, empty where it has none."""
+    """Return the columns of the angles and speeds of the arm's joints, or empty if it has none."""
     if pose == poses.NAMED:
         numbers = range(1, JOINTS + 1)
         names = tuple(f"robot_joint{n}_rad" for n in numbers), tuple(f"robot_joint{n}_velocity_rad_s" for n in numbers)
@@ -383,7 +383,7 @@ def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, .
 
 
 def whole_numbers(table: pa.Table | Columns, name: str) -> Int64s:
-    """Return an integer column, shape (time,). Raises `TacpipeError` where it is absent."""
+    """Return an integer column, shape (time,). Raises `TacpipeError` if it is absent."""
     if name not in table.column_names:
         raise TacpipeError(f"There is no column {name}. Run `tacpipe segment contacts` on the synchronized recordings.")
     return np.asarray(table.column(name).to_numpy(), dtype=np.int64)
@@ -410,10 +410,10 @@ def negated(arm: AnyFloats) -> AnyFloats:
 
 
 def rate_hz(tracks: Sequence[Track]) -> float:
-    """Return the median rate of the tracks' grids in Hz; 0 where none has two rows.
+    """Return the median rate of the tracks' grids in Hz, or 0 if none has two rows.
 
     On rows as logged or fresh a step is a row, however long it takes; so rates may differ there. Else raises
-    `TacpipeError` where they do by more than 1 %, and where the tracks are not of one timeline.
+    `TacpipeError` if they do by more than 1 %, and where the tracks are not of one timeline.
     """
     if len({track.timeline for track in tracks}) > 1:
         names_by_timeline = {track.timeline: track.name for track in tracks}

@@ -79,7 +79,7 @@ def train(
 
     Scales and baselines are fitted on the training recordings alone,
     or scales taken over from the model ``init`` with its weights. The files name what ``auto`` became.
-    Raises `TacpipeError` where recordings lack columns or windows or hold what the architecture cannot read, and where
+    Raises `TacpipeError` if recordings lack columns or windows or hold what the architecture cannot read, and where
     ``init`` has another shape or codec.
     """
     if not training.recordings:
@@ -202,7 +202,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
 
 
 def _look_ahead(training: Dataset) -> LookAhead | None:
-    """Return how far the rows of the training recordings look ahead; None where no recording states it."""
+    """Return how far the rows of the training recordings look ahead, or None if no recording states it."""
     look_ahead = [
         (
             float(recording.attributes[streams.LOOK_AHEAD_MEAN] or 0),
@@ -338,7 +338,7 @@ def _check_start(
     codec: codecs.Codec,
     recordings: Mapping[str, bytes],
 ) -> None:
-    """Raise `TacpipeError` where the model to begin with does not fit what is to be trained."""
+    """Raise `TacpipeError` if the model to begin with does not fit what is to be trained."""
     for name in ("architecture", "members", "hidden", "context", "horizon"):
         started_with, requested = getattr(start.params, name), getattr(params, name)
         if started_with != requested:
@@ -357,7 +357,7 @@ def _check_start(
 
 
 def _take_over(model: nn.Module, start: Forecaster) -> None:
-    """Give a network the weights of the model to begin with. Raises `TacpipeError` where they are of other shapes."""
+    """Give a network the weights of the model to begin with. Raises `TacpipeError` if they are of other shapes."""
     network = start.model.network if isinstance(start.model, Shrunk) else start.model
     shapes, expected = (
         {name: tuple(weight.shape) for name, weight in module.state_dict().items()} for module in (network, model)
@@ -393,7 +393,7 @@ def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
 
 
 def _check_pose(start: Forecaster, pose: Pose) -> None:
-    """Raise `TacpipeError` where the model to begin with reads another arm than the recordings have."""
+    """Raise `TacpipeError` if the model to begin with reads another arm than the recordings have."""
     if start.pose != pose:
         read, recorded = (", ".join(pose_read.columns) or "no arm" for pose_read in (start.pose, pose))
         raise TacpipeError(

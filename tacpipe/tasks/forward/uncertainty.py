@@ -99,7 +99,7 @@ class ResidualQuantiles:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
+        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another."""
         quantiles = cls(
             tensors["levels"],
             tensors["unit"],
@@ -281,7 +281,7 @@ class Uncertainty:
 
     @classmethod
     def load(cls, content: bytes, channels: int, horizon: int) -> Self:
-        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
+        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` if shapes do not fit."""
         arrays = model_files.arrays(content, FILE)
         uncertainty = cls(
             ResidualQuantiles.from_tensors(tensors_under(ERRORS, arrays)),

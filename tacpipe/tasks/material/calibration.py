@@ -37,7 +37,7 @@ def calibrate(
 ) -> dict[str, bytes]:
     """Return the files of a classifier whose probabilities are calibrated on validation slides, with a threshold of unknown.
 
-    Raises `TacpipeError` where the model learned from these validation slides, where a sensor has none, and for too few.
+    Raises `TacpipeError` if the model learned from these validation slides, where a sensor has none, and for too few.
     """
     classifier = Classifier.load(model)
     training_by_sensor, validation_by_sensor = (classifier.read(part, labelled=True) for part in (training, validation))

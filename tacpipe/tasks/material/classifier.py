@@ -182,7 +182,7 @@ class Classifier:
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task.
+        """Return the classifier of a model's files. Raises `TacpipeError` if they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
         that recordings went through the same.
@@ -285,7 +285,7 @@ class Classifier:
         return self.readers[layout.sensor].read(frames).scores
 
     def layout(self, sensor: str) -> SlideLayout:
-        """Return the layout of a sensor's slides. Raises `TacpipeError` where the model does not know the sensor."""
+        """Return the layout of a sensor's slides. Raises `TacpipeError` if the model does not know the sensor."""
         if sensor not in self.layouts:
             raise TacpipeError(
                 f"The model does not know the sensor {sensor}; it was trained on {', '.join(self.layouts)}. "
@@ -313,7 +313,7 @@ class Classifier:
         return by_sensor
 
     def check(self, slides: Slides) -> None:
-        """Raise `TacpipeError` where slides are of another layout than those that the model was trained on."""
+        """Raise `TacpipeError` if slides are of another layout than those that the model was trained on."""
         layout = self.layout(slides.layout.sensor)
         if not layout.alike(slides.layout):
             raise TacpipeError(

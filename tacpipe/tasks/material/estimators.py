@@ -45,7 +45,7 @@ class FittedEstimator:
     def fit(cls, params: Estimator, frames: Float32s, materials: Int64s) -> Self:
         """Return the estimator that ``params`` build, fitted on slides (slide, time, channel) and their classes (slide,).
 
-        Raises `TacpipeError` where features or scores are not what `Estimator` states.
+        Raises `TacpipeError` if features or scores are not what `Estimator` states.
         """
         fitted = cls(params.build(params.seed), params.features)
         fitted.estimator.fit(fitted._features(frames), materials)
@@ -110,7 +110,7 @@ def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
 def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEstimator]:
     """Return the estimators by sensor in the file ``name``.
 
-    Raises `TacpipeError` where it is not such a file, and where it has types that the architecture does not trust.
+    Raises `TacpipeError` if it is not such a file, and where it has types that the architecture does not trust.
     """
     with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import get_untrusted_types, loads
@@ -199,7 +199,7 @@ def _member(name: str, numbers: dict[Any, int]) -> str:
 def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Network:
     """Return the network that ``params`` build for a sensor, of random weights; a plain one wrapped, to be called as others.
 
-    Raises `TacpipeError` where they build something else.
+    Raises `TacpipeError` if they build something else.
     """
     network = params.build(shape) if isinstance(params, NetworkParams) else None
     if not isinstance(network, nn.Module):
@@ -211,7 +211,7 @@ def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Netwo
 
 @torch.no_grad()
 def check_network(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
-    """Raise `TacpipeError` where a network returns something else than scores for ``slides`` (slide, time, channel)."""
+    """Raise `TacpipeError` if a network returns something else than scores for ``slides`` (slide, time, channel)."""
     training = network.training
     output = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
     network.train(training)

@@ -119,7 +119,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     """Return metrics, confusions and predictions of a model, its files given, on slides, next to its baselines.
 
     Every slide counts. Slides that the model was trained or chosen on are recognised by their digests and reported
-    apart, under ``seen``. Raises `TacpipeError` where slides have no label or are not what the model reads.
+    apart, under ``seen``. Raises `TacpipeError` if slides have no label or are not what the model reads.
     """
     classifier = Classifier.load(model)
     trained_on = set(classifier.config["trained_on"].values())

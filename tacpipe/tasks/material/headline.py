@@ -108,7 +108,7 @@ class Naming:
         return self.names.index(label_text(label))
 
     def read(self, word: str) -> int:
-        """Return the number of a class that an option names. Raises `ValueError` where there is none of this name."""
+        """Return the number of a class that an option names. Raises `ValueError` if there is none of this name."""
         return self.names.index(word) if self.names else int(word)
 
     def name(self, number: int) -> str:
@@ -148,7 +148,7 @@ def label_text(label: Attribute) -> str:
 
 
 def label_field(name: str, values: AnyArray, quantity: str) -> tuple[pa.Field, list[Any]]:
-    """Return a column of classes and its values: int32 where they are whole numbers, else text, nothing where unknown."""
+    """Return a column of classes and its values: int32 where they are whole numbers, else text, or nothing if unknown."""
     import pyarrow as pa
 
     about = {"quantity": quantity}

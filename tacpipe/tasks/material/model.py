@@ -103,7 +103,7 @@ class MaterialModel(Classifier):
         calibrate` made, a ``probability_…`` of each class and the ``answer``, a name or unknown.
         ``.to_pandas()`` makes a frame of it. Scores of
         a dataset are those of the command to the last bit; those of one recording alone may differ in the last digits
-        of a float32, because slides are computed together. Raises `UsageError` where the recordings did not go through
+        of a float32, because slides are computed together. Raises `UsageError` if the recordings did not go through
         the stages that the model was trained behind.
 
         **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them

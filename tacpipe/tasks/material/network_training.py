@@ -67,7 +67,7 @@ def train_network(
 ) -> dict[str, bytes]:
     """Return the files of networks, one per sensor, trained on ``training_slides`` and chosen on ``validation_slides``.
 
-    ``config`` is completed. Raises `TacpipeError` where a sensor has no slide to choose by or, learned jointly, lacks
+    ``config`` is completed. Raises `TacpipeError` if a sensor has no slide to choose by or, learned jointly, lacks
     materials, and `UsageError` for a model to begin with that does not fit.
     """
     missing = sorted(set(training_slides) - set(validation_slides))
@@ -333,7 +333,7 @@ def train(
 
     Whatever is fitted is fitted on training slides alone; a readout in closed form needs none to choose by, and learns
     from validation slides too where ``use_validation`` is set.
-    Raises `TacpipeError` where slides lack labels, differ in layout or, learned jointly, in materials.
+    Raises `TacpipeError` if slides lack labels, differ in layout or, learned jointly, in materials.
     """
     _check(params, init)
     only = CommaList().items(params.sensors)

@@ -83,7 +83,7 @@ class MaterialModelParams(ABC):
 
     @property
     def aligned_sensor(self) -> str:
-        """The sensor of the model of ``--init`` whose network stays frozen; empty where none does."""
+        """The sensor of the model of ``--init`` whose network stays frozen, or empty if none does."""
         return ""
 
     @abstractmethod
@@ -302,7 +302,7 @@ class Raec(NetworkParams):
 
     @property
     def aligned_sensor(self) -> str:
-        """The sensor of the model of ``--init`` whose network stays frozen; empty where none does."""
+        """The sensor of the model of ``--init`` whose network stays frozen, or empty if none does."""
         return self.frozen_sensor
 
     @property

@@ -104,7 +104,7 @@ def spectra(
     """Return the files of a model of spectra over spatial frequency, by which sensors learn materials from one another.
 
     ``held_out`` are the materials whose labels a sensor does not learn; nothing that is fitted for it sees their slides.
-    Raises `TacpipeError` where a sensor's speed or rate is not known, where sensors share too few materials, and where no
+    Raises `TacpipeError` if a sensor's speed or rate is not known, where sensors share too few materials, and where no
     sensor learns a material.
     """
     sampled = _samplings(params.speeds, training_slides)

@@ -121,7 +121,7 @@ class ClassDistance:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another.
+        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another.
 
         Raises `TacpipeError` for tensors of an earlier version, which held no training slides.
         """
@@ -214,7 +214,7 @@ class SensorCalibration:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` where it cannot be."""
+        """Return what `to_tensors` described. Raises `ValueError` if it cannot be."""
         temperature, threshold, rule = (float(number) for number in tensors["numbers"])
         if temperature <= 0 or not 0 <= int(rule) < len(RULES):
             raise ValueError(f"the temperature is {temperature} and the rule {rule}")

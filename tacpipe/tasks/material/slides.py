@@ -62,7 +62,7 @@ class Slides:
     frames: Float32s  # (slide, time, channel), device counts
     materials: Int64s  # (slide,), numbers of classes; UNKNOWN where none is labelled
     digests: tuple[str, ...]
-    speeds_m_s: Floats  # (slide,); NaN where none is recorded
+    speeds_m_s: Floats  # (slide,), or NaN if none is recorded
 
     def __len__(self) -> int:
         """Return how many slides there are."""
@@ -99,7 +99,7 @@ def read(
 
     Columns of the ``quantities`` are read, as far as a sensor has them. ``labelled`` refuses slides without a material;
     ``advance`` is called after each recording.
-    Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
+    Raises `TacpipeError` if a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
     by_sensor: dict[str, list[tuple[Recording, SlideLayout, Float32s]]] = {}

@@ -85,7 +85,7 @@ def select_rows(predicted: Readings, mask: Bools) -> dict[str, Floats]:
 
 
 def _finite(value: float) -> float | None:
-    """Return a measure, or None where it is not defined, for JSON."""
+    """Return a measure, or None if it is not defined, for JSON."""
     return value if np.isfinite(value) else None
 
 
@@ -94,7 +94,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
     The measures are of grasps that the model was not trained on, and again of those among them whose object it knows
     (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are reported
-    apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
+    apart, under ``seen``. Raises `TacpipeError` if grasps have no reading, or are not what the model reads.
     """
     predictor = Predictor.load(model)
     with terminal.progress_bar(
@@ -241,7 +241,7 @@ def _about(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
-    """Return the attribute that marks what simulated recordings led to; none where all are real."""
+    """Return the attribute that marks what simulated recordings led to, or None if all are real."""
     is_simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
     return {"simulated": True} if is_simulated else {}
 

@@ -30,7 +30,7 @@ class Grasps:
     """Grasps side by side, each with its cloud and, where it is known, the reading of both fingers."""
 
     names: tuple[str, ...]
-    objects: tuple[str, ...]  # empty where none is labelled
+    objects: tuple[str, ...]  # empty if none is labelled
     sessions: tuple[str, ...]
     t_ns: Times  # (grasp,)
     clouds: tuple[Cloud, ...]
@@ -61,7 +61,7 @@ def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[.
 
     ``advance`` is called after each.
 
-    Raises `TacpipeError` where a recording lacks a stream or a column, where a value is not finite, where a cloud has
+    Raises `TacpipeError` if a recording lacks a stream or a column, where a value is not finite, where a cloud has
     next to no points, and where a grasp lies far from it.
     """
     names = sorted(recordings.recordings)

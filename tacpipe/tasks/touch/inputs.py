@@ -77,7 +77,7 @@ class CloudSources:
     def __init__(
         self, inputs: CloudInputs, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
     ) -> None:
-        """Take clouds and grasps; raises `TacpipeError` where one has too few points, no colours or no wrist."""
+        """Take clouds and grasps; raises `TacpipeError` if one has too few points, no colours or no wrist."""
         self.inputs, self.clouds, self.grasps = inputs, clouds, grasps
         for name, cloud, grasp in zip(names, clouds, grasps, strict=True):
             _check(inputs, name, cloud, grasp)
@@ -182,7 +182,7 @@ class PatchSources:
     def __init__(
         self, patches: PatchOptions, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
     ) -> None:
-        """Take clouds and grasps; raises `TacpipeError` where colours are to be read and a cloud has none."""
+        """Take clouds and grasps; raises `TacpipeError` if colours are to be read and a cloud has none."""
         self.patches = patches
         self.clouds: list[Float32s] = []  # (point, channel) each
         self.near: list[list[Indices]] = []  # indices of points near g1 and near g2

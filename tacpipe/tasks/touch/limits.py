@@ -200,7 +200,7 @@ def limits(
     """Return what limits the prediction of touch on grasps with readings.
 
     ``draws`` is how often folds and training grasps are drawn anew; ``advance`` is called `steps` times. Raises
-    `TacpipeError` where an object has fewer than five grasps, one for each fold, or where grasps have no object.
+    `TacpipeError` if an object has fewer than five grasps, one for each fold, or where grasps have no object.
     """
     counts = {name: grasps.objects.count(name) for name in sorted(set(grasps.objects))}
     rarest = min(counts, key=lambda name: counts[name], default="")

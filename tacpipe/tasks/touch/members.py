@@ -208,7 +208,7 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
 
 
 def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
-    """Return an untrained network for params and targets. Raises `TacpipeError` where params build something else."""
+    """Return an untrained network for params and targets. Raises `TacpipeError` if params build something else."""
     values = sum(biotac_sp.width(target) for target in targets)
     read = inputs(params) if isinstance(params, params_of.Pointnet) else patches(params)
     built = params.build(PointNetworkShape(read.channels, read.grasp_numbers, values))
@@ -242,7 +242,7 @@ def coloured(params: params_of.Trees | NetworkParams) -> bool:
 
 
 def sources(params: NetworkParams, grasps: Grasps) -> Drawn:
-    """Return where a network's points are drawn from. Raises `TacpipeError` where a grasp lacks what it reads."""
+    """Return where a network's points are drawn from. Raises `TacpipeError` if a grasp lacks what it reads."""
     if isinstance(params, params_of.Pointnet):
         return CloudSources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
     return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)

@@ -34,7 +34,7 @@ def predict(
 ) -> Result:
     """Return one table, ``predictions``: a row a grasp with the recording's name and all predicted values, device counts.
 
-    Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` where
+    Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` if
     there are no recordings or they are not what the model reads. ``quantiles`` (percent), of a calibrated model, add columns
     such as ``e_mf_07_q90``.
     """
@@ -77,10 +77,10 @@ class TouchModel(Predictor):
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
         a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
         ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as ``e_mf_07_q90``. ``.to_pandas()`` makes
-        a frame of it. Raises `UsageError` where the recordings did not go through the stages that the model was trained
+        a frame of it. Raises `UsageError` if the recordings did not go through the stages that the model was trained
         behind.
 
-        **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` where the grasp
+        **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` if the grasp
         lies far from the cloud, and where either lacks what the model reads.
         """
         if isinstance(recordings, Cloud):
@@ -107,7 +107,7 @@ def calibrate(
 ) -> dict[str, bytes]:
     """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
 
-    Raises `TacpipeError` where the model learned from these validation grasps, and where there are none.
+    Raises `TacpipeError` if the model learned from these validation grasps, and where there are none.
     """
     check_levels(request.quantiles)
     predictor = Predictor.load(model)

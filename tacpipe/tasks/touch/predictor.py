@@ -53,7 +53,7 @@ class Baselines:
         return cls(grasps.readings, grasps.objects, grasps.t_ns)
 
     def check(self) -> None:
-        """Raise `ValueError` where arrays are not as long as there are training grasps, or of another width."""
+        """Raise `ValueError` if arrays are not as long as there are training grasps, or of another width."""
         for name, values in self.readings.items():
             if values.shape != (len(self.objects), biotac_sp.width(name)) or self.t_ns.shape != values.shape[:1]:
                 raise ValueError(f"baselines of {name} are {values.shape} for {len(self.objects)} grasps")
@@ -248,7 +248,7 @@ class Predictor:
 
         A shrinkage applies to grasps of objects that the model was not trained on.
 
-        Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
+        Raises `TacpipeError` if a grasp lacks what the model reads: colours, points, the wrist.
         """
         by_target = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
         predicted = {target: by_target[target] for target in self.targets}

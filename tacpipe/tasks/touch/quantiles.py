@@ -83,7 +83,7 @@ class ReadingQuantiles:
 
     @classmethod
     def load(cls, content: bytes, targets: Sequence[str]) -> Self:
-        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
+        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` if shapes do not fit."""
         tensors = model_files.arrays(content, FILE)
         offsets = {name: dict(tensors_under(f"{name}.", tensors)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
         for by_target in offsets.values():

@@ -94,7 +94,7 @@ def train(
     """Return the files of a model trained on the grasps of ``training``.
 
     Whatever is fitted is fitted on training grasps alone, and on those of ``validation`` too where ``use_validation`` is
-    set and nothing is chosen by them. Raises `TacpipeError` where grasps lack what is to be read or predicted.
+    set and nothing is chosen by them. Raises `TacpipeError` if grasps lack what is to be read or predicted.
     """
     requested = CommaList().items(params.targets)
     targets = tuple(target for target in biotac_sp.TARGETS if target in requested)  # always in one order

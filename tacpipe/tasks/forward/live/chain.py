@@ -61,7 +61,7 @@ class GridForecast:
 
     t_ns: int  # time of the grid point; step k is the time t_ns + k * period, on a uniform grid
     made_from_t_ns: int  # stamp of the newest sample that was read, never above t_ns; 0 before the streams have begun
-    count: Float32s | None  # (horizon, channel), above rest; None where `cause` has a flag of `BLOCKING`
+    count: Float32s | None  # (horizon, channel), above rest, or None if `cause` has a flag of `BLOCKING`
     now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
     cause: Cause
     gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
@@ -165,7 +165,7 @@ class LiveChain:
         ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model; who
         makes several chains gives the model loaded, because that and its first forecast take a second.
         ``layouts`` holds the schemas (with field metadata) of the rig's streams, as they are recorded; ``master`` is the
-        rig file's, used where the model's stages name none. Raises `TacpipeError` where the model is not of a task that
+        rig file's, used where the model's stages name none. Raises `TacpipeError` if the model is not of a task that
         runs live, was trained behind a stage that looks ahead and has no causal rule, or needs a stream or channel that
         ``layouts`` lacks or has otherwise.
 
@@ -174,9 +174,9 @@ class LiveChain:
         around are taken as near to the level at rest as they can be.
 
         ``plan_from`` names the stream of an arm whose set-points are the planned motion (`targets`), in the place
-        of the stream ``plan``. Raises `UsageError` where it has none.
+        of the stream ``plan``. Raises `UsageError` if it has none.
 
-        ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` where the model has none, or not these.
+        ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` if the model has none, or not these.
 
         Raises `TacpipeError` for a model that was trained on rows that look ahead, unless ``allow_look_ahead``.
         """

@@ -216,7 +216,7 @@ class ForecastEngine(Engine):
 
     @property
     def _row_ns(self) -> int | None:
-        """When the next row is due, on the monotonic clock; None where that is not known."""
+        """When the next row is due, on the monotonic clock, or None if that is not known."""
         if self._point_ns is None or self._offset_ns is None:
             return None
         return self._point_ns + self.period_ns - self._offset_ns + self.settle_ns

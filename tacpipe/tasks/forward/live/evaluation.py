@@ -53,7 +53,7 @@ class _Offline(NamedTuple):
 def evaluate(model: Model, recordings: Dataset) -> Result:
     """Return the evaluation of recordings of live sessions.
 
-    Raises `UsageError` where one has no stream ``forecast``, or its session ran another model.
+    Raises `UsageError` if one has no stream ``forecast``, or its session ran another model.
     """
     check(model.digest, recordings)
     forecaster = Forecaster.load(model.files)

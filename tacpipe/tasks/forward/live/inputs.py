@@ -88,7 +88,7 @@ class InputLayout:
     ) -> InputLayout:
         """Return where inputs are in streams of these schemas, by the params of the model's `synchronize`.
 
-        Raises `TacpipeError` where a stream or a channel is absent, or is another than the model's.
+        Raises `TacpipeError` if a stream or a channel is absent, or is another than the model's.
         """
         import pyarrow as pa
 
@@ -161,7 +161,7 @@ class InputLayout:
     def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> tuple[Times, Floats]:
         """Return stamps (time,) and the columns that are read (time, column) of a batch of a stream.
 
-        Raises `TacpipeError` where a column is absent.
+        Raises `TacpipeError` if a column is absent.
         """
         place = self._places.get(stream)
         if place is None or place[0] is not batch.schema:
@@ -188,7 +188,7 @@ class InputLayout:
         return row
 
     def levels(self, rest_levels: Sequence[float]) -> dict[str, Floats]:
-        """Return levels of channels (channel,) as columns of the streams they are in, (column,), NaN where there is none."""
+        """Return levels of channels (channel,) as columns of the streams they are in, (column,), or NaN if there is none."""
         by_stream = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
         for stream, (columns, channels) in self.tactile_of.items():
             by_stream[stream][columns] = np.asarray(rest_levels)[channels]
@@ -209,7 +209,7 @@ class InputLayout:
         return position, quaternion, angles, speeds
 
     def finger_m(self, values: Mapping[str, Floats]) -> float:
-        """Return the width between the fingers in m of a row; 0 where it is not recorded."""
+        """Return the width between the fingers in m of a row, or 0 if it is not recorded."""
         if self.finger is None:
             return 0.0
         stream, columns = self.finger

@@ -44,7 +44,7 @@ def equality(
 
 
 def at(t_ns: Times, values: AnyFloats, groups: Int64s, usable: Bools, wanted_ns: Times) -> Floats:
-    """Return values (wanted, channel) at times, linear between rows (time, channel) of a group; NaN where there are none.
+    """Return values (wanted, channel) at times, linear between rows (time, channel) of a group, or NaN if there are none.
 
     >>> t_ns, values = np.array([0, 10, 20]), np.array([[0.0], [5.0], [7.0]])
     >>> groups, usable = np.array([0, 0, 1]), np.array([True, True, True])

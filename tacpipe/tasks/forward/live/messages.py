@@ -120,7 +120,7 @@ class ForecastMessage(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """True where there is a forecast."""
+        """True if there is a forecast."""
         return self.values is not None
 
     @property

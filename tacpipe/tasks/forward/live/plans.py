@@ -92,7 +92,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def targets_of(rig: Rig, plan: str) -> str:
-    """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` where there is none."""
+    """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` if there is none."""
     scheme, _, stream = plan.partition(":")
     if scheme != RIG:
         return ""
@@ -113,7 +113,7 @@ class Targets:
     """The newest set-points of one arm's stream."""
 
     def __init__(self, stream: str, schema: pa.Schema) -> None:
-        """Take the stream's schema. Raises `UsageError` where it holds no set-points of a pose."""
+        """Take the stream's schema. Raises `UsageError` if it holds no set-points of a pose."""
         self.stream = stream
         fields_by_part = {(_about(field, "quantity"), _about(field, "component")): field for field in schema}
         parts = [*((POSITION, axis) for axis in AXES), *((ORIENTATION, part) for part in COMPONENTS)]
@@ -136,7 +136,7 @@ class Targets:
         self._kept.extend(zip(t_ns.tolist(), poses, strict=True))
 
     def state(self, t_ns: int) -> Float32s | None:
-        """Return pose and velocities (13,) that the controller aims at; None where its newest set-point is too old.
+        """Return pose and velocities (13,) that the controller aims at, or None if its newest set-point is too old.
 
         The newest set-point that is not after ``t_ns`` counts, and for its velocities the one `SPAN_NS` before it. Times
         must not run backwards from one call to the next.

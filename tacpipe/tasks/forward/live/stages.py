@@ -27,7 +27,7 @@ class CausalStages(NamedTuple):
 def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
     """Return the params of the stages of a chain, as manifests list them.
 
-    Raises `UsageError` where a stage has another version now, `TacpipeError` where one has no causal rule or is absent.
+    Raises `UsageError` if a stage has another version now, `TacpipeError` if one has no causal rule or is absent.
     """
     params_by_stage: dict[str, Any] = {}
     for step in steps:

@@ -52,7 +52,7 @@ class ForwardSettings(TaskSettings):
         return {name: value for name, value in file_settings.items() if name not in void}
 
     def check(self, settings: Settings) -> None:
-        """Raise `UsageError` where alarms lack recordings, or recordings or a split lack alarms."""
+        """Raise `UsageError` if alarms lack recordings, or recordings or a split lack alarms."""
         if bool(self.alarms_per_hour) != bool(self.alarms_on):
             present, absent = ALARM_KEYS[:2] if self.alarms_per_hour else ALARM_KEYS[1::-1]
             missing = absent if present in settings.places else option(absent)

@@ -31,7 +31,7 @@ def rows_by_predictor(
 
 
 def anticipation_folds(context: Context) -> list[Fold]:
-    """Return how often and how early a method sees a change come; nothing where no result states it."""
+    """Return how often and how early a method sees a change come, or nothing if no result states it."""
     described = rows_by_predictor(context.methods, "anticipation", anticipation_scores)
     measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
     rows: list[Sequence[str | Cell]] = [
@@ -75,7 +75,7 @@ SLIP_NOTE = (
 
 
 def slip_folds(context: Context) -> list[Fold]:
-    """Return what the alarm is worth with the forecasts of each method; nothing where no result states slips."""
+    """Return what the alarm is worth with the forecasts of each method, or nothing if no result states slips."""
     pairs = rows_by_predictor(context.methods, "slips", slip_scores)
     ordered = sorted(pairs, key=lambda pair: -pair[1]["led_percent"])
     rows: list[Sequence[str | Cell]] = [

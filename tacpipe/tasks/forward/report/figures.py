@@ -40,7 +40,7 @@ EXPLAINED = {
 
 
 def run_folds(method: str, run: ComparedRun) -> list[Fold]:
-    """Return the errors of a run of a method; nothing where the result holds no errors by step."""
+    """Return the errors of a run of a method, or nothing if the result holds no errors by step."""
     metrics, unit = run.details.metrics, headline.unit_of_model(run.details.config)
     names = _ordered_predictors(metrics)
     if not names:

@@ -43,7 +43,7 @@ ERROR_COLUMNS = (
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Sums over windows and channels; NaN where a predictor has no errors in a group of channels."""
+    """Sums over windows and channels, or NaN if a predictor has no errors in a group of channels."""
 
     predictors: tuple[str, ...]
     groups: tuple[str, ...]
@@ -58,7 +58,7 @@ class ErrorSums:
     objects: Mapping[str, str] = field(default_factory=dict)  # recording to its object, if it names one
 
     def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
-        """Return squared and absolute sums, both (recording, step); None where there are none."""
+        """Return squared and absolute sums, both (recording, step), or None if there are none."""
         if predictor not in self.predictors or group not in self.groups:
             return None
         at = self.predictors.index(predictor), self.groups.index(group)
@@ -69,7 +69,7 @@ class ErrorSums:
 def read_error_sums(content: bytes) -> ErrorSums:
     """Return the sums that a file holds, without those of recordings that the model was trained on.
 
-    Raises `TacpipeError` where a column is missing, or where predictors were not evaluated on the same windows.
+    Raises `TacpipeError` if a column is missing, or where predictors were not evaluated on the same windows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -157,7 +157,7 @@ class ForwardResult(context.ReportResult):
 
     @property
     def rate_hz(self) -> float:
-        """Rows a second; 0 where a row has no fixed duration."""
+        """Rows a second, or 0 if a row has no fixed duration."""
         return float(self.config.get("rate_hz") or 0)
 
     @property
@@ -208,7 +208,7 @@ def codec_of(method: Method) -> Tree:
 
 
 def paper_row(codec: Tree) -> str | None:
-    """Return what Table 1 of the paper calls a representation; None where it has none such.
+    """Return what Table 1 of the paper calls a representation, or None if it has none such.
 
     >>> paper_row({"kind": "autoencoder", "of": "levels", "frames": 2, "latents": 8})
     'AE-C2'
@@ -284,7 +284,7 @@ def shown_steps(runs: Sequence[ForwardResult]) -> tuple[int, ...]:
 def sums_by_recording(
     run: ForwardResult, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
 ) -> dict[str, AnyFloats]:
-    """Return what `headline.sums` adds up, by recording; empty where a predictor has no errors in a group of channels."""
+    """Return what `headline.sums` adds up, by recording, or empty if a predictor has no errors in a group of channels."""
     errors = run.errors
     predictor_sums, persistence_sums = errors.of(predictor, group), errors.of(BASELINE, group)
     if predictor_sums is None or persistence_sums is None:

@@ -122,7 +122,7 @@ def representation_folds(context: Context) -> list[Fold]:
 
 
 def represent_method(method: Method) -> Representation | None:
-    """Return a method's errors in its own scaled space; None where the results do not state them."""
+    """Return a method's errors in its own scaled space, or None if the results do not state them."""
 
     def error(run: ComparedRun, predictor: str, known_objects: bool | None = None) -> float | None:
         steps = run.details.errors.steps

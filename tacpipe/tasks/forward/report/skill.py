@@ -96,7 +96,7 @@ SITUATION_NOTE = (
 
 
 def situation_folds(context: Context) -> list[Fold]:
-    """Return errors and skill by situation of each method; nothing where no result states them."""
+    """Return errors and skill by situation of each method, or nothing if no result states them."""
     rows: list[list[str | Cell]] = []
     for name in SITUATIONS:
         for method in context.methods:

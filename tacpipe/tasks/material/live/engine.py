@@ -237,7 +237,7 @@ class MaterialEngine(Engine):
 
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:
-    """Return the stream with tactile channels. Raises `TacpipeError` where there is none, or more than one."""
+    """Return the stream with tactile channels. Raises `TacpipeError` if there is none, or more than one."""
     from tacpipe.channels.streams import finger
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}

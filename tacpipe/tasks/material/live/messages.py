@@ -107,7 +107,7 @@ class MaterialMessage(messages.Message):
 
     @property
     def probability_columns(self) -> Float32s:
-        """The probability of each material (class,), NaN where none is named."""
+        """The probability of each material (class,), or NaN if none is named."""
         unknown = np.full(len(self.names), np.nan, np.float32)
         return unknown if self.probabilities is None else self.probabilities.astype(np.float32)
 
@@ -118,7 +118,7 @@ class MaterialMessage(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """True where a material is named."""
+        """True if a material is named."""
         return self.probabilities is not None
 
     @property

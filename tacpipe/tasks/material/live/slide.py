@@ -42,7 +42,7 @@ UNLIKE = "the slide is like none of the materials that the model knows"
 def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
     """Return the params of `segment slides` that a model of materials was trained behind.
 
-    Raises `UsageError` where that stage has another version now, `TacpipeError` where the model was trained behind others.
+    Raises `UsageError` if that stage has another version now, `TacpipeError` if the model was trained behind others.
     """
     names = [step["stage"] for step in steps]
     if names != [SLIDES]:
@@ -167,7 +167,7 @@ class SlideSoFar:
 
     @property
     def ends_by_arm(self) -> bool:
-        """True where a slide ends only when the arm stops."""
+        """True if a slide ends only when the arm stops."""
         return bool(self._params.trigger != "load")
 
     def _cut(self, recording: Held, table: pa.Table) -> tuple[Any, bool]:
@@ -197,7 +197,7 @@ class Parting:
         self._moments = 0
 
     def end_ns(self, tables: Tables, until_ns: int) -> int | None:
-        """Return the moment at which the slide of this part is over, None where it is not by ``until_ns``.
+        """Return the moment at which the slide of this part is over, or None if it is not by ``until_ns``.
 
         ``tables`` are the streams of this part, of which all samples up to ``until_ns`` have come.
         """

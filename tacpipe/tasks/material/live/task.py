@@ -57,7 +57,7 @@ class MaterialLive(LiveTask):
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> MaterialEngine:
         """Return the engine of a session.
 
-        Raises `UsageError` where it is not stated which of the model's sensors the rig has, `TacpipeError` where the rig
+        Raises `UsageError` if it is not stated which of the model's sensors the rig has, `TacpipeError` if the rig
         has not the channels that the model reads, or the model was trained behind a stage that has no causal rule.
         """
         from tacpipe.tasks.material.classifier import Classifier, NetworkReader, SpectraReader
@@ -117,7 +117,7 @@ def _material_settings(settings: Settings) -> MaterialSettings:
 
 
 def _check_channels(classifier: Classifier, sensor: str, stream: str, finger: Sensor) -> None:
-    """Raise `TacpipeError` where the stream of the finger has other channels than the slides of training."""
+    """Raise `TacpipeError` if the stream of the finger has other channels than the slides of training."""
     layout = classifier.layout(sensor)
     quantities = {quantity.encode() for quantity in classifier.quantities}
     channels = tuple(field.name for field in finger.fields() if (field.metadata or {}).get(b"quantity") in quantities)

@@ -120,7 +120,7 @@ def validation_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
-    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; none where none is given."""
+    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart, or None if none is given."""
     chosen = [
         method
         for method in methods
@@ -138,12 +138,12 @@ def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def alignment_by_epoch(run: MaterialResult) -> list[float]:
-    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
+    """Return the mean squared latent difference of training pairs by epoch, or NaN if an epoch does not state it."""
     return without_gaps([epoch.get("alignment") for epoch in run.history])
 
 
 def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return accuracy over the number of training slides, a chart a sensor; none where all have as many."""
+    """Return accuracy over the number of training slides, a chart a sensor, or None if all have as many."""
     chosen = [candidate for candidate in methods if has_usual_settings(candidate.settings, "few", "subsample_sensor")]
     drawn = []
     for sensor in sensors_of(chosen):
@@ -191,7 +191,7 @@ def _add_points(points: dict[str, Points], name: str, method: Method, sensor: st
 
 
 def _validation_by_epoch(run: MaterialResult, sensor: str) -> list[float]:
-    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
+    """Return the validation accuracy on a sensor's slides by epoch, in percent, or empty if none is given."""
     accuracies = [epoch.get("val", {}).get(sensor, {}).get("accuracy") for epoch in run.history]
     return [100 * value for value in without_gaps(accuracies)]
 

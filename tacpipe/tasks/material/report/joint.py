@@ -159,7 +159,7 @@ def _swapped_accuracy(method: Method) -> dict[str, Accuracy]:
 
 
 def swap_table(methods: Sequence[Method]) -> Table | None:
-    """Return Table II: accuracy before and after classifiers are exchanged; None where none were."""
+    """Return Table II: accuracy before and after classifiers are exchanged, or None if none were."""
     candidates = [item for item in methods if has_usual_settings(item.settings) or scores.is_control(item)]
     candidates = [
         item for item in candidates if any(SWAPPED in result.predictions.predicted for result in item.details)
@@ -196,7 +196,7 @@ def swap_table(methods: Sequence[Method]) -> Table | None:
 
 
 def difference_table(methods: Sequence[Method]) -> Table | None:
-    """Return which method is ahead on the same slides, and how sure that is; None where none can be paired."""
+    """Return which method is ahead on the same slides, and how sure that is, or None if none can be paired."""
     rows: list[list[str | Cell]] = []
     for pair in scores.method_pairs(methods):
         for sensor in sensors_of([pair.first, pair.second]):
@@ -241,7 +241,7 @@ JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 
 
 def reduction_tables(methods: Sequence[Method]) -> list[Table]:
-    """Return a table a reduced sensor, in the paper's form; none where no sensor was reduced or other data are shown.
+    """Return a table a reduced sensor, in the paper's form, or None if no sensor was reduced or other data are shown.
 
     A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
@@ -327,7 +327,7 @@ class HeldOut:
 
 
 def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return how often held-out materials are named right across sensors; nothing where none were held out."""
+    """Return how often held-out materials are named right across sensors, or nothing if none were held out."""
     rows: list[list[str | Cell]] = []
     for scored in held_out_methods(methods):
         rows.append(

@@ -33,9 +33,9 @@ class SlidePredictions:
     sensors: NDArray[np.str_]  # (slide,)
     materials: Int64s  # (slide,), the truth
     predicted: Mapping[str, Int64s]  # predictor -> (slide,)
-    latents: AnyFloats | None  # (slide, latent); None where the model has none
+    latents: AnyFloats | None  # (slide, latent), or None if the model has none
     naming: Naming = NUMBERS  # names of the materials
-    sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
+    sessions: NDArray[np.str_] | None = None  # (slide,), or empty if none is named; None in results that report on none
 
     def of(self, sensor: str) -> SlidePredictions:
         """Return the rows of one sensor."""

@@ -41,7 +41,7 @@ class Accuracy:
 
 
 def accuracy(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> Accuracy | None:
-    """Return how many slides of a sensor a predictor of these runs names right; None where none states anything."""
+    """Return how many slides of a sensor a predictor of these runs names right, or None if none states anything."""
     named_right = slides_named_right(runs, sensor, predictor)
     if not len(named_right):
         return None
@@ -52,7 +52,7 @@ def accuracy(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -
 
 
 def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> float:
-    """Return 1 - errors / errors of the mean level, of runs that hold both; NaN where the mean level never errs.
+    """Return 1 - errors / errors of the mean level, of runs that hold both, or NaN if the mean level never errs.
 
     1 is perfect, 0 no better than what the time-averaged channels state.
     """
@@ -102,7 +102,7 @@ class MethodPair:
 def compare_runs(
     first: Method, second: Method, sensor: str, predictors: tuple[str, str] = (MODEL, MODEL)
 ) -> MethodDifference | None:
-    """Return what ``first`` has over ``second`` on slides of a sensor; None where they share none.
+    """Return what ``first`` has over ``second`` on slides of a sensor, or None if they share none.
 
     McNemar's test takes a slide for right where at least half of a method's runs name it right.
     """
@@ -186,7 +186,7 @@ SESSIONS = (
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these slides cannot show, next to every table of accuracies; empty where nothing is known against them."""
+    """Return what these slides cannot show, next to every table of accuracies, or empty if nothing is known against them."""
     if any(rows.simulated for rows in methods):
         return context.SIMULATED
     predictions = [result.predictions for rows in methods for result in rows.details]

@@ -83,7 +83,7 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
     """Return what calibrated runs of a method answered of a sensor's slides: a row a slide that was not seen and a run.
 
     Columns: ``run``, ``recording``, ``known`` (whether its material was learned), ``right``, ``probability``, ``score`` and
-    ``refused`` (answered unknown). None where no run is of a calibrated model.
+    ``refused`` (answered unknown). None if no run is of a calibrated model.
     """
     import pandas as pd
 

@@ -29,7 +29,7 @@ LARGEST_BYTES = 1 << 28  # limit of an NPZ file
 
 
 def requested_grasps(record: Any) -> list[Grasp]:
-    """Return the candidates of a request. Raises `TacpipeError` where one cannot be, with its number."""
+    """Return the candidates of a request. Raises `TacpipeError` if one cannot be, with its number."""
     candidates = []
     for number, grasp in enumerate(record["grasps"]):
         wrist = None if grasp.get("wrist") is None else np.array(grasp["wrist"], np.float64)
@@ -43,7 +43,7 @@ def requested_grasps(record: Any) -> list[Grasp]:
 def requested_cloud(record: Any, folder: str, before: Cloud | None) -> Cloud:
     """Return the cloud of a request: its points, those of a file within ``folder``, or of the request before.
 
-    Raises `TacpipeError` where there is none, or it cannot be read.
+    Raises `TacpipeError` if there is none, or it cannot be read.
     """
     points_or_file = record.get("cloud")
     if points_or_file is None:
@@ -160,7 +160,7 @@ class TouchEngine(Engine):
     """One live session of a model of touch."""
 
     def __init__(self, sensors: Mapping[str, Sensor], predictor: Predictor, criterion: Criterion) -> None:
-        """Take the rig's sensors. Raises `TacpipeError` where none gives requests, or the model predicts too little."""
+        """Take the rig's sensors. Raises `TacpipeError` if none gives requests, or the model predicts too little."""
         super().__init__(sensors)
         self.requests = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, GraspRequests)}
         if not self.requests:

@@ -96,7 +96,7 @@ class TouchMessage(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """True where candidates are ranked."""
+        """True if candidates are ranked."""
         return self.touch is not None
 
     @property

@@ -39,7 +39,7 @@ MOST_GRASPS = 800  # grasps of a figure
 
 
 def pressure_folds(method: Method) -> list[Fold]:
-    """Return a chart a finger, of the first run; nothing where the method predicts no pressure."""
+    """Return a chart a finger, of the first run, or nothing if the method predicts no pressure."""
     rows = method.details[0].predictions
     drawn = [_pressure_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)]
     return fold("The pressure, predicted and true", Charts(drawn), about=method.name) if drawn else []
@@ -94,7 +94,7 @@ class DrawnGrasp:
 
 
 def electrode_folds(method: Method) -> list[Fold]:
-    """Return the electrodes' R² and some grasps; nothing where the method predicts no electrodes."""
+    """Return the electrodes' R² and some grasps, or nothing if the method predicts no electrodes."""
     fingers = [target for target in FINGERS if target in predicted_targets(method)]
     if not fingers:
         return []
@@ -133,7 +133,7 @@ def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
 
 
 def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
-    """Return the R² of each electrode on known or on novel objects; None where there are none."""
+    """Return the R² of each electrode on known or on novel objects, or None if there are none."""
     rows: list[dict[str, object]] = []
     for target in fingers:
         scores_by_electrode = predictions.r2_by_electrode(paper.predictions_of_runs(method), target, known_objects)
@@ -271,7 +271,7 @@ def loss_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def figure_8(methods: Sequence[Method]) -> list[Chart]:
-    """Return Figure 8 in the paper's form: both losses of its network, of most epochs; none where it was not run."""
+    """Return Figure 8 in the paper's form: both losses of its network, of most epochs, or None if it was not run."""
     candidates = [
         (method, target)
         for method in methods
@@ -298,7 +298,7 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
 
 
 def losses_by_epoch(result: TouchResult, target: str, name: str) -> list[float]:
-    """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
+    """Return a loss of the network of one target by epoch, or the mean of several networks, or empty if none states it.
 
     The mean ends where the first network does. NaN stands where an epoch does not state the loss.
     """

@@ -54,7 +54,7 @@ class TouchResult(context.ReportResult):
 
     @property
     def split(self) -> str:
-        """How grasps were parted into those of training and others, in words; empty where nobody stated."""
+        """How grasps were parted into those of training and others, in words, or empty if nobody stated."""
         return str(self.config.get("split", ""))
 
     @property
@@ -205,7 +205,7 @@ IN_A_ROW = 0.75  # fraction of successive grasps: from here on, objects were not
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
+    """Return what these grasps cannot show, next to every table of errors, or empty if nothing is known against them."""
     if methods and all(method.simulated for method in methods):
         return context.SIMULATED
     counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]

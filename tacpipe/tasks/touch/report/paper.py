@@ -87,7 +87,7 @@ ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # rows of
 
 
 def tables_by_object(methods: Sequence[Method]) -> list[Table]:
-    """Return errors and skill by object of one method an architecture; none where no object was evaluated."""
+    """Return errors and skill by object of one method an architecture, or None if no object was evaluated."""
     return [object_table for method in one_per_architecture(methods) if (object_table := _table_by_object(method))]
 
 
@@ -239,7 +239,7 @@ ESTIMATED = (
 
 
 def setting_tables(methods: Sequence[Method]) -> list[Block]:
-    """Return the tables of which at least two rows were run; none where there is none."""
+    """Return the tables of which at least two rows were run, or None if there is none."""
     described = [block for form in FORMS for block in _setting_table(form, methods)]
     published = all(block.published for block in methods)
     return [*described, *([SmallPrint(SCALES)] if published and described else [])]

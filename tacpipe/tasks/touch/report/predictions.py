@@ -128,7 +128,7 @@ class _TargetRows(NamedTuple):
 
     true: AnyFloats  # (grasp, value), normalised
     predicted: AnyFloats  # (grasp, value)
-    constant: AnyFloats  # (grasp, value), NaN where the result holds none
+    constant: AnyFloats  # (grasp, value), or NaN if the result holds none
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
 
@@ -160,7 +160,7 @@ def score(
 
 
 def r2_by_electrode(runs: Sequence[GraspPredictions], target: str, known_objects: bool | None) -> AnyFloats | None:
-    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
+    """Return the R² of each electrode, (value,), pooled over runs, or None if nothing is stated of the target."""
     parts = _rows(runs, target, known_objects, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 

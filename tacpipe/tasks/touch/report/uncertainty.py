@@ -127,7 +127,7 @@ def _split_of(method: Method) -> tuple[str, bool]:
 
 
 def _read_coverage(method: Method) -> pd.DataFrame | None:
-    """Return a row a value, predictor, grasp and run of a method; None where none of its runs is of a calibrated model."""
+    """Return a row a value, predictor, grasp and run of a method, or None if none of its runs is of a calibrated model."""
     import pandas as pd
 
     files = [result.dataset.files[COVERAGE] for result in method.details if COVERAGE in result.dataset.files]
