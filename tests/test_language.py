@@ -50,8 +50,8 @@ BE_NO = re.compile(r"\w+ no", re.IGNORECASE)  # checked only in text for users
 
 def find_unused_words(text: str) -> list[str]:
     """Return each word that is not used, with its context; code is left out."""
-    prose = re.sub(r"`[^`\n]*`|^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
-    spots = [" ".join(prose[max(0, match.start() - 30) : match.end() + 20].split()) for match in WORDS.finditer(prose)]
+    prose = " ".join(re.sub(r"`[^`\n]*`|^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE).split())
+    spots = [prose[max(0, match.start() - 30) : match.end() + 20].strip() for match in WORDS.finditer(prose)]
     return [spot for spot in spots if not any(words in spot for words in EXCEPTIONS)]
 
 
