@@ -1,8 +1,8 @@
-"""Compress tactile channels to a few latents, fitted on the training recordings alone.
+"""Compress tactile channels to a few latents.
 
-The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Channels are those whose field
-metadata states ``quantity=tactile``; their rest level is taken off before. ``codec.json`` and ``codec.safetensors`` hold
-what is needed to go back to counts, and how much is lost on the way.
+They are fitted on the training recordings only, and added as columns ``z00``, ``z01``, …; all other columns and rows
+stay. Channels are those whose field metadata states ``quantity=tactile``; their rest level is taken off before.
+``codec.json`` and ``codec.safetensors`` hold what is needed to go back to counts, and how much is lost on the way.
 """
 
 from __future__ import annotations

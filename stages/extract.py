@@ -1,4 +1,9 @@
-"""Compute tactile channels from the frames of cameras behind a gel. Rows do not look ahead, and memory does not grow."""
+"""Compute tactile channels from the frames of cameras.
+
+The camera looks at a gel. Rows do not look ahead, and memory does not grow with a recording.
+
+Example: tacpipe extract markers data/recordings -o data/markers
+"""
 
 from __future__ import annotations
 

@@ -314,7 +314,7 @@ def test_a_recording_that_lost_a_stream_is_one_object_with_the_error_in_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("rig.toml").write_text('[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n')
-    monkeypatch.setattr("tacpipe.cli.acquire._record", lambda *arguments, **options: ([], ["f was lost."]))
+    monkeypatch.setattr("tacpipe_stages.acquire.record", lambda *arguments, **options: ([], ["f was lost."]))
     failed = lab.call("acquire rig.toml -o rec --json")
     value = json.loads(failed.out)
     assert failed.code == value["exit_code"] == 5 and value["error"].endswith("f was lost.")

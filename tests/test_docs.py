@@ -133,9 +133,8 @@ def test_every_stage_has_a_summary_that_is_a_sentence(name: str) -> None:
 
 
 def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> None:
-    texts = {**registry.commands(), **commands.SUMMARIES}
+    texts = {**registry.commands(), **{name: commands.summary(name) for name in commands.NAMES}}
 
-    assert set(commands.NAMES) <= set(commands.SUMMARIES)
     assert {name.partition(".")[0] for name in BUILT_IN if "." in name} <= set(texts)
     assert not [name for name, text in texts.items() if not re.fullmatch(r"[A-Z].+\.", text)]
 

@@ -13,12 +13,12 @@ import typer
 
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
+from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, listed, plain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
-    "acquire": "Record every stream of a rig.",
     "live": "Forecast while a rig is recorded, with alarms.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
@@ -133,7 +133,6 @@ def _compare(program: typer.Typer) -> None:
         as_json: AsJson = False,
     ) -> None:
         from tacpipe.cli import compare as comparing
-        from tacpipe.io import terminal
 
         if as_csv and as_json:
             raise UsageError("--csv and --json exclude each other. Give one of them.")
@@ -234,7 +233,7 @@ def _run(program: typer.Typer) -> None:
 def _acquire(program: typer.Typer) -> None:
     from tacpipe.cli import acquire
 
-    acquire.add(program, SUMMARIES["acquire"])
+    acquire.add(program)
 
 
 def _live(program: typer.Typer) -> None:
@@ -279,6 +278,12 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "demo": _demo,
     "version": _version,
 }
+
+
+def summary(name: str) -> str:
+    """Return the line of a command in the list of all: of `SUMMARIES`, or of the module that is named after it."""
+    return SUMMARIES.get(name) or registry.group_help(name).partition("\n")[0]
+
 
 SHOWN = 20  # Largest number of recordings whose changes are printed
 

@@ -128,7 +128,6 @@ def _run(
     as_json: bool,
 ) -> None:
     """Run a session and print what it did."""
-    from tacpipe.cli import acquire
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
@@ -140,8 +139,8 @@ def _run(
     store = location.locate(*([] if output is None else [output]))
     plan: trials_of.RecordingPlan | None = None
     if output is not None:
-        attributes = {**acquire.attributes(labels, None), **prepared.attributes}
-        plan = trials.RecordingPlan(output, acquire.checked_name(name), duration_s, attributes=attributes)
+        attributes = {**trials.attributes(labels, None), **prepared.attributes}
+        plan = trials.RecordingPlan(output, trials.recording_name(name), duration_s, attributes=attributes)
         store.prepare()
         directory.check_output(store, output)
         appending.refuse_taken(output, plan.names)

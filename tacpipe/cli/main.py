@@ -203,4 +203,4 @@ def _add_summaries(program: typer.Typer) -> None:
 
     lines = registry.commands()
     for name in (*lines, *commands.NAMES):
-        program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(stages.nothing)
+        program.command(name, help=lines.get(name) or commands.summary(name))(stages.nothing)

@@ -241,12 +241,14 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def summary(name: str, stage: AnyStage) -> str:
-    """Return the docstring of a stage: that of its module where the command is the stage alone, else of its function.
+    """Return the docstring of a stage: that of its module where that is named after the stage, else of its function.
 
     Its last paragraph is an example; one is made of the stage's arguments where it has none.
     """
-    function_text, module_text = stage.function.__doc__, sys.modules[stage.function.__module__].__doc__
-    text = inspect.cleandoc((function_text or module_text if "." in name else module_text or function_text) or "")
+    module = stage.function.__module__
+    texts = (sys.modules[module].__doc__, stage.function.__doc__)
+    first, second = texts if registry.is_named_after(module, name) else reversed(texts)
+    text = inspect.cleandoc(first or second or "")
     return text if EXAMPLE in text else f"{text}\n\n{EXAMPLE}{example(name, stage)}"
 
 

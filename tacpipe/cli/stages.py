@@ -49,7 +49,8 @@ def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> Non
     if names == [group]:
         add(program, group, group)
         return
-    methods = typer.Typer(help=registry.commands()[group], no_args_is_help=True, rich_markup_mode=None)
+    group_help = registry.group_help(group) or registry.commands()[group]
+    methods = typer.Typer(help=group_help, no_args_is_help=True, rich_markup_mode=None)
     by_method = {name.partition(".")[2]: name for name in names}
     requested = [method for method in by_method if method in arguments]
     for method in requested:  # A broken method does not affect the other methods.

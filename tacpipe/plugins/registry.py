@@ -7,6 +7,7 @@ import contextlib
 import functools
 import importlib
 import importlib.util
+import inspect
 import operator
 import sys
 from collections.abc import Iterator, Sequence
@@ -207,7 +208,8 @@ def commands() -> dict[str, str]:
     """Return the summary of each command that is a stage or a group of stages, in the order of help.
 
     A plug-in's entry point in the group ``tacpipe.commands`` is a dict of names in their order, each with the line of a
-    group, or "" where the stage has its own. tacpipe's own come first, names that are in none last, in alphabetical order.
+    group, or "" where the stage, or the module of the group, has its own. tacpipe's own come first, names that are in none
+    last, in alphabetical order.
     """
     first: dict[str, str] = {}
     for name in reversed(stages()):
@@ -217,7 +219,43 @@ def commands() -> dict[str, str]:
         with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils its own order alone
             lines = {**lines, **_import(name, target)}
     names = [*(name for name in lines if name in first), *sorted(set(first) - set(lines))]
-    return {name: lines.get(name) or summary(first[name]) for name in names}
+    return {name: lines.get(name) or _own_summary(name) or summary(first[name]) for name in names}
+
+
+def _own_summary(command: str) -> str:
+    """Return the summary of a stage, or of a group that has a module; empty for another group."""
+    return summary(command) if command in stages() else group_help(command).partition("\n")[0]
+
+
+def own_module(command: str) -> str:
+    """Return the name of the module of tacpipe's own stages that is named after a command."""
+    return f"{entry_points()[COMMANDS][OWN].partition(':')[0]}.{command}"
+
+
+def load_command(name: str) -> Any:
+    """Return the module of tacpipe's own stages that holds a command which is no stage."""
+    return _import(name, own_module(name))
+
+
+def group_help(group: str) -> str:
+    """Return the docstring of the module that is named after a group of stages or another command; empty without one."""
+    try:
+        return docstring(source(own_module(group)).read_text(encoding="utf-8"))
+    except (OSError, SyntaxError, ValueError, ImportError):
+        return ""
+
+
+def docstring(code: str) -> str:
+    """Return the docstring of a module's code, which is parsed only where it is unusual.
+
+    >>> docstring("'Split recordings.'")
+    'Split recordings.'
+    """
+    quotes = '"""'
+    text, end, _ = code.removeprefix(quotes).partition(quotes)
+    if code.startswith(quotes) and end and "\\" not in text:
+        return inspect.cleandoc(text)
+    return ast.get_docstring(ast.parse(code)) or ""
 
 
 def stage_name(name: str) -> str:
@@ -401,12 +439,23 @@ def summary(name: str) -> str:
     """Return the first line of the docstring of a stage's function, or of its module; never imports, never raises."""
     module, _, attribute = stages()[name].partition(":")
     try:
-        tree = ast.parse(source(module).read_text(encoding="utf-8"))
-        function = _definition(tree, attribute.split(".")) if "." in name else None
+        code = source(module).read_text(encoding="utf-8")
+        function = None if is_named_after(module, name) else _definition(ast.parse(code), attribute.split("."))
         text = function and ast.get_docstring(function)
-        return (text or ast.get_docstring(tree) or "").split("\n")[0]
+        return (text or docstring(code)).split("\n")[0]
     except (OSError, SyntaxError, ValueError, ImportError):
         return "(its module cannot be read)"
+
+
+def is_named_after(module: str, stage_name: str) -> bool:
+    """Return whether the docstring of a module is the help of a stage: that of a command, or of one in a group.
+
+    >>> is_named_after("tacpipe_stages.segment_slips", "segment.slips"), is_named_after("lab.stages", "scale")
+    (True, True)
+    >>> is_named_after("tacpipe_stages.compress", "compress.pca")
+    False
+    """
+    return "." not in stage_name or module.rpartition(".")[2] == stage_name.replace(".", "_")
 
 
 def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | None:

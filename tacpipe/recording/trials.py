@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import signal
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tacpipe.datasets.paths import NAME_BYTES
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import termination
 from tacpipe.io.termination import EndRequest
 from tacpipe.plugins.stage import Attribute
@@ -22,6 +24,8 @@ from tacpipe.recording.spool import ENDED, Spool, Spooled, StreamNote
 from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, users
 from tacpipe.recording.watch import RigView
 from tacpipe.store.store import Store
+
+NAME = re.compile(r"[\w-][\w.-]*")
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,22 @@ class RecordingPlan:
     def names(self) -> list[str]:
         """The names of the recordings: the given name, with a trial number if there are several."""
         return [self.name] if self.trials == 1 else [f"{self.name}-{trial + 1:03d}" for trial in range(self.trials)]
+
+
+def recording_name(name: str | None) -> str:
+    """Return the name of a recording, by default the current time. Raises `UsageError` for an invalid file name."""
+    name = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    if not NAME.fullmatch(name) or not spool_folders.is_name(name):
+        raise UsageError(f"--name {name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
+    return name
+
+
+def attributes(labels: Sequence[str], note: str | None) -> dict[str, Attribute]:
+    """Return labels and a note as attributes of a recording. Raises `UsageError` for malformed labels."""
+    from tacpipe.datasets import labels as labels_of
+
+    parsed = labels_of.parse(labels, None, include=False) if labels else {}
+    return {**parsed, **({"note": note} if note else {})}
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,13 @@ import pyxdf
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import xdf_streams
-from tacpipe.formats.container_commands import XDF, xdf
-from tacpipe.formats.table.contained import Params
+from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.xdf_writer import Writer
 
+XDF = ContainerCommand("xdf")
+xdf = registry.load("ingest.xdf")
 RNG = np.random.default_rng(8)
 SAMPLE_DATA = os.environ.get("TACPIPE_SAMPLE_DATA")
 
@@ -36,7 +38,8 @@ def _quiet() -> None:
 def read(path: Path, layout: str = "") -> RecordingOutput:
     params = Params(json.dumps(tomllib.loads(layout)) if layout else "")
     (source,) = XDF.discover(params, path.parent).values()
-    return xdf(params, source.files, source.values)
+    recording: RecordingOutput = xdf(params, source.files, source.values)
+    return recording
 
 
 def theirs(path: Path, **options: Any) -> dict[str, Mapping[str, Any]]:

@@ -137,7 +137,7 @@ def test_json_tells_what_was_recorded(lab: Lab, rig: Emulator) -> None:
 def test_a_dry_run_opens_every_stream_and_writes_nothing(
     lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.cli.acquire.DRY_RUN_S", 0.2)
+    monkeypatch.setattr("tacpipe_stages.acquire.DRY_RUN_S", 0.2)
     before = sorted(lab.folder.rglob("*"))
     report = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
 

@@ -13,14 +13,16 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import container
-from tacpipe.formats.container_commands import HDF5, hdf5
 from tacpipe.formats.table import layout, reading
-from tacpipe.formats.table.contained import Params
+from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.arrays import files
 
 NONE = Params()
+HDF5 = ContainerCommand("hdf5")
+hdf5 = registry.load("ingest.hdf5")
 
 
 def layout_params(text: str) -> Params:

@@ -15,26 +15,29 @@ from zarr import open_group
 
 import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import container_commands
 from tacpipe.formats.arrays import container
-from tacpipe.formats.container_commands import ZARR, ZarrParams
+from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import Lab
 from tests.conftest import tacpipe as in_a_process
 from tests.formats.arrays import files
 
 LAYOUT = '[streams.hand]\nsource = "data"\ntime = { rate_hz = 60 }'
+ZARR = ContainerCommand("zarr")
+zarr = registry.load("ingest.zarr")
 INGEST = "ingest zarr stores --layout layout.toml -o data/rec"
 
 
-def layout_params(text: str = LAYOUT, *, fill: bool = False) -> ZarrParams:
-    return ZarrParams(json.dumps(tomllib.loads(text)), fill_missing_chunks=fill)
+def layout_params(text: str = LAYOUT, *, fill: bool = False) -> Params:
+    params: Params = zarr.params(json.dumps(tomllib.loads(text)), fill_missing_chunks=fill)
+    return params
 
 
-def read(folder: Path, params: ZarrParams | None = None) -> dict[str, RecordingOutput]:
+def read(folder: Path, params: Params | None = None) -> dict[str, RecordingOutput]:
     params = params or layout_params()
     sources = ZARR.discover(params, folder)
-    return {name: container_commands.zarr(params, value.files, value.values) for name, value in sources.items()}
+    return {name: zarr(params, value.files, value.values) for name, value in sources.items()}
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
@@ -83,14 +86,11 @@ def test_a_lost_chunk_is_not_read_as_zeros(tmp_path: Path) -> None:
     (tmp_path / "replay.zarr" / "data" / "robot0_eef_pos" / "3.0").unlink()
     sources = ZARR.discover(layout_params(), tmp_path)
     first, last = sources["replay-episode_000000"], sources["replay-episode_000002"]
-    assert container_commands.zarr(layout_params(), first.files, first.values).streams["hand"].num_rows == 30
+    assert zarr(layout_params(), first.files, first.values).streams["hand"].num_rows == 30
     with pytest.raises(TacpipeError, match=r"replay\.zarr lacks data/robot0_eef_pos/3\.0.*--fill-missing-chunks"):
-        container_commands.zarr(layout_params(), last.files, last.values)
+        zarr(layout_params(), last.files, last.values)
     filled = (
-        container_commands.zarr(layout_params(fill=True), last.files, last.values)
-        .streams["hand"]
-        .column("robot0_eef_pos_x")
-        .to_pylist()
+        zarr(layout_params(fill=True), last.files, last.values).streams["hand"].column("robot0_eef_pos_x").to_pylist()
     )
     assert filled[15:] == [0.0] * 20 and 0.0 not in filled[:15]
 

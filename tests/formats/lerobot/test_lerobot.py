@@ -16,9 +16,9 @@ import pytest
 import tacpipe
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.container_commands import LEROBOT, lerobot
-from tacpipe.formats.table.contained import Params
+from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.video import decoding, stream
 from tests.conftest import Lab
@@ -26,6 +26,8 @@ from tests.formats.lerobot import files
 from tests.video import videos
 
 NONE = Params()
+LEROBOT = ContainerCommand("lerobot")
+lerobot = registry.load("ingest.lerobot")
 EPISODE = "pick-episode_00000{}"
 
 

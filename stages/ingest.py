@@ -1,13 +1,27 @@
-"""The stages that ingest containers: bags, MCAP, HDF5, Zarr, XDF and LeRobot datasets. Imports nothing heavy."""
+"""Read recordings of files into a dataset.
+
+One command per format. Files of a robot or a lab (bags, MCAP, HDF5, Zarr, LeRobot, XDF) state their streams, and a layout
+file adds what they leave out; ``table`` reads a lab's own tables, which a layout file describes. The other commands read
+published data sets. ``--guess`` prints a first layout, ``--dry-run`` describes what would be read.
+
+Example: tacpipe ingest mcap FOLDER -o data/recordings
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from tacpipe.errors import UsageError
 from tacpipe.formats.table import contained
+from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table.contained import ContainerCommand, Params
-from tacpipe.plugins.stage import Files, RecordingOutput, Values, stage
+from tacpipe.plugins.constraints import TomlFile
+from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), ContainerCommand("hdf5")
 XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
@@ -77,7 +91,7 @@ def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
 
 
 @dataclass(frozen=True)
-class ZarrParams(contained.Params):
+class ZarrParams(Params):
     """Settings that Zarr stores do not declare."""
 
     fill_missing_chunks: bool = False  # read chunks that are not there as fill values, which zarr 3 does not write
@@ -104,3 +118,60 @@ def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
 
     with allow_missing_chunks(filled=params.fill_missing_chunks):
         return ZARR.read(params, files, values)
+
+
+@dataclass(frozen=True)
+class TableParams(StreamSelection):
+    """How the tables are laid out."""
+
+    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/reference/layout.md describes its entries
+
+    def check(self) -> None:
+        """Raise `UsageError` for a layout that is missing or wrong, before any file is looked for."""
+        self.parsed()
+
+    def parsed(self) -> layouts.Layout:
+        """Return the layout."""
+        if not self.layout:
+            raise UsageError("--layout must be given: the file that describes the tables. --guess prints a first one.")
+        return layouts.layout_from_tables(json.loads(self.layout), "The layout")
+
+
+def discover_table(params: TableParams, source: Path) -> dict[str, Source]:
+    """Return the files and labels of each recording below ``source``."""
+    from tacpipe.formats.table import recordings
+
+    layout = params.parsed()
+    return contained.discover_sources(layout, source, recordings.find_recordings(layout, source))
+
+
+def preview_table(params: TableParams, source: Path) -> str:
+    """Return what would be read, in words."""
+    from tacpipe.formats.table import recordings
+
+    layout = params.parsed()
+    return contained.preview_text(layout, source, recordings.find_recordings(layout, source))
+
+
+def guess_table(source: Path) -> str:
+    """Return the text of a first layout."""
+    from tacpipe.formats.table import guess
+
+    return guess.guess_layout(source)
+
+
+def why_unread_table(params: TableParams, source: Path) -> Callable[[str], str]:
+    """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
+    return contained.why_unread(params.parsed(), source)
+
+
+@stage(version=1, discover=discover_table, preview=preview_table, guess=guess_table, why_unread=why_unread_table)
+def table(params: TableParams, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
+    """Read a lab's own tables (CSV, Excel, Parquet, NumPy).
+
+    A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
+    come from. Start with ``--guess``, replace each "?" in what it prints, look at the result with ``--dry-run``.
+
+    Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
+    """
+    return contained.read_recording(params.parsed(), None, files, values, shared)

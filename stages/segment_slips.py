@@ -1,4 +1,13 @@
-"""Mark slips and drops of a held object, by its distance from the wrist. All rows stay."""
+"""Mark slips and drops of a held object.
+
+They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
+recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
+contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
+Outside of contacts, after a drop and where there is no reading nothing slips. Rows need one rate, as of
+``synchronize --rate-hz 50``.
+
+Example: tacpipe segment slips data/even-contacts -o data/slips
+"""
 
 from __future__ import annotations
 
@@ -62,16 +71,7 @@ class Params(StreamSelection):
 
 @stage(version=2)
 def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchReader:
-    """Mark slips and drops of a held object.
-
-    They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
-    recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
-    contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
-    Outside of contacts, after a drop and where there is no reading nothing slips. Rows need one rate, as of
-    ``synchronize --rate-hz 50``.
-
-    Example: tacpipe segment slips data/even-contacts -o data/slips
-    """
+    """Return the recording with the labels of slips and drops."""
     import numpy as np
     import pyarrow as pa
 

@@ -1,4 +1,12 @@
-"""Reduce grasps to the points of the object and one tactile reading: what models of the task ``touch`` are trained on."""
+"""Cut out the grasped object and the tactile reading.
+
+Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
+of each channel after contact, stamped where it begins; ``contact_ns`` is the time when both fingers first touched. Other
+streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
+already stays as it is; a planned one has no ``biotac_sp``, and gets no ``reading``.
+
+Example: tacpipe segment grasps data/pinched -o data/grasps
+"""
 
 from __future__ import annotations
 
@@ -52,15 +60,7 @@ class Params(StreamSelection):
 
 @stage(version=2)
 def grasps(params: Params, recording: Recording) -> RecordingOutput:
-    """Cut out the grasped object and the tactile reading.
-
-    Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
-    of each channel after contact, stamped where it begins; ``contact_ns`` is the time when both fingers first touched. Other
-    streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
-    already stays as it is; a planned one has no ``biotac_sp``, and gets no ``reading``.
-
-    Example: tacpipe segment grasps data/pinched -o data/grasps
-    """
+    """Return the object and the reading of a grasp."""
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
     from tacpipe.clouds.segmentation import SegmentationLimits, object_rows

@@ -1,4 +1,16 @@
-"""Cut out the slide of each recording: of it the frames remain that are alike in all recordings."""
+"""Cut out the slide of each recording.
+
+All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
+
+The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
+changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
+``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
+then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
+positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
+
+Example: tacpipe segment slides data/touched -o data/slides
+"""
 
 from __future__ import annotations
 
@@ -94,19 +106,7 @@ class Params(StreamSelection):
 
 @stage(version=1)
 def slides(params: Params, recording: Recording) -> RecordingOutput:
-    """Cut out the slide of each recording.
-
-    All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
-
-    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
-    changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
-    ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
-    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
-    then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
-    positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
-
-    Example: tacpipe segment slides data/touched -o data/slides
-    """
+    """Return the slide of a recording, with its measures as attributes."""
     from tacpipe.channels import arm
     from tacpipe.channels.streams import finger, without_spikes
     from tacpipe.datasets.overview import streams_of

@@ -1,4 +1,15 @@
-"""Mark contacts in synchronized recordings: which rows a model is trained on. All rows stay."""
+"""Mark contacts in synchronized recordings.
+
+Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
+tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
+median of the first seconds (``rest``), whatever ``tare`` is. A stream in counts has the thresholds of ``on_count``
+and ``off_count``, unless ``thresholds`` is noise. One in any other unit has those of ``on_level`` and ``off_level``
+or of its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
+``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without a
+contact has a note.
+
+Example: tacpipe segment contacts data/synced -o data/segments
+"""
 
 from __future__ import annotations
 
@@ -68,18 +79,7 @@ class Params(StreamSelection):
 
 @stage(version=2)
 def contacts(params: Params, recording: Recording) -> RecordingOutput:
-    """Mark contacts in synchronized recordings.
-
-    Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
-    tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
-    median of the first seconds (``rest``), whatever ``tare`` is. A stream in counts has the thresholds of ``on_count``
-    and ``off_count``, unless ``thresholds`` is noise. One in any other unit has those of ``on_level`` and ``off_level``
-    or of its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
-    ``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without a
-    contact has a note.
-
-    Example: tacpipe segment contacts data/synced -o data/segments
-    """
+    """Return the recording with the number of the contact in each row."""
     import numpy as np
     import pyarrow as pa
 

@@ -1,0 +1,93 @@
+"""Record every stream of a rig.
+
+A rig file names the streams. Each recording is appended to the dataset of ``-o``: ``--trials`` of them, which a key, a
+contact or a tap may start and stop. The bytes of the devices are on disk at once; recordings that a crash cut off are
+completed by the next ``acquire``, or with ``--recover``.
+
+Example: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacpipe.errors import UsageError
+from tacpipe.io import terminal
+
+if TYPE_CHECKING:
+    from tacpipe.recording.rig import Rig
+    from tacpipe.recording.trials import Recorded, RecordingPlan
+    from tacpipe.recording.watch import Figures
+    from tacpipe.store.store import Store
+
+DRY_RUN_S = 3.0
+
+
+def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
+    """Record the trials of a plan and return the recordings, and a sentence for each stream that was lost."""
+    from tacpipe.datasets import directory
+    from tacpipe.io.termination import EndRequest
+    from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording.recorder import Recorder, complete_rig
+    from tacpipe.recording.watch import RigView
+
+    for value, option, choices in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
+        if value not in choices:
+            raise UsageError(f"There is no {option} {value}; it must be one of {', '.join(choices)}.")
+    if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
+        raise UsageError("--trials and --duration-s must be above 0.")
+    if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
+        raise UsageError("--trials needs --duration-s or --stop, or the first trial never ends.")
+    store.prepare()
+    directory.check_output(store, plan.output)
+    appending.refuse_taken(plan.output, plan.names)
+    recorder = Recorder(complete_rig(rig))
+    with EndRequest() as is_over, recorder.open(), RigView(recorder.watches, quiet=quiet).open() as view:
+        recorder.await_first(is_over)
+        recorded, lost = trials.run(recorder, store, plan, view, is_over)
+    for recording in recorded if not quiet else ():
+        terminal.note(recording.line())
+    return recorded, lost
+
+
+def recover(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
+    """Seal the spools that earlier processes of this user left; return the recordings and the number not sealed."""
+    from tacpipe.recording import trials
+
+    sealed: list[Recorded] = []
+    unsealed_count = 0
+    for recovered in trials.recover_spools(store, output):
+        if isinstance(recovered, trials.Unsealed):
+            terminal.note(f"tacpipe: {recovered.line()}")
+            unsealed_count += 1
+            continue
+        sealed.append(recovered)
+        if not quiet:
+            terminal.note(f"recovered {recovered.line()}")
+    return sealed, unsealed_count
+
+
+def report_spools_of_others(store: Store) -> None:
+    """Print the owners of the spools that other users left in a shared store."""
+    from tacpipe.recording import trials
+
+    for folder, owner in trials.spools_of_others(store).items():
+        terminal.note(f"The spool {folder} belongs to {owner}, who alone can seal it.")
+
+
+def measure(rig: Rig) -> dict[str, Figures]:
+    """Open every stream for `DRY_RUN_S` and return its figures by name; nothing is recorded.
+
+    Raises `DeviceError` for streams that do not open or send nothing.
+    """
+    from tacpipe.io.termination import EndRequest
+    from tacpipe.recording import clock
+    from tacpipe.recording.recorder import Recorder
+
+    recorder = Recorder(rig)
+    with EndRequest() as is_over, recorder.open():
+        recorder.await_first(is_over)
+        until_s = clock.now_s() + DRY_RUN_S
+        recorder.run(lambda: is_over() or clock.now_s() > until_s)
+        return {name: watch.figures(clock.now_ns()) for name, watch in recorder.watches.items()}
