@@ -18,7 +18,7 @@ from scipy.stats import t as student
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.metrics import intervals, pairing
-from tacpipe.metrics.headline import FEWEST
+from tacpipe.metrics.headline import MIN_CLUSTERS
 from tacpipe.metrics.intervals import wilson
 from tacpipe.metrics.pairing import Measure
 from tacpipe.tasks.forward import headline as forward
@@ -57,7 +57,7 @@ class Coverage:
     """How often intervals hold the truth."""
 
     case: Case
-    verdicts: float  # share of repetitions with `FEWEST` effective clusters or more, which have a verdict
+    verdicts: float  # share of repetitions with `MIN_CLUSTERS` effective clusters or more, which have a verdict
     coverage: float  # share of these whose interval holds the truth; NaN without any
     percentile: float  # the same of all repetitions by the percentile bootstrap over recordings, seeds drawn too
     studentized: float  # the same by the studentized bootstrap of the influence of clusters
@@ -131,7 +131,7 @@ def simulate(case: Case, repeats: int = REPEATS) -> Coverage:
         pair = pairing.pair(measure, model, still, clusters)
         assert pair is not None
         gain = pairing.gain(measure, [pair])
-        enough[repeat] = min(gain.clusters, round(gain.effective, 6)) >= FEWEST
+        enough[repeat] = min(gain.clusters, round(gain.effective, 6)) >= MIN_CLUSTERS
         ends = (gain.low, gain.high), percentile(measure, model, still), studentized(pair)
         holds[repeat] = [low <= truth <= high for low, high in ends]
     coverage = float(holds[enough, 0].mean()) if enough.any() else float("nan")
@@ -199,7 +199,7 @@ def rates(materials: int, slides: int = 16, repeats: int = REPEATS) -> tuple[flo
         found = intervals.share_interval(accepted[:, None].astype(float), whole).first
         holds[repeat] = low <= truth <= high, found.low <= truth <= found.high
     over_slides, over_materials = holds.mean(axis=0)
-    return float(over_slides), float(over_materials) if materials >= FEWEST else float("nan")
+    return float(over_slides), float(over_materials) if materials >= MIN_CLUSTERS else float("nan")
 
 
 def lines(repeats: int = REPEATS) -> Iterator[str]:

@@ -6,7 +6,7 @@ import re
 
 from tacpipe import printable
 
-LONGEST_WORD = 250  # letters: no path or name that a person gave is longer
+MAX_WORD_LENGTH = 250  # letters: no path or name that a person gave is longer
 DONE, FAILED, USAGE, WOULD_CHANGE, DAMAGED, DEVICE, LOCKED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
 
@@ -18,8 +18,8 @@ class TacpipeError(Exception):
     def __str__(self) -> str:
         """Return the sentence; untrusted text in it is cut to a line, and its control characters are escaped."""
         text = super().__str__()
-        if len(text) > LONGEST_WORD:
-            text = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
+        if len(text) > MAX_WORD_LENGTH:
+            text = re.sub(rf"\S{{{MAX_WORD_LENGTH},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
         return printable.lines(text.split("\n"))
 
 

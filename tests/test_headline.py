@@ -63,7 +63,7 @@ def test_few_recordings_give_no_verdict_whatever_their_interval(clusters: int) -
     few_recordings = headline_with(clusters=clusters)
     assert few_recordings.verdict == ""
     assert "too few for a verdict" in headline.sentence(few_recordings)
-    assert headline_with(clusters=headline.FEWEST).verdict == "better"
+    assert headline_with(clusters=headline.MIN_CLUSTERS).verdict == "better"
 
 
 def test_without_a_baseline_nothing_is_claimed() -> None:

@@ -17,7 +17,7 @@ LITTLE = {  # Ten recordings have more than these bytes, which may stay in memor
     "tacpipe.tasks.forward.training.CALIBRATED": 256,  # windows: of a hundred recordings there are more than of ten
     "tacpipe.tasks.forward.training.LINEAR": 256,
     "tacpipe.io.spill.SEGMENT_BYTES": 1 << 22,
-    "tacpipe.io.spill.MOST_READ": 1 << 22,
+    "tacpipe.io.spill.MAX_READ_BYTES": 1 << 22,
 }
 STAGES = {  # The stages run in this order.
     "synchronize": "synchronize rec --jobs 1 -o synced",

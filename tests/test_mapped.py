@@ -54,7 +54,7 @@ def test_what_was_read_takes_no_memory_once_it_is_let_go_of() -> None:
     before = resident_bytes()
     array[:] = 1.0
     assert resident_bytes() > before + size // 2
-    mapped_arrays.read(spill.MOST_READ + 1)
+    mapped_arrays.read(spill.MAX_READ_BYTES + 1)
     assert resident_bytes() < before + size // 8
     assert array.sum() == len(array)
 

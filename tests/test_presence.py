@@ -184,7 +184,7 @@ def test_objects_of_others_cost_a_look_at_the_shelves_that_they_came_to(noted: L
 def test_a_note_is_written_anew_where_many_shelves_changed(
     noted: Lab, shows: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(presence, "_MOST_CHANGED", 0)
+    monkeypatch.setattr(presence, "_MAX_CHANGED", 0)
     (note,) = (noted.folder / ".tacpipe/presence").iterdir()
     before = note.read_bytes()
     _, stored = first(noted)

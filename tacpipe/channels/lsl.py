@@ -41,10 +41,10 @@ QUANTITIES = {  # quantities by the type of a channel, or of a stream whose chan
     "eeg": "voltage", "emg": "voltage", "voltage": "voltage", "markers": "text", "current": "current",
 }  # fmt: skip
 COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
-LATEST_S = 9e9  # latest time that nanoseconds in 64 bits hold
+MAX_TIME_S = 9e9  # latest time that nanoseconds in 64 bits hold
 TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
-MOST_CHANNELS = 1 << 16
-MOST_BYTES = 1 << 24  # largest size of a description
+MAX_CHANNELS = 1 << 16
+MAX_DESCRIPTION_BYTES = 1 << 24  # largest size of a description
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ def parse(text: str | bytes) -> LslDescription:
 
     Raises `TacpipeError` for what is not one: no XML, no such format, a count of channels or a rate that is none.
     """
-    if len(text) > MOST_BYTES:
-        raise TacpipeError(f"its description has {len(text):,} bytes, more than {MOST_BYTES:,}")
+    if len(text) > MAX_DESCRIPTION_BYTES:
+        raise TacpipeError(f"its description has {len(text):,} bytes, more than {MAX_DESCRIPTION_BYTES:,}")
     try:
         root = ET.fromstring(text.decode(errors="replace") if isinstance(text, bytes) else text)
     except (ET.ParseError, ValueError) as error:
@@ -105,8 +105,8 @@ def parse(text: str | bytes) -> LslDescription:
     )
     if form not in FORMATS:
         raise TacpipeError(f"its channel_format is {excerpt(form)}, not one of {', '.join(FORMATS)}")
-    if not count.isdecimal() or len(count) > 9 or not 1 <= int(count) <= MOST_CHANNELS:
-        raise TacpipeError(f"its channel_count is {excerpt(count)}, not between 1 and {MOST_CHANNELS:,}")
+    if not count.isdecimal() or len(count) > 9 or not 1 <= int(count) <= MAX_CHANNELS:
+        raise TacpipeError(f"its channel_count is {excerpt(count)}, not between 1 and {MAX_CHANNELS:,}")
     try:
         rate_hz = float(rate or 0)
     except ValueError:

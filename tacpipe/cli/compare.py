@@ -178,7 +178,9 @@ class Compared:
         points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
         fewest = min(row.n for comparison in comparisons for row in comparison.rows)
         few_note = (
-            f" With n below {headline.FEWEST} no interval proves a difference." if fewest < headline.FEWEST else ""
+            f" With n below {headline.MIN_CLUSTERS} no interval proves a difference."
+            if fewest < headline.MIN_CLUSTERS
+            else ""
         )
         chosen = max(len(comparison.models) for comparison in comparisons)
         chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""

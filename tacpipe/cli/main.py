@@ -56,7 +56,7 @@ Exit codes: 0 done, 1 to 6 and 130 as in docs/reference/exit-codes.md.
 """
 
 
-WIDEST = 1_000  # Columns of help: the terminal's, up to this.
+MAX_WIDTH = 1_000  # Columns of help: the terminal's, up to this.
 ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # Abbreviations that help and completion do not list
 
 
@@ -72,7 +72,7 @@ def app(arguments: Sequence[str]) -> typer.Typer:
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDEST},
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MAX_WIDTH},
     )
 
     @program.callback()

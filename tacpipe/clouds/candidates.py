@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 COUNT = 10
 SHIFT = 0.4  # fraction of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
 OPENING_M = (0.020, 0.130)  # least and largest opening; the published grasps have 0.026 to 0.121
-FEWEST = 50  # points of a cloud that states a shape; published ones have 814 and more
-MOST = 20_000  # points that are looked at: more add time and no shape
-FEWEST_CUT = 6  # points of a cut
+MIN_POINTS = 50  # points of a cloud that states a shape; published ones have 814 and more
+MAX_POINTS = 20_000  # points that are looked at: more add time and no shape
+MIN_CUT_POINTS = 6  # points of a cut
 FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published one has 0.026
 HALF_CUT_M = 0.007  # half the thickness of a cut, as in GeoGrasp
 TRIM = 0.02  # fraction of a cut's points at either end that may be stray
@@ -119,8 +119,8 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
     limits = f"{opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm"
     if not widths_m:
         return (
-            f"No cut through the cloud has {FEWEST_CUT} points within {HALF_CUT_M * 1e3:g} mm; the cloud is too sparse to "
-            f"state where its edges are. Take one with more points."
+            f"No cut through the cloud has {MIN_CUT_POINTS} points within {HALF_CUT_M * 1e3:g} mm; the cloud is too "
+            f"sparse to locate its edges. Use a cloud with more points."
         )
     return (
         f"The object is {min(widths_m) * 1e3:.0f} to {max(widths_m) * 1e3:.0f} mm wide where it was cut, and the fingers "
@@ -129,13 +129,13 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
 
 
 def _thinned(cloud: Cloud, seed: int) -> Cloud:
-    if len(cloud) < FEWEST:
+    if len(cloud) < MIN_POINTS:
         raise TacpipeError(
-            f"The cloud has {len(cloud)} points; to find its shape it takes {FEWEST} or more. Is it the object's cloud?"
+            f"The cloud has {len(cloud)} points; to find its shape it takes {MIN_POINTS} or more. Is it the object's cloud?"
         )
-    if len(cloud) <= MOST:
+    if len(cloud) <= MAX_POINTS:
         return cloud
-    rows = np.random.default_rng(seed).choice(len(cloud), MOST, replace=False)
+    rows = np.random.default_rng(seed).choice(len(cloud), MAX_POINTS, replace=False)
     return Cloud(cloud.points_m[rows])
 
 
@@ -184,7 +184,7 @@ class _Cuts:
     def best(self, shift_m: float) -> Candidate | None:
         """Return the best pair of points near the plane at ``shift_m``; None if no pair fits between the fingers."""
         cut = np.flatnonzero(np.abs(self._along_m - shift_m) < HALF_CUT_M)
-        if len(cut) < FEWEST_CUT:
+        if len(cut) < MIN_CUT_POINTS:
             return None
         low, high = np.quantile(self._across_m[cut], [TRIM, 1 - TRIM])
         width = high - low

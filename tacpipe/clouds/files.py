@@ -14,7 +14,7 @@ from tacpipe.io import regular
 TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
 SUFFIXES = (".pcd", ".ply", *TEXT)
 DIGITS = 18  # largest number of digits of a number of points
-LARGEST_M = 10.0  # largest distance that a hand's camera sees; a cloud in millimetres is a thousand times as large
+MAX_DISTANCE_M = 10.0  # largest distance that a hand's camera sees; a cloud in millimetres is a thousand times as large
 
 
 def read(path: Path | str) -> Cloud:
@@ -37,12 +37,12 @@ def read(path: Path | str) -> Cloud:
 
 
 def require_metres(path: Path, cloud: Cloud) -> None:
-    """Raise `TacpipeError` if a cloud is larger than `LARGEST_M`."""
+    """Raise `TacpipeError` if a cloud is larger than `MAX_DISTANCE_M`."""
     extent_m = float(np.ptp(cloud.points_m.astype(np.float64), axis=0).max(initial=0.0))
-    if extent_m > LARGEST_M:
+    if extent_m > MAX_DISTANCE_M:
         raise TacpipeError(
-            f"{path} is {extent_m:.4g} m long; clouds are {LARGEST_M:g} m at most. It looks like millimetres: divide its "
-            f"coordinates by 1000."
+            f"{path} is {extent_m:.4g} m long; clouds have at most {MAX_DISTANCE_M:g} m. If it is in millimetres, divide "
+            f"its coordinates by 1000."
         )
 
 

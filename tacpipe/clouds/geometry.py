@@ -25,7 +25,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp, local_points, wrist_of
 
 UNIT_M = 0.05  # length in which coefficients are given, so that they are of one order
-SMALLEST = 1e-9  # added to the mean squared gradient, for points that state nothing of a coefficient
+EPSILON = 1e-9  # added to the mean squared gradient, for points that state nothing of a coefficient
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def fitted(points_m: Floats) -> tuple[float, Quadric]:
     moments = terms.T @ terms / len(points)
     steep = np.sum([part.T @ part for part in _slopes(points)], axis=0)[:9, :9] / len(points)
     free = moments[:9, :9] - np.outer(moments[:9, 9], moments[9, :9])  # the constant makes the mean value zero
-    values, vectors = eigh(free, steep + SMALLEST * np.eye(9), subset_by_index=(0, 0))
+    values, vectors = eigh(free, steep + EPSILON * np.eye(9), subset_by_index=(0, 0))
     first = vectors[:, 0]
     misfit = float(np.sqrt(max(values[0], 0.0)))
     return misfit * UNIT_M, Quadric(np.append(first, -moments[9, :9] @ first), centre)
@@ -79,10 +79,10 @@ QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 RADII_M = (0.015, 0.025, 0.04)  # radii of the patches about each contact: a fingertip's pad, and its surroundings
 SLICE_M = 0.01  # half the thickness of the slice that the fingers close in
 BINS = 10  # bins of that slice, from finger to finger
-NEAREST = 50  # points whose mean colour is that of a contact
-FEWEST = 6  # points of a patch below which its shape is not stated
+COLOUR_POINTS = 50  # points whose mean colour is that of a contact
+MIN_PATCH_POINTS = 6  # points of a patch below which its shape is not stated
 NEAR_M = 0.05  # about a contact, within which a quadric is fitted
-FEWEST_FITTED = 30  # points below which none is
+MIN_FITTED_POINTS = 30  # points below which none is
 AXES = ("approach", "closing", "third")
 PAIRS = tuple(combinations_with_replacement(range(3), 2))
 PAIR_NAMES = tuple(f"{AXES[first]}_{AXES[second]}" for first, second in PAIRS)
@@ -106,7 +106,7 @@ def features(cloud: Cloud, grasp: Grasp) -> dict[str, float]:
             f"{name}_near", points[away < NEAR_M], place_m
         )
         if cloud.colours is not None:
-            nearest = np.argsort(away, kind="stable")[:NEAREST]
+            nearest = np.argsort(away, kind="stable")[:COLOUR_POINTS]
             values_by_name |= _with_parts(f"{name}_colour", cloud.colours[nearest].mean(axis=0), "rgb")
     if cloud.colours is not None:
         values_by_name |= _colours(cloud.colours.astype(np.float64))
@@ -189,7 +189,7 @@ def _patch(name: str, points: Floats, place_m: float, total: int) -> dict[str, f
         *(f"normal_{axis}" for axis in AXES),
         "offset_m",
     )
-    if len(points) < FEWEST:
+    if len(points) < MIN_PATCH_POINTS:
         return _with_parts(name, np.zeros(len(parts)), parts)
     variances, directions = np.linalg.eigh(np.cov(points.T))
     variances = np.maximum(variances, 0)
@@ -202,7 +202,7 @@ def _patch(name: str, points: Floats, place_m: float, total: int) -> dict[str, f
 def _fitted(name: str, points: Floats, place_m: float) -> dict[str, float]:
     """Return how well a quadric fits the points, and which way it faces at a contact, whether that is seen or not."""
     parts = ("misfit_m", *(f"faces_{axis}" for axis in AXES))
-    if len(points) < FEWEST_FITTED:
+    if len(points) < MIN_FITTED_POINTS:
         return _with_parts(name, np.zeros(len(parts)), parts)
     misfit_m, surface = fitted(points)
     normal = _outwards(surface.normal(np.array([0.0, place_m, 0.0])), place_m)
@@ -230,7 +230,7 @@ def _colours(colours: Floats) -> dict[str, float]:
 
 
 NORMALISATIONS = ("none", "sphere", "minmax", "wrist")
-SMALLEST_M = 1e-6  # a cloud's extent along an axis counts as at least this, so that a flat one can be divided by it
+MIN_EXTENT_M = 1e-6  # a cloud's extent along an axis counts as at least this, so that a flat one can be divided by it
 
 
 @dataclass(frozen=True)
@@ -269,14 +269,14 @@ def minmax(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
     """
     corners = extent.corners_m @ rotation.T
     low, high = corners.min(axis=0), corners.max(axis=0)
-    scaled: AnyFloats = 2 * (points - low) / np.maximum(high - low, SMALLEST_M) - 1
+    scaled: AnyFloats = 2 * (points - low) / np.maximum(high - low, MIN_EXTENT_M) - 1
     return scaled
 
 
 def sphere(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
     """Return points (point, xyz), turned already, about the cloud's centroid and with its largest radius as unit."""
     radius = np.linalg.norm(extent.corners_m - extent.centroid_m, axis=1).max()  # a farthest point is a corner
-    scaled: AnyFloats = (points - rotation @ extent.centroid_m) / max(radius, SMALLEST_M)
+    scaled: AnyFloats = (points - rotation @ extent.centroid_m) / max(radius, MIN_EXTENT_M)
     return scaled
 
 

@@ -29,9 +29,9 @@ VERSIONS = ("0.7", ".7")
 KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}  # letter: numpy's, sizes in bytes
 POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
-LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
+MAX_HEADER_BYTES = 65_536  # bytes; a file without the line DATA in so many is none
 DIGITS = 18  # largest number of digits of a number in a header
-LARGEST_POINT = 65_536  # bytes, fields that are skipped included
+MAX_POINT_BYTES = 65_536  # bytes, fields that are skipped included
 LZF_MOST = 88  # largest factor of compression: three bytes unpack to 264
 
 
@@ -145,7 +145,7 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
     lines: dict[str, list[str]] = {}
     place = 0
     while "DATA" not in lines:
-        end = content.find(b"\n", place, LONGEST_HEADER)
+        end = content.find(b"\n", place, MAX_HEADER_BYTES)
         if end < 0:
             raise TacpipeError(
                 f"{path} is not a PCD file or was cut off: its header ends without a line DATA. Give a PCD file of version "
@@ -200,10 +200,10 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
                 f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count_text}; it must be {right}."
             )
         total += width * count
-        if not count > 0 or total > LARGEST_POINT:
+        if not count > 0 or total > MAX_POINT_BYTES:
             raise TacpipeError(
-                f"{path} has the field {plain(name)} of COUNT {count_text}; a point has {LARGEST_POINT} bytes at most, and "
-                f"each field one number or more. Copy the file again."
+                f"{path} has the field {plain(name)} of COUNT {count_text}; a point has at most {MAX_POINT_BYTES} bytes and "
+                f"each field at least one number. Copy the file again."
             )
         field_name = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
         fields.append((field_name, f"<{letter}{width}", () if count == 1 else (count,)))

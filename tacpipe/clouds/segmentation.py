@@ -18,8 +18,8 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 
 PLANES = 4  # the largest ones, among which the table is looked for: a floor, walls and sides of boxes may be larger
-LONGEST_M = 0.4  # largest extent of an object along any axis; published objects have at most 0.28 m
-DEEPEST_M = 0.1  # largest height of an object above the middle of a grasp: a hand cannot lift 20 cm like that
+MAX_EXTENT_M = 0.4  # largest extent of an object along any axis; published objects have at most 0.28 m
+MAX_HEIGHT_M = 0.1  # largest height of an object above the middle of a grasp: a hand cannot lift 20 cm like that
 NOISES = 3.0  # standard deviations of the table's points about its plane, beyond which a point lies in front of it
 SAMPLED = 10_000  # points that state a plane as well as all of a view do
 
@@ -65,10 +65,10 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: in
         )
     rows = front[labels == labels[nearest]]
     length_m = float(np.ptp(points_m[rows], axis=0).max())
-    if length_m > LONGEST_M:
+    if length_m > MAX_EXTENT_M:
         raise TacpipeError(
-            f"What is near the grasp is {1e3 * length_m:.0f} mm long, and what a hand lifts {1e3 * LONGEST_M:g} mm at most: "
-            f"it has grown together with the table, or with things next to it. Raise --plane-mm or lower --cluster-mm."
+            f"The object near the grasp is {1e3 * length_m:.0f} mm long; a hand lifts at most {1e3 * MAX_EXTENT_M:g} mm. "
+            f"It may have merged with the table or with neighbouring objects. Raise --plane-mm or lower --cluster-mm."
         )
     object_points: Indices = rows[_inliers(points_m[rows], limits)]
     return object_points
@@ -111,11 +111,11 @@ def heights_m(points_m: Floats, plane: Floats) -> Floats:
 def from_grasp_m(points_m: Floats, grasp: Grasp) -> Floats:
     """Return how far points (point, xyz) lie from a grasp, metres (point,): from its two lines, whichever is nearer.
 
-    One goes from finger to finger, through the object. The other goes from the middle `DEEPEST_M` towards the camera, and
+    One goes from finger to finger, through the object. The other goes from the middle `MAX_HEIGHT_M` towards the camera, and
     meets what the camera sees of the object, though the fingers may lie far beneath it.
     """
     towards = -grasp.middle_m / np.linalg.norm(grasp.middle_m)  # (xyz), from the middle to the camera
-    lines = ((grasp.g1_m, grasp.closing, grasp.opening_m), (grasp.middle_m, towards, DEEPEST_M))
+    lines = ((grasp.g1_m, grasp.closing, grasp.opening_m), (grasp.middle_m, towards, MAX_HEIGHT_M))
     return np.minimum(*(_from_line_m(points_m, *line) for line in lines))
 
 

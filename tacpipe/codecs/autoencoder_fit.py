@@ -33,7 +33,7 @@ FRAMES = (1, 2, 3)  # widths for the classes C1, C2 and C3
 HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # layers between input and latent, by frames
 SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # widths that a search tries, times the frames
 STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # factors of learning rate and weight decay that a search tries
-MOST = len(SHAPES) * len(STEPS)
+MAX_TENSORS = len(SHAPES) * len(STEPS)
 GRADIENT_CLIP = 1.0  # largest norm of the gradient, without unit, as of the forecasters
 
 
@@ -59,8 +59,10 @@ def networks(
     """
     if frames not in FRAMES:
         raise TacpipeError(f"frames is {frames}; an autoencoder reads 1, 2 or 3 frames in a row.")
-    if not 0 <= search <= MOST:
-        raise TacpipeError(f"search is {search}; it is how many networks to try, 1 to {MOST}, or 0 for no search.")
+    if not 0 <= search <= MAX_TENSORS:
+        raise TacpipeError(
+            f"search is {search}; it is how many networks to try, 1 to {MAX_TENSORS}, or 0 for no search."
+        )
     if not weight_decay >= 0:
         raise TacpipeError(f"weight_decay is {weight_decay}; it must be 0 or above.")
     if search and hidden:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.task import Task
 
 CONFIG = "config.json"
-MOST = 100_000  # rows, points, units: what no model of touch comes near
+MAX_SIZE = 100_000  # rows, points, units: what no model of touch comes near
 NONE = type(None)
 _KINDS = {
     int: "a whole number",
@@ -181,8 +181,8 @@ def _require(name: str, path: str, value: Any, kind: Kind) -> None:
         raise TacpipeError(
             f"{name}: {path} {described}; it must be {description}. Copy the model again from whoever made it."
         )
-    if isinstance(value, int) and not 0 <= value <= MOST:
-        raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MOST}.")
+    if isinstance(value, int) and not 0 <= value <= MAX_SIZE:
+        raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MAX_SIZE}.")
 
 
 def _is(value: Any, kind: type) -> bool:

@@ -66,7 +66,7 @@ def refuse_shared_paths(paths: Sequence[str]) -> None:
         raise ValueError(_SHARED)
 
 
-LONGEST_NAME = NAME_BYTES - len(".parquet")  # bytes of UTF-8
+MAX_NAME_BYTES = NAME_BYTES - len(".parquet")  # bytes of UTF-8
 _MARK = 8  # hex digits of the digest that ends a name that was cut
 _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._-")
 
@@ -83,9 +83,9 @@ def valid_name(text: str) -> str:
     composed = unicodedata.normalize("NFC", text)
     printable_text = "".join(c if c in _ASCII or (c.isprintable() and not c.isascii()) else " " for c in composed)
     name = "-".join(printable_text.split()).strip("-.")
-    if len(name.encode()) <= LONGEST_NAME:
+    if len(name.encode()) <= MAX_NAME_BYTES:
         return name
-    cut = name.encode()[: LONGEST_NAME - _MARK - 1].decode(errors="ignore")
+    cut = name.encode()[: MAX_NAME_BYTES - _MARK - 1].decode(errors="ignore")
     return f"{cut}-{bytes_digest(name.encode())[:_MARK]}"
 
 

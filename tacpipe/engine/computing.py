@@ -30,7 +30,7 @@ from tacpipe.training import devices
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-AT_ONCE = 8  # tasks that wait for a distant store while one is computed
+MAX_PENDING = 8  # tasks that wait for a distant store while one is computed
 _MANY = 4  # tasks for which threads are started
 
 
@@ -72,22 +72,22 @@ def _overlapped(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
     """Yield what becomes of each task. Stages run in this thread alone."""
     from concurrent.futures import ThreadPoolExecutor  # Not loaded for a cache hit
 
-    pool = ThreadPoolExecutor(AT_ONCE)
+    pool = ThreadPoolExecutor(MAX_PENDING)
     looks: deque[Future[None]] = deque()
     sent: deque[Future[Done]] = deque()
     unsent: list[Callable[[], Done]] = []
     try:
-        for task, store in tasks[:AT_ONCE]:
+        for task, store in tasks[:MAX_PENDING]:
             looks.append(pool.submit(store.seek, digest(task.identity)))
         for place, (task, store) in enumerate(tasks):
             with contextlib.suppress(TacpipeError):  # The next look reports the error
                 looks.popleft().result()
-            if place + AT_ONCE < len(tasks):
-                later, its_store = tasks[place + AT_ONCE]
+            if place + MAX_PENDING < len(tasks):
+                later, its_store = tasks[place + MAX_PENDING]
                 looks.append(pool.submit(its_store.seek, digest(later.identity)))
             unsent.append(_begin(task, store))
             sent.append(pool.submit(unsent[-1]))
-            while sent and (sent[0].done() or len(sent) > AT_ONCE):
+            while sent and (sent[0].done() or len(sent) > MAX_PENDING):
                 unsent.pop(0)
                 yield sent.popleft().result()
         while sent:

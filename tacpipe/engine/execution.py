@@ -31,7 +31,7 @@ from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
 
-_MOST_BYTES = 1 << 20  # Longest error message
+_MAX_MESSAGE_BYTES = 1 << 20  # Longest error message
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SharedFiles:
         path, failed = (self.store.draft(digest([key, part])[:32]) for part in ("made", "failed"))
         with self.store.leases.hold(key, "the recordings of a file"):
             if present(failed):
-                raise TacpipeError(regular.content(failed, _MOST_BYTES, follow=False).decode())
+                raise TacpipeError(regular.content(failed, _MAX_MESSAGE_BYTES, follow=False).decode())
             if not present(path):
                 name = self.store.draft()
                 with files.new_draft(name, self.store.root) as draft:

@@ -16,7 +16,7 @@ from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
 
-_MOST_TRIALS = 1_000_000
+_MAX_TRIALS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[W
     """Return one task per recording to simulate, named ``trial-000`` and so on."""
     (argument,) = (name for name, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)
-    if count > _MOST_TRIALS:
-        raise UsageError(f"--trials is {count}; a dataset holds at most {_MOST_TRIALS:,} recordings.")
+    if count > _MAX_TRIALS:
+        raise UsageError(f"--trials is {count}; a dataset holds at most {_MAX_TRIALS:,} recordings.")
     width = max(3, len(str(count - 1)))
     return [
         WorkerTask(

@@ -121,7 +121,7 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
                 losses.append(Loss("it has no time, and a message needs one", stream))
             continue
         t_ns = table.column(TIME).to_numpy()
-        if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.LATEST_S * 10**9:
+        if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.MAX_STAMP_S * 10**9:
             losses.append(Loss("its stamps lie before 1970 or after 2038, which ROS has no stamps for", stream))
             continue
         losses += _losses(stream, table)

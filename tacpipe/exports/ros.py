@@ -146,7 +146,7 @@ def _align_up(position: int, to: int) -> int:
 PACKAGE = "tacpipe_msgs"
 POINT, COLOURS = ("x_m", "y_m", "z_m"), ("red", "green", "blue")  # columns of a cloud
 _FLOAT32 = 7  # a constant of sensor_msgs/PointField
-LATEST_S = 2**31 - 1  # largest int32, the type of a stamp's seconds
+MAX_STAMP_S = 2**31 - 1  # largest int32, the type of a stamp's seconds
 TYPES = {  # arrow type to type of a message's field
     **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
     **{"float": "float32", "double": "float64", "bool": "bool", "string": "string", "binary": "uint8[]"},

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
-LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
+MAX_READING = 255.0  # readings stem from eight bits, compensated for temperature
 ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
 UNREADABLE = (
     *(ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, OverflowError),
@@ -44,7 +44,7 @@ UNREADABLE = (
 )
 MADE = "from nominal rate"
 MAX_LABEL = 10_000  # materials
-LONGEST_HEAD = 10_000  # bytes in front of an array, as numpy allows
+MAX_HEADER_BYTES = 10_000  # bytes in front of an array, as numpy allows
 KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # numeric dtype with its size in bytes
 
 
@@ -142,8 +142,8 @@ def _count_slides(path: Path) -> int:
                 raise ValueError("it does not begin as an array of numpy does")
             wide = file.read(2)[0] > 1
             length = int.from_bytes(file.read(4 if wide else 2), "little")
-            if length > LONGEST_HEAD:
-                raise ValueError(f"its head has {length} bytes, {LONGEST_HEAD} are allowed")
+            if length > MAX_HEADER_BYTES:
+                raise ValueError(f"its head has {length} bytes, {MAX_HEADER_BYTES} are allowed")
             head = ast.literal_eval(file.read(length).decode())
             available = os.fstat(file.fileno()).st_size - file.tell()
         shape, kind = head["shape"], KIND.fullmatch(head["descr"])
@@ -198,10 +198,10 @@ def _read_slide(path: Path, place: int) -> Float32s:
     slide = np.array(block[place], dtype=np.float32)  # (triangle, taxel, time)
     if not np.isfinite(slide).all():
         raise TacpipeError(f"{path}, slide {place} holds values that are not finite. Copy the file again.")
-    if slide.min() < 0 or slide.max() > LARGEST:
+    if slide.min() < 0 or slide.max() > MAX_READING:
         raise TacpipeError(
             f"{path}, slide {place} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
-            f"{LARGEST:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
+            f"{MAX_READING:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
         )
     for evidence in (slide, block):
         if is_time(evidence, -1, ALONG_TIME):
@@ -267,7 +267,7 @@ def _unreadable(path: Path, error: BaseException) -> TacpipeError:
     return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")
 
 
-LEAST = 0.5  # lag-1 autocorrelation that time must have
+MIN_AUTOCORRELATION = 0.5  # lag-1 autocorrelation that time must have
 
 
 def lag_one(values: AnyArray, axis: int) -> float:
@@ -290,7 +290,7 @@ def lag_one(values: AnyArray, axis: int) -> float:
     return float(before @ after) / spread if spread > 0 else float("nan")
 
 
-def is_time(values: AnyArray, axis: int, lowest: float = LEAST) -> bool:
+def is_time(values: AnyArray, axis: int, lowest: float = MIN_AUTOCORRELATION) -> bool:
     """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``lowest`` or more, and the largest.
 
     False if nothing varies along it: such an array states nothing about its axes.

@@ -34,7 +34,7 @@ CLOUD, GRASP, READING = NAMES = ("cloud-object.pcd", "best-grasp.txt", "tactile.
 TWIN = "duplicate_of="  # begins the name of the file of an earlier grasp with the same reading
 UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 on
 VALUES = 58  # values of a reading: 29 of the middle finger, then as many of the thumb
-LARGEST = 4095  # counts; the sensor's converter has twelve bits
+MAX_COUNT = 4095  # counts; the sensor's converter has twelve bits
 POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the wrist's rotation, row by row
 
 
@@ -216,10 +216,10 @@ def _read_counts(path: Path) -> list[int]:
     values = []
     for place, cell in enumerate(cells, start=2):
         count = cell.strip()
-        if not (count.isascii() and count.isdigit() and len(count) <= 4 and int(count) <= LARGEST):
+        if not (count.isascii() and count.isdigit() and len(count) <= 4 and int(count) <= MAX_COUNT):
             raise TacpipeError(
                 f"{path}, row 1, field {place}: {count[:20]!r} is not a count; it must be a whole number from 0 to "
-                f"{LARGEST} (12 bits). Copy it again."
+                f"{MAX_COUNT} (12 bits). Copy it again."
             )
         values.append(int(count))
     return values

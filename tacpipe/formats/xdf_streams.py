@@ -316,8 +316,8 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
     Instead a reason where that cannot be known.
     """
     raw_s = np.concatenate(stream.stamps)
-    if not (np.abs(raw_s) < lsl.LATEST_S).all():
-        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.LATEST_S)][0]))} is not a time in seconds"
+    if not (np.abs(raw_s) < lsl.MAX_TIME_S).all():
+        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.MAX_TIME_S)][0]))} is not a time in seconds"
     raw_ns = lsl.nanoseconds(raw_s)
     measured = _valid_offsets(stream)
     facts: dict[str, Attribute] = {}
@@ -353,7 +353,7 @@ def _valid_offsets(stream: _StreamReading) -> Int64s:
 
 
 def _is_valid(offsets_s: Floats) -> AnyArray:
-    return np.asarray((np.abs(offsets_s) < lsl.LATEST_S).all(axis=1))
+    return np.asarray((np.abs(offsets_s) < lsl.MAX_TIME_S).all(axis=1))
 
 
 def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: int) -> int:

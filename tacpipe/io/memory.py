@@ -23,7 +23,7 @@ _VERSIONS = {  # version to the files of limit and use, and the entry of reclaim
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
-MOST_BLOCK = 1 << 28  # bytes that a chunk, a page or a record of a file may unpack to
+MAX_BLOCK_BYTES = 1 << 28  # bytes that a chunk, a page or a record of a file may unpack to
 KEPT = 0.9  # fraction of what is left that one file may declare
 SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
 LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores
@@ -176,10 +176,10 @@ def require(needed: int, source: str, *, error: type[TacpipeError] = TacpipeErro
 
 
 def require_block(size: int, source: str) -> None:
-    """Raise `TacpipeError` if a chunk, a page or a record of a file declares more than `MOST_BLOCK` bytes."""
-    if size > MOST_BLOCK:
+    """Raise `TacpipeError` if a chunk, a page or a record of a file declares more than `MAX_BLOCK_BYTES` bytes."""
+    if size > MAX_BLOCK_BYTES:
         raise TacpipeError(
-            f"{source} declares {readable_size(size)} in one piece, and at most {readable_size(MOST_BLOCK)} are read at "
+            f"{source} declares {readable_size(size)} in one piece; at most {readable_size(MAX_BLOCK_BYTES)} are read at "
             "once. Write it in smaller chunks; if its source is untrusted, do not use it."
         )
 

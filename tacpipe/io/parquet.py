@@ -124,7 +124,7 @@ def require_claims(
     """Raise `TacpipeError` if columns of an untrusted file declare more than may be read at once, or than is there.
 
     That is ``max_bytes`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
-    `memory.MOST_BLOCK` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.
+    `memory.MAX_BLOCK_BYTES` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.
     """
     with regular.failing(path), regular.opened(path) as file:
         try:
@@ -138,10 +138,10 @@ def require_claims(
                 f"{path} is not a whole Parquet file: {plain(' '.join(str(error).split()), 200)}. Copy it again."
             ) from error
         memory.require_block(largest, f"A page of {path}")
-        limit = memory.MOST_BLOCK if rows is not None else max_bytes
+        limit = memory.MAX_BLOCK_BYTES if rows is not None else max_bytes
         if rows is None:
             _require_size(path, int(encoded * share), limit)
-        if total * share > min(limit or total, memory.MOST_BLOCK):
+        if total * share > min(limit or total, memory.MAX_BLOCK_BYTES):
             texts = _text_bytes(file, schema, columns, rows or BATCH_ROWS)
             _require_size(
                 path, max(texts, default=0) if rows is not None else int((encoded + sum(texts)) * share), limit

@@ -40,7 +40,7 @@ _USUAL = re.compile(  # kind 0, unpacked size, size, maybe a check sum, and of i
     rb"\x15\x00\x15%b\x15%b(?:\x15%b\x1c|\x2c)\x15%b\x15(%b)\x15%b\x15%b(?:\x1c\x00)?\x00\x00"
     % (*(_VARINT,) * 4, *(_SMALL,) * 3),
 )
-DEEPEST = 8  # structures within one another in a page's header
+MAX_DEPTH = 8  # structures within one another in a page's header
 
 
 class _Leaf(NamedTuple):
@@ -225,9 +225,9 @@ def _value(content: Bytes, place: int, stop: int, kind: int, depth: int) -> tupl
     if kind == 8:  # a text: its length is no zigzag
         length, place = _number(content, place, stop)
         return None, place + (2 * length if length >= 0 else -2 * length - 1)
-    if kind == 9 and depth < DEEPEST:
+    if kind == 9 and depth < MAX_DEPTH:
         return _list(content, place, stop, depth + 1)
-    if kind == 12 and depth < DEEPEST:
+    if kind == 12 and depth < MAX_DEPTH:
         return _struct(content, place, stop, depth + 1)
     raise ValueError("its footer or a page's header is none")
 

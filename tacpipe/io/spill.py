@@ -170,7 +170,7 @@ def _rows_below(waiting: list[tuple[int, pa.Table]], order: str, limit: float | 
 
 
 SEGMENT_BYTES = 1 << 28  # size of a file; few are opened, since each takes a descriptor
-MOST_READ = 1 << 26  # bytes read before their pages are released
+MAX_READ_BYTES = 1 << 26  # bytes read before their pages are released
 
 
 class MappedArrays:
@@ -224,9 +224,9 @@ class MappedArrays:
         return np.frombuffer(self._segments[-1], kind, int(np.prod(shape)), place).reshape(shape)
 
     def read(self, size: int) -> None:
-        """Note that about so many bytes were read; beyond `MOST_READ` they are let go of."""
+        """Note that about so many bytes were read; beyond `MAX_READ_BYTES` they are let go of."""
         self._read += size
-        if self._read > MOST_READ:
+        if self._read > MAX_READ_BYTES:
             self.release()
 
     def release(self) -> None:

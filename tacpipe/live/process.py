@@ -31,7 +31,7 @@ from tacpipe.recording.spool import StreamNote
 REPORT_NS = 250_000_000  # period of reports to the recording process
 FETCH_BYTES = 1 << 18  # read at once
 SWITCH_S = 0.0005  # time that a publisher's thread may hold up an answer
-LONGEST_WAIT_S = 0.02
+MAX_WAIT_S = 0.02
 REFUSED = 2  # exit code: the session cannot begin with this model and rig
 SHORTEST_MS, LONGEST_MS = 0.01, 100_000.0
 PER_DECADE = 100  # bins; a quantile is exact to 2.3 %
@@ -109,7 +109,7 @@ class Loop:
                 gc.collect(1)  # a full collection would take longer than an answer may
             wait_s = (self.engine.due_ns(time.monotonic_ns()) - time.monotonic_ns()) / 1e9
             if wait_s > 0:
-                time.sleep(min(wait_s, LONGEST_WAIT_S))
+                time.sleep(min(wait_s, MAX_WAIT_S))
         for message in self.engine.finish():
             self.publish(message)
         self.report()

@@ -29,7 +29,7 @@ EXAMPLES = {
     "mcap": "mcap:session.mcap",
 }
 DESCRIBED_EVERY = 100  # messages from one description to the next, because datagrams may be lost
-LARGEST_DATAGRAM = 65_000  # bytes
+MAX_DATAGRAM_BYTES = 65_000  # bytes
 FORMATS = ("json", "msgpack")
 MCAP_QUEUED = 500  # messages that wait for the disk: 10 s at 50 Hz
 
@@ -270,7 +270,7 @@ class UdpPublisher:
 
     def _send(self, data: bytes) -> None:
         try:
-            if len(data) > LARGEST_DATAGRAM:
+            if len(data) > MAX_DATAGRAM_BYTES:
                 raise OSError
             self._socket.send(data)
         except OSError:

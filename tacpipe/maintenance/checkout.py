@@ -28,8 +28,8 @@ from tacpipe.store.store import MissingError
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"
-SHORTEST = 6  # hex digits by which a manifest may be named
-_HEX = re.compile(rf"[0-9a-f]{{{SHORTEST},64}}")
+MIN_DIGITS = 6  # hex digits by which a manifest may be named
+_HEX = re.compile(rf"[0-9a-f]{{{MIN_DIGITS},64}}")
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _manifest_digest(store: AnyStore, name: str) -> str:
             return str(pushed.find(store, name, name, projects.identity_of(locate(), folder))["manifest"])
         except UsageError as error:
             raise UsageError(
-                f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "
+                f"{name} is neither the digest of a manifest ({MIN_DIGITS} or more hex digits) nor a path at which "
                 f"{store.place} has seen a dataset; `tacpipe store list` names both. {error}"
             ) from None
     matching = {

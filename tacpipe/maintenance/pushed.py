@@ -21,7 +21,7 @@ from tacpipe.store.roots import PUSHED, Root, project_id
 from tacpipe.store.store import Store
 
 AnyStore = Store | RemoteStore
-SHORTEST = 6  # digits by which a project or a manifest may be named
+MIN_DIGITS = 6  # digits by which a project or a manifest may be named
 _SHOWN_DIGITS = 8  # digits of a project's id, shown where another project has its name too
 _SHOWN = 20  # datasets listed before the rest is counted
 
@@ -63,7 +63,7 @@ def label(root: Root, every: Iterable[Root]) -> str:
 def _roots_of_project(requested: str, pushed_roots: Iterable[Root]) -> list[Root]:
     """Return the pushed roots that ``PROJECT:PATH`` names.
 
-    A project is given by its name, by `SHORTEST` or more digits of its id, or by nothing for what has none.
+    A project is given by its name, by `MIN_DIGITS` or more digits of its id, or by nothing for what has none.
     """
     project, colon, path = requested.partition(":")
     return [root for root in pushed_roots if colon and root["path"] == path and _belongs_to(project, root)]
@@ -72,7 +72,7 @@ def _roots_of_project(requested: str, pushed_roots: Iterable[Root]) -> list[Root
 def _belongs_to(project: str, root: Root) -> bool:
     if not project:
         return not project_id(root)
-    by_id = len(project) >= SHORTEST and project_id(root).startswith(project)
+    by_id = len(project) >= MIN_DIGITS and project_id(root).startswith(project)
     return by_id or root.get("project", {}).get("name") == project
 
 
@@ -82,7 +82,7 @@ def project_in(store: AnyStore, wanted: str) -> Project:
     matching = [
         identifier
         for identifier, name in names_by_id.items()
-        if wanted == name or (len(wanted) >= SHORTEST and identifier.startswith(wanted))
+        if wanted == name or (len(wanted) >= MIN_DIGITS and identifier.startswith(wanted))
     ]
     if len(matching) != 1:
         names = listed((f"{name} ({identifier[:_SHOWN_DIGITS]})" for identifier, name in names_by_id.items()), _SHOWN)
@@ -156,7 +156,7 @@ def lasting(store: AnyStore, manifest: str) -> bool:
 
 
 def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
-    """Keep no longer what ``wanted`` names: all snapshots of ``PROJECT:PATH``, or one by `SHORTEST` or more of its digits.
+    """Keep no longer what ``wanted`` names: all snapshots of ``PROJECT:PATH``, or one by `MIN_DIGITS` or more of its digits.
 
     Returns whether there was any. Raises `UsageError` if several are meant.
     """
@@ -173,7 +173,7 @@ def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
         digest
         for root in all_roots
         for digest in _manifests(root)
-        if len(wanted) >= SHORTEST and digest.startswith(wanted)
+        if len(wanted) >= MIN_DIGITS and digest.startswith(wanted)
     }
     if len(snapshots) > 1:
         raise UsageError(

@@ -26,7 +26,7 @@ from tacpipe.maintenance import unnamed
 from tacpipe.maintenance.garbage import GRACE_DAYS, Collected, ancestors
 from tacpipe.maintenance.repair import Soundness
 from tacpipe.store import layout
-from tacpipe.store.backend import AT_ONCE, Entry
+from tacpipe.store.backend import MAX_CONCURRENT, Entry
 from tacpipe.store.records import digests
 from tacpipe.store.remote import SNAPSHOTS, RemoteStore
 from tacpipe.store.store import AbsentError, MissingError
@@ -57,7 +57,9 @@ def verify(store: RemoteStore) -> Soundness:
     names = [Path(entry.name).name for entry in entries if _is_object(entry.name)]
     soundness.foreign = sorted(entry.name for entry in entries if not _is_object(entry.name))
     with terminal.progress_bar("verifying", len(names)) as advance:
-        for name, error_type in threads.map_in_threads(lambda name: (name, _read_error(store, name)), names, AT_ONCE):
+        for name, error_type in threads.map_in_threads(
+            lambda name: (name, _read_error(store, name)), names, MAX_CONCURRENT
+        ):
             soundness.objects += error_type is not AbsentError
             if error_type is MissingError:
                 soundness.damaged.append(name)
@@ -153,7 +155,9 @@ def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str
     """Move objects aside, read again what is needed, and remove what still nobody needs, records first."""
     mine = uuid.uuid4().hex
     asides = {entry.name: f"tmp/{layout.ASIDE}{Path(entry.name).name}-{mine}" for entry in surplus}
-    moves = threads.map_in_threads(lambda entry: store.files.move(entry.name, asides[entry.name]), surplus, AT_ONCE)
+    moves = threads.map_in_threads(
+        lambda entry: store.files.move(entry.name, asides[entry.name]), surplus, MAX_CONCURRENT
+    )
     moved = [entry for entry, was_moved in zip(surplus, moves, strict=True) if was_moved]
     needed = _needed(store).objects
     restored = [entry for entry in moved if Path(entry.name).name in needed]
@@ -169,7 +173,7 @@ def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str
 
 
 def _run_all(work: Callable[[Item], object], items: Iterable[Item]) -> None:
-    for _ in threads.map_in_threads(work, items, AT_ONCE):
+    for _ in threads.map_in_threads(work, items, MAX_CONCURRENT):
         pass
 
 
@@ -239,7 +243,7 @@ def _needed(store: RemoteStore) -> _Needed:
         todo = sorted(set(pending) - needed.manifests)
         needed.manifests |= set(todo)
         pending = []
-        for manifest in threads.map_in_threads(lambda name: _manifest(store, name), todo, AT_ONCE):
+        for manifest in threads.map_in_threads(lambda name: _manifest(store, name), todo, MAX_CONCURRENT):
             if manifest is not None:
                 needed.objects |= manifest.reached(walked)
                 pending += ancestors(manifest)
@@ -270,7 +274,9 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
     """
     covered = {possession for manifest in recorded for possession, _ in replacing.possessions(manifest)}
     retained: set[str] = set()
-    for name, manifest in threads.map_in_threads(lambda name: (name, _manifest_or_none(store, name)), names, AT_ONCE):
+    for name, manifest in threads.map_in_threads(
+        lambda name: (name, _manifest_or_none(store, name)), names, MAX_CONCURRENT
+    ):
         if manifest is None:
             continue
         with contextlib.suppress(pages.MissingPageError):  # a manifest without all of its pages may have held anything

@@ -22,7 +22,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import intervals
 
 BINS = 10  # equally wide bins of confidence
-SMALLEST = 1e-12  # probability
+MIN_PROBABILITY = 1e-12  # probability
 RANGE = 8.0  # natural logarithm of a temperature, about that of the spread of scores
 
 
@@ -51,7 +51,7 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
     from scipy.optimize import minimize_scalar  # slow to import, and quantiles do not need it
 
     def loss(log: float) -> float:
-        logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), SMALLEST))
+        logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), MIN_PROBABILITY))
         return float(-(targets * logs).sum(axis=1).mean())
 
     optimum = minimize_scalar(loss, bounds=(-RANGE, RANGE), method="bounded", options={"xatol": 1e-4})
@@ -60,7 +60,7 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
 
 def log_loss(class_probabilities: AnyFloats, labels: Ints) -> float:
     """Return the mean negative log-likelihood of labels (slide,), columns of probabilities (slide, class)."""
-    likelihoods = np.maximum(class_probabilities[np.arange(len(labels)), labels], SMALLEST)
+    likelihoods = np.maximum(class_probabilities[np.arange(len(labels)), labels], MIN_PROBABILITY)
     return float(-np.log(likelihoods).mean())
 
 

@@ -15,7 +15,9 @@ from types import MappingProxyType
 from typing import Any
 
 FILE = "headline.json"
-FEWEST = 6  # clusters for a verdict: of 5 that all favour one side, chance alone gives 1 in 16, which is more than 5 %
+MIN_CLUSTERS = (
+    6  # clusters for a verdict: of 5 that all favour one side, chance alone gives 1 in 16, which is more than 5 %
+)
 BETTER, WORSE, UNCLEAR, NO_VERDICT = "better", "worse", "unclear", ""
 NONE = "–"
 
@@ -112,10 +114,10 @@ def read(content: bytes) -> list[Headline]:
 def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
     """Return ``better`` or ``worse`` where the interval of a gain excludes 0, ``unclear`` where it does not.
 
-    Empty if an interval is not sure to hold 95 %: with fewer than `FEWEST` clusters, or where these are as certain as
+    Empty if an interval is not sure to hold 95 %: with fewer than `MIN_CLUSTERS` clusters, or where these are as certain as
     fewer equal ones would be (``effective``), and without an interval.
     """
-    if clusters < FEWEST or round(effective, 6) < FEWEST or math.isnan(low) or math.isnan(high):
+    if clusters < MIN_CLUSTERS or round(effective, 6) < MIN_CLUSTERS or math.isnan(low) or math.isnan(high):
         return NO_VERDICT
     return BETTER if low > 0 else WORSE if high < 0 else UNCLEAR
 
@@ -126,7 +128,7 @@ def too_few(clusters: int, cluster: str, effective: float) -> str:
     >>> too_few(5, "recordings", 5.0), too_few(23, "recordings", 4.04)
     ('5 recordings are too few for a verdict', '23 recordings count as 4.0 equal ones, too few for a verdict')
     """
-    if clusters >= FEWEST and round(effective, 6) < FEWEST:
+    if clusters >= MIN_CLUSTERS and round(effective, 6) < MIN_CLUSTERS:
         return f"{counted(clusters, cluster)} count as {effective:.1f} equal ones, too few for a verdict"
     return f"{counted(clusters, cluster)} {'is' if clusters == 1 else 'are'} too few for a verdict"
 
@@ -271,7 +273,7 @@ def _number(value: float | None) -> float:
 
 
 SUMMARY = "summary.json"
-MOST = 30  # numbers: those of headlines that would be more are left out
+MAX_NUMBERS = 30  # numbers: those of headlines that would be more are left out
 Names = Mapping[str, str]
 
 
@@ -304,7 +306,7 @@ def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})
                 summary["_".join([*place, _short(column)])] = headline.model.values[at]
                 summary["_".join([*place, reference.name, _short(column)])] = reference.values[at]
     finite = {name: value for name, value in summary.items() if math.isfinite(value)}
-    return {name: _rounded(value) for name, value in list(finite.items())[: MOST - 1]}
+    return {name: _rounded(value) for name, value in list(finite.items())[: MAX_NUMBERS - 1]}
 
 
 def write_summary(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> bytes:

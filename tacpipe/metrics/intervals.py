@@ -24,15 +24,18 @@ from tacpipe.arrays import AnyArray, AnyFloats, Bools
 from tacpipe.errors import TacpipeError
 
 COVERAGE = 0.95
-LEAST = 3  # clusters of an interval; two show nothing of how much they vary
+MIN_INTERVAL_CLUSTERS = 3  # clusters of an interval; two show nothing of how much they vary
 DRAWS = 20_000  # simulated values of the largest of several statistics
 NODES, BISECTIONS = 64, 50  # nodes to integrate Student's density, and steps to invert it
-SMALLEST = 1e-12  # ratio of errors whose logarithm is taken
+MIN_RATIO = 1e-12  # ratio of errors whose logarithm is taken
 Statistic = Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to values (draw, value)
 
 
 class Estimate(NamedTuple):
-    """A value and its 95 % interval, or NaN if it is not defined, ends also with fewer than `LEAST` clusters."""
+    """A value and its 95 % interval.
+
+    All are NaN if the value is not defined; the ends are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
+    """
 
     mean: float
     low: float
@@ -94,7 +97,7 @@ def student_quantile(freedom: float, level: float) -> float:
 
 
 def effective_number(weights: AnyFloats) -> AnyFloats:
-    """Return how many equal clusters would be as certain as clusters of these weights (cluster, value), (value,).
+    """Return the effective number of clusters, shape (value,), for weights of shape (cluster, value).
 
     >>> effective_number(np.array([[1.0, 9.0], [1.0, 1.0]])).round(2).tolist()
     [2.0, 1.22]
@@ -107,19 +110,19 @@ def effective_number(weights: AnyFloats) -> AnyFloats:
 def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None = None) -> Jackknife:
     """Return values of sums (seed, cluster, part) with their standard errors.
 
-    ``weights`` (cluster, value) state how much each cluster counts; without them all count the same. Errors are NaN with
-    fewer than `LEAST` clusters, freedom where these are as certain as fewer equal ones, and both where a value is not
-    defined without one of the clusters.
+    ``weights`` (cluster, value) are the weights of clusters, equal by default. Errors are NaN with fewer than
+    `MIN_INTERVAL_CLUSTERS` clusters, and the degrees of freedom are NaN with a smaller effective number. Both are
+    NaN for a value that is undefined if a cluster is left out.
     """
     seeds, clusters, _ = sums.shape
     total = sums.sum(axis=(0, 1))
     mean = statistic(total[None])[0]
-    if clusters < LEAST:
+    if clusters < MIN_INTERVAL_CLUSTERS:
         undefined = np.full(len(mean), np.nan)
         return Jackknife(mean, undefined, undefined, np.full((clusters, len(mean)), np.nan))
     number = np.full(len(mean), float(clusters)) if weights is None else effective_number(weights)
     influence = _influence(statistic, total, sums.sum(axis=0))
-    variance, freedom = _variance(influence), np.where(number < LEAST, np.nan, number - 1)
+    variance, freedom = _variance(influence), np.where(number < MIN_INTERVAL_CLUSTERS, np.nan, number - 1)
     if seeds > 1:
         of_seeds = _variance(_influence(statistic, total, sums.sum(axis=1)))
         of_seeds = 2 * of_seeds if seeds == 2 else of_seeds  # a single difference: else intervals hold less than 92 %
@@ -167,7 +170,7 @@ def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
 
 def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
     """Return the logarithm of a ratio of errors, 1 - `skill`, bounded below, or NaN if the baseline never errs."""
-    ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), SMALLEST))
+    ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), MIN_RATIO))
     return ratio
 
 
@@ -209,7 +212,7 @@ def skill_interval(
     """Return the skill of sums of errors with its interval, each (value,), from ``model`` and ``baseline`` (item, value).
 
     ``clusters`` (item,) name what chance draws, by default each item. ``power`` is 0.5 for the skill of root mean squared
-    errors, from sums of squares. Ends are NaN with fewer than `LEAST` clusters.
+    errors, from sums of squares. Ends are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
     """
     values = model.shape[1]
     sums = _by_cluster(np.hstack([model, baseline]), clusters)

@@ -110,7 +110,7 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         gain = measure.gain(*map(measure.error, (draws[:, :width], draws[:, width:])))
-        return (-np.log(np.maximum(1 - gain, intervals.SMALLEST)) if measure.name == "skill" else gain)[:, None]
+        return (-np.log(np.maximum(1 - gain, intervals.MIN_RATIO)) if measure.name == "skill" else gain)[:, None]
 
     weights = measure.weight(sums.sum(axis=0)[:, width:])[:, None]
     effective = float(intervals.effective_number(weights)[0])
@@ -215,7 +215,7 @@ def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = Non
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         error = measure.error(draws)
-        return (np.log(np.maximum(error, intervals.SMALLEST)) if relative else error)[:, None]
+        return (np.log(np.maximum(error, intervals.MIN_RATIO)) if relative else error)[:, None]
 
     interval = intervals.jackknife(rows, statistic, measure.weight(rows.sum(axis=0))[:, None]).interval()
     ends = np.concatenate([interval.low, interval.high])

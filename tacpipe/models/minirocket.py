@@ -30,7 +30,7 @@ LENGTH = 9  # weights of a kernel
 HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
 KERNELS = len(HEAVY)  # 84
 DILATIONS = 32  # most dilations of a kernel
-MOST_CHANNELS = 9  # most channels that one kernel sums
+MAX_CHANNELS = 9  # most channels that one kernel sums
 GOLDEN = (5**0.5 + 1) / 2  # its multiples, modulo 1, fill the unit interval evenly
 BLOCK_BYTES = 2**18  # size of one channel of a block of slides: several such arrays fit into a cache of 1 MB
 COUNTED = 255  # positions that a byte can count
@@ -59,7 +59,7 @@ class Rocket:
         slides, frames, channels = x.shape
         rng = np.random.default_rng(seed)
         dilations, counts_per_kernel = _dilations(frames, features // KERNELS)
-        limit = min(channels, MOST_CHANNELS)
+        limit = min(channels, MAX_CHANNELS)
         channel_counts = (2 ** rng.uniform(0, np.log2(limit + 1), (len(dilations), KERNELS))).astype(int)
         drawn = rng.random((len(dilations), KERNELS, channels)).argsort(axis=-1).argsort(axis=-1)
         chosen = drawn < channel_counts[..., None]

@@ -244,7 +244,7 @@ View = Literal["all", "level", "level_removed"]
 VIEWS: tuple[View, ...] = get_args(View)
 ACROSS = (0.5, 0.75, 0.9, 1.0)  # quantiles of the channels at one moment
 OVER = (0.1, 0.25, 0.5, 0.75, 0.9)  # quantiles of a channel over the slide
-FEWEST = 3  # frames; fewer have no thirds and no turns
+MIN_FRAMES = 3  # frames; fewer have no thirds and no turns
 CHUNK = 64  # slides at once, which bounds memory
 
 
@@ -329,10 +329,10 @@ def statistics(x: AnyFloats) -> Float32s:
 
 
 def _check_slides(x: AnyFloats) -> None:
-    if x.ndim != 3 or x.shape[1] < FEWEST or not x.shape[2]:
+    if x.ndim != 3 or x.shape[1] < MIN_FRAMES or not x.shape[2]:
         raise TacpipeError(
-            f"Slides of {x.shape} have no statistics; they must be (slide, time, channel) with {FEWEST} frames or more and "
-            "a channel. Segment longer slides."
+            f"Slides of {x.shape} have no statistics; they must be (slide, time, channel) with at least {MIN_FRAMES} frames "
+            "and a channel. Segment longer slides."
         )
     if not np.isfinite(x).all():
         raise TacpipeError("Some slides hold values that are not finite. Segment them again, or leave these out.")

@@ -195,7 +195,9 @@ BANDS = 16
 PERIODS = (
     3.0  # fewest periods of the longest wave in the way; a slower one cannot be separated from a change of pressure
 )
-HIGHEST = 0.6  # fraction of the spatial frequency above which a sensor would take a wave for a longer one
+MAX_FREQUENCY_FRACTION = (
+    0.6  # fraction of the spatial frequency above which a sensor would take a wave for a longer one
+)
 LINES = 4  # spatial frequencies at which a band is read
 LEADING = 0.3  # fraction of the channels that are read, those pressed most; the others may not touch at all
 HOP = 0.25  # distance of windows, as a fraction of their length
@@ -238,16 +240,16 @@ class Bands:
 
     @classmethod
     def common(cls, sensors: Sequence[Sampling], number: int = BANDS) -> Bands:
-        """Return ``number`` bands, alike on a logarithmic scale, that all sensors can be read in.
+        """Return ``number`` bands of equal width on a logarithmic scale, within the range that all sensors resolve.
 
-        They begin at `PERIODS` in the shortest slide's way and end at the fraction `HIGHEST` of the lowest frequency that
-        a sensor could separate from others. Raises `TacpipeError` if nothing lies between.
+        The lowest edge has `PERIODS` periods in the shortest slide. The highest is `MAX_FREQUENCY_FRACTION` of the lowest
+        frequency limit of the sensors. Raises `TacpipeError` if this range is empty.
 
         >>> Bands.common([Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)]).edges_per_m[[0, -1]].round(3).tolist()
         [40.0, 300.0]
         """
         way_m = min(sampling.way_m for sampling in sensors)
-        lowest, highest = PERIODS / way_m, HIGHEST * min(sampling.highest_per_m for sampling in sensors)
+        lowest, highest = PERIODS / way_m, MAX_FREQUENCY_FRACTION * min(sampling.highest_per_m for sampling in sensors)
         if not lowest < highest:
             raise TacpipeError(
                 f"The shortest slide goes {way_m:.3g} m and shows waves of more than {lowest:.3g} periods a metre, but a "

@@ -16,7 +16,7 @@ from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.printable import plain
 
-MOST_BYTES = 1 << 20  # Largest TOML file
+MAX_TOML_BYTES = 1 << 20  # Largest TOML file
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class TomlFile:
         if not path:
             return path
         try:
-            content = regular.content(path, MOST_BYTES)
+            content = regular.content(path, MAX_TOML_BYTES)
         except FileNotFoundError:
             raise UsageError(f"There is no file {path}. Give the path of a TOML file.") from None
         try:

@@ -13,7 +13,7 @@ from tacpipe.report.blocks import table as table_of
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context
 
-MOST = 7  # rows of the table
+MAX_ROWS = 7  # rows of the table
 SHOWN = 4  # methods of a chart, and as many baselines
 CLAUSES = {
     headline.BETTER: "better than",
@@ -89,11 +89,11 @@ def first_table(context: Context) -> Table | None:
     if len(targets) > 1:
         return _by_target(context, parts, targets)
     firsts = [compared[0] for compared in parts.values()]
-    names = list(dict.fromkeys(row.name for comparison in firsts for row in _leaders(comparison)))[: MOST - 2]
+    names = list(dict.fromkeys(row.name for comparison in firsts for row in _leaders(comparison)))[: MAX_ROWS - 2]
     baselines = [row.name for first in firsts for row in [first.best_baseline] if row]
     baselines += [row.name for first in firsts for row in first.of("baseline") if row.name == first.measure.reference]
     baselines = list(dict.fromkeys(baselines))
-    baselines = baselines[: MOST - len(names)]
+    baselines = baselines[: MAX_ROWS - len(names)]
     single = len(firsts) == 1
     heads, kinds = [""], dict[int, str]()
     rows: list[Sequence[str | Cell]] = []
@@ -123,7 +123,7 @@ def _by_target(context: Context, parts: dict[str, list[Comparison]], targets: Se
         name = method.name if method else ""
         heads += [f"{part}: {name}", "best baseline", compared[0].measure.name]
     rows: list[Sequence[str | Cell]] = []
-    for target in targets[:MOST]:
+    for target in targets[:MAX_ROWS]:
         cells: list[str | Cell] = [target]
         for part, compared in parts.items():
             comparison = next((comparison for comparison in compared if comparison.question.target == target), None)
@@ -160,10 +160,10 @@ def _leaders(comparison: Comparison) -> list[ComparisonRow]:
     firsts: dict[str, ComparisonRow] = {}
     for row in comparison.models:
         firsts.setdefault(row.family, row)
-    heads = list(firsts.values())[: MOST - 2]
-    leading_names = {row.name for row in heads} | {row.name for row in comparison.models[: MOST - 2 - len(heads)]}
+    heads = list(firsts.values())[: MAX_ROWS - 2]
+    leading_names = {row.name for row in heads} | {row.name for row in comparison.models[: MAX_ROWS - 2 - len(heads)]}
     next_rows = [row for row in comparison.models if row.name not in leading_names][
-        : max(MOST - 2 - len(leading_names), 0)
+        : max(MAX_ROWS - 2 - len(leading_names), 0)
     ]
     return [row for row in comparison.models if row.name in leading_names or row in next_rows]
 

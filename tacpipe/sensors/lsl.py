@@ -93,7 +93,7 @@ class Lsl(Sensor):
         if packet[:1] == DESCRIPTION:
             return _described(packet) is not None
         opened = self._opened(packet)
-        return opened is not None and bool((np.abs(opened[1]) < lsl.LATEST_S).all())
+        return opened is not None and bool((np.abs(opened[1]) < lsl.MAX_TIME_S).all())
 
     def _opened(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
         """Return correction, stamps (sample,) in seconds and values (sample, channel); None: no samples of this stream."""

@@ -11,14 +11,14 @@ from itertools import pairwise
 import numpy as np
 
 from tacpipe.arrays import Int64s, Times
-from tacpipe.signals.clocks import MOST_DRIFT, STEP_NS, Segment
+from tacpipe.signals.clocks import MAX_DRIFT, STEP_NS, Segment
 
 NEIGHBOURS = 3  # measurements on either side of a jump that must lie apart for a reset
 LINE_ROWS, LINE_NS = (
     3,
     10_000_000_000,
 )  # least measurements and time of a line: a shorter one shows the errors of its measurements, no drift
-MOST_PAIRED = 512  # measurements whose pairs are looked at; of more, as many evenly spaced
+MAX_PAIRED = 512  # measurements whose pairs are looked at; of more, as many evenly spaced
 
 
 def fit_offsets(device_ns: Times, offset_ns: Int64s) -> tuple[Segment, ...]:
@@ -46,7 +46,7 @@ def resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
     """
     steps_ns = np.diff(device_ns)
     jumps_ns = np.diff(offset_ns)
-    suspected = (steps_ns < 0) | (np.abs(jumps_ns) > STEP_NS + MOST_DRIFT * np.abs(steps_ns))
+    suspected = (steps_ns < 0) | (np.abs(jumps_ns) > STEP_NS + MAX_DRIFT * np.abs(steps_ns))
     rows: list[int] = []
     for row in (np.flatnonzero(suspected) + 1).tolist():
         before = offset_ns[max(rows[-1] if rows else 0, row - NEIGHBOURS) : row]
@@ -77,7 +77,7 @@ def _line(start: int, stop: int, device_ns: Times, offset_ns: Int64s) -> Segment
     apart_ns = (offset_ns - offset_ns[0]).astype(np.float64)
     drift = 0.0
     if len(since_ns) >= LINE_ROWS and since_ns.max() - since_ns.min() >= LINE_NS:
-        step = -(-len(since_ns) // MOST_PAIRED)
+        step = -(-len(since_ns) // MAX_PAIRED)
         first, second = np.triu_indices(len(since_ns[::step]), 1)
         between_ns = since_ns[::step][second] - since_ns[::step][first]
         rises_ns = apart_ns[::step][second] - apart_ns[::step][first]

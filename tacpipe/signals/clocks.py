@@ -32,7 +32,7 @@ EARLY_NS = 100_000.0  # least distance below the first line beyond which a sampl
 LINE_ROWS, LINE_NS = 32, 2_000_000_000  # least rows and time of a line: a shorter one shows jitter, no drift
 HULL_BLOCKS = 512
 ENOUGH_ROWS = 1 << 14  # rows for a median and for the first line; the envelope itself uses all rows
-MOST_DRIFT = 0.1  # an RC oscillator is off by a few percent; beyond, the stamps are not nanoseconds
+MAX_DRIFT = 0.1  # an RC oscillator is off by a few percent; beyond, the stamps are not nanoseconds
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _drift(device_ns: Times, arrival_ns: Times) -> float | None:
     apart = arrival_ns - device_ns
     apart_ns = (apart - apart[0]).astype(np.float64)
     rough = _rough_drift(_some(since_ns), _some(apart_ns))
-    if rough is None or abs(rough) > MOST_DRIFT:
+    if rough is None or abs(rough) > MAX_DRIFT:
         rate = "none" if rough is None else f"{1 / (1 + rough):.4g}" if rough > -1 else "negative"
         raise TacpipeError(
             f"The device's clock runs at {rate} times the host's over {span_ns / 1e9:.4g} s; it must run within 10 % of "

@@ -20,7 +20,7 @@ WITHOUT_ROWS = "The level at rest cannot be distinguished from a recording witho
 # Yields the channels of a recording (time, channel) in blocks of one row or more, from the first row on.
 Blocks = Callable[[], Iterable[AnyArray]]
 ENDS = 2 / 3  # load at which contact ends, as a fraction of the load at which it starts
-LARGEST = 0.99  # quantile of the load that is its largest: a single wrong frame is none
+PEAK_QUANTILE = 0.99  # quantile of the load that is its largest: a single wrong frame is none
 
 
 class Thresholds(NamedTuple):
@@ -160,7 +160,7 @@ def noise_thresholds(
     230 counts, next to the 120 that were set by hand. Without any load the thresholds are infinite.
     """
     finite = np.isfinite(load)
-    largest = float(np.quantile(load[finite], LARGEST)) if finite.any() else 0.0
+    largest = float(np.quantile(load[finite], PEAK_QUANTILE)) if finite.any() else 0.0
     if largest <= 0:
         return Thresholds(np.inf, np.inf)
     at_rest = finite & ~repeated & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)

@@ -22,7 +22,7 @@ LEAN = 0.3  # value one sigma before or after the centre, as for the fingertip
 NOISE_COUNT = 2.25  # three times the fingertip's
 DEAD_COUNT = 6.0  # readings below are zero, those above less by it
 DRIFT_COUNT = 0.9  # random walk, counts after one second
-LARGEST_COUNT = 255.0
+MAX_COUNT = 255.0
 RATE_HZ, FRAMES = 50.0, 75
 START_M = ((-0.018, -0.010), (-0.003, 0.003))  # start of the patch's centre along and across the strip
 ROLL_M = ((0.012, 0.022), (-0.003, 0.003))  # its way during a slide
@@ -55,5 +55,5 @@ def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Float3
     """Return the taxels (time, taxel) as they are logged: with noise and drift, without the dead zone, clipped."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
-    counts: Float32s = (signal + noise_scale * noise - DEAD_COUNT).clip(0, LARGEST_COUNT).astype(np.float32)
+    counts: Float32s = (signal + noise_scale * noise - DEAD_COUNT).clip(0, MAX_COUNT).astype(np.float32)
     return counts

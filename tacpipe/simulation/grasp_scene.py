@@ -168,7 +168,7 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera
 SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # mean and standard deviation of object positions in the camera's view
-LEAST_POINTS = 800  # smallest size of a cloud, as in the published set
+MIN_POINTS = 800  # smallest size of a cloud, as in the published set
 TRIES = 100  # poses until one is seen and grasped
 SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 
@@ -256,7 +256,7 @@ def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
         at_m = (float(rng.normal(SEEN_AT_M[0], SPREAD_M)), float(rng.normal(SEEN_AT_M[1], SPREAD_M)))
         placed = depth_camera.place_shape(thing.shape, pose, float(rng.uniform(0, 2 * np.pi)), at_m, up, height_m)
         direction, depth_m = depth_camera.depths(placed)
-        if len(depth_m) < LEAST_POINTS:
+        if len(depth_m) < MIN_POINTS:
             continue
         points = depth_camera.measured(direction, depth_m, rig.noise_scale, rng)
         grasp = antipodal_grasps(placed, points.astype(np.float64), up, rig.shift, rng, central=rig.spheres)

@@ -36,7 +36,7 @@ BOX_M = (
 )  # region in which a person carries the object, relative to the start
 PEAK_M_S2 = (1.0, 8.0)  # peak acceleration of a minimum-jerk segment; the larger one is the limit of a leg's too
 REACH = (0.05, 1.0)  # fraction of the way to its random target per segment: short ones are shakes
-SHORTEST_S = 0.12  # segment
+MIN_SEGMENT_S = 0.12  # segment
 JERK_PEAK = 10 / np.sqrt(3)  # peak acceleration of a minimum-jerk segment of one metre in one second
 OVERLAP = (0.75, 1.15)  # start of the next segment, in lengths of this one
 TREMOR_HZ = 4.0
@@ -112,7 +112,7 @@ def kinaesthetic(rows: int, first: int, rng: np.random.Generator) -> Floats:
             target = at + (target - at) * rng.uniform(*REACH)
         distance = float(np.linalg.norm(target - at))
         peak = np.exp(rng.uniform(*np.log(PEAK_M_S2)))
-        length = max(round(np.sqrt(JERK_PEAK * distance / peak) * RATE_HZ), round(SHORTEST_S * RATE_HZ))
+        length = max(round(np.sqrt(JERK_PEAK * distance / peak) * RATE_HZ), round(MIN_SEGMENT_S * RATE_HZ))
         progress = np.clip((np.arange(rows) - row) / length, 0.0, 1.0)
         path += (target - at) * minimum_jerk(progress)[:, None]
         at, row = target, row + round(rng.uniform(*OVERLAP) * length)

@@ -20,7 +20,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sentence, unread, write_whole
 from tacpipe.store import layout
 
-AT_ONCE = 16  # requests on their way at once
+MAX_CONCURRENT = 16  # requests on their way at once
 
 
 class Entry(NamedTuple):

@@ -20,7 +20,7 @@ from tacpipe.io.files import Draft, present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
 from tacpipe.store.addresses import BucketAddress
-from tacpipe.store.backend import AT_ONCE
+from tacpipe.store.backend import MAX_CONCURRENT
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.remote import RemoteStore
 from tacpipe.store.store import AbsentError, MissingError, Object, Store
@@ -184,7 +184,7 @@ class CachedStore(Store):
         self.prepare()
         self.bucket  # noqa: B018  (before there are threads)
         with self._bar("downloading", len(absent)) as advance:
-            for _ in threads.map_in_threads(bring, absent, AT_ONCE if len(absent) > 1 else 1):
+            for _ in threads.map_in_threads(bring, absent, MAX_CONCURRENT if len(absent) > 1 else 1):
                 advance()
 
     def _bring(self, name: str, size: int | None = None) -> None:
@@ -253,7 +253,7 @@ class CachedStore(Store):
 
         with self._bar("uploading", len(names)) as advance:
             for name, _ in zip(
-                names, threads.map_in_threads(send, names, AT_ONCE if len(names) > 1 else 1), strict=True
+                names, threads.map_in_threads(send, names, MAX_CONCURRENT if len(names) > 1 else 1), strict=True
             ):
                 self._bucket_sizes[name] = os.lstat(self.object_path(name)).st_size
                 advance()

@@ -143,7 +143,7 @@ def _file(store: Store, directory: Path) -> Path:
 
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system is repaired between two starts of a computer
-_MOST_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
+_MAX_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
 _SAMPLE = 16  # files of which both ways to learn the inode are compared
 _MANIFEST = "manifest.json"  # A copy instead of a link, so its content is hashed whenever a note is used
 
@@ -192,7 +192,7 @@ class Look:
         changed = self._changed(note)
         if not all(self._lie(note.rows(shelf)) for shelf in changed):
             return False
-        if not listed and (head.directory != self._directory_state or len(changed) > _MOST_CHANGED):
+        if not listed and (head.directory != self._directory_state or len(changed) > _MAX_CHANGED):
             self._renew(note, changed)
         return True
 
@@ -268,7 +268,7 @@ class Look:
             settled = self._settled()
             directory_state = settled(self._directory_state) or note.head.directory
             states = {shelf: settled(self._shelves[shelf]) for shelf in changed}
-            gained = sum(state is not None for state in states.values()) > _MOST_CHANGED
+            gained = sum(state is not None for state in states.values()) > _MAX_CHANGED
             if directory_state == note.head.directory and not gained:
                 return
             shelves = {}

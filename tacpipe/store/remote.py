@@ -23,7 +23,7 @@ from tacpipe.io import regular, threads
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.printable import plain
 from tacpipe.store import layout, leases
-from tacpipe.store.backend import AT_ONCE, Backend, Entry, read_twice
+from tacpipe.store.backend import MAX_CONCURRENT, Backend, Entry, read_twice
 from tacpipe.store.leases import LEASE_BYTES, Run
 from tacpipe.store.remote_roots import RemoteRoots
 from tacpipe.store.store import AbsentError, MissingError, Object, parse_record, read_limit, record_content
@@ -37,7 +37,7 @@ _TRIES = 10  # Attempts to replace a record that others replace too
 class RemoteStore:
     """A store in a place such as a bucket, for `push` and `pull`. It may be used from several threads."""
 
-    at_once = AT_ONCE
+    at_once = MAX_CONCURRENT
 
     def __init__(self, files: Backend) -> None:
         self.files = files
@@ -171,7 +171,7 @@ class RemoteStore:
                     return entries_by_name
             if budget > 0:  # The listing is complete
                 return entries_by_name
-        entries = threads.map_in_threads(self.files.stat, remaining, AT_ONCE)
+        entries = threads.map_in_threads(self.files.stat, remaining, MAX_CONCURRENT)
         return entries_by_name | {
             remaining[path]: entry for path, entry in zip(remaining, entries, strict=True) if entry is not None
         }
@@ -318,7 +318,7 @@ class RemoteStore:
         """Yield keys and their records, by default all; damaged ones count as none."""
         if keys is None:
             keys = [Path(entry.name).stem for entry in self.files.list("records")]
-        for key, record in threads.map_in_threads(self._record, keys, AT_ONCE):
+        for key, record in threads.map_in_threads(self._record, keys, MAX_CONCURRENT):
             if record is not None:
                 yield key, record
 

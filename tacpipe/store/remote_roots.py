@@ -11,7 +11,7 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import threads
-from tacpipe.store.backend import AT_ONCE, Backend, read_twice
+from tacpipe.store.backend import MAX_CONCURRENT, Backend, read_twice
 from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, decoded, encoded, name_of, project_id, succeeding
 
 _OUTPUT = "output"  # Marks a root that a command wrote with the bucket as its store
@@ -115,7 +115,7 @@ class RemoteRoots:
     def _read(self, only: str = "") -> Iterator[tuple[str, Root | None]]:
         """Yield the name of each root, or of ``only`` one, and its newest version; None for a damaged one."""
         newest = {name: versions[-1] for name, versions in self._versions(only).items()}
-        return zip(newest, threads.map_in_threads(self._at, newest.values(), AT_ONCE), strict=True)
+        return zip(newest, threads.map_in_threads(self._at, newest.values(), MAX_CONCURRENT), strict=True)
 
     def _at(self, version: tuple[int, str]) -> Root | None:
         number, file = version

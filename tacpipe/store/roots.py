@@ -25,7 +25,7 @@ Root = dict[str, Any]
 ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
 PUSHES = 100  # manifests of a path that are remembered as pushed
-_LATEST_S = 1 << 40  # a time in a root is no later: the year 36,812
+_MAX_TIME_S = 1 << 40  # a time in a root is no later: the year 36,812
 
 
 class Roots:
@@ -190,7 +190,7 @@ def _formed(root: Root) -> bool:
     times = [version.get("written_s", 0) for version in (root, *history)] + [root.get("missing_since_s", 0)]
     return (
         all(isinstance(text, str) and "\0" not in text for text in texts)
-        and all(isinstance(time_s, int) and 0 <= time_s < _LATEST_S for time_s in times)
+        and all(isinstance(time_s, int) and 0 <= time_s < _MAX_TIME_S for time_s in times)
         and all(isinstance(version.get("lasting"), bool) for version in history)
         and isinstance(root.get("previous"), str | None)
         and root.get("kind") in (BESIDE, ABSOLUTE, PUSHED)

@@ -24,9 +24,12 @@ from tacpipe.simulation import fingertip, forearm, slide, texture
 
 FRAMES = 400  # frames from the middle of a BioTac's slide, as classifiers read them
 STEP_M = 0.0005  # distance between two places of a track
-SHORTEST_M = {"biotac": 0.002, "roboskin": 0.0035}  # wavelength that is compared; shorter ones do not pass the aperture
-LONGEST_M = 0.020  # longer ones went with the levels
-LEAST = 0.02  # fraction of the largest weight of a place; places with less do not count
+MIN_WAVELENGTH_M = {
+    "biotac": 0.002,
+    "roboskin": 0.0035,
+}  # wavelength that is compared; shorter ones do not pass the aperture
+MAX_WAVELENGTH_M = 0.020  # longer ones went with the levels
+MIN_WEIGHT = 0.02  # fraction of the largest weight of a place; places with less do not count
 GAINS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 MISFIT = 0.003  # fraction of a texture's power at other wave numbers than expected, of stretch, wear and levels
 FINE = 16  # wave numbers at which a taper's spectrum is known, between two of the periodogram
@@ -58,7 +61,7 @@ def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
     track = felt_track(seed, index, rig)
     size = 2 * len(track.taper)
     number = np.fft.rfftfreq(size, STEP_M)
-    compared = (number >= 1 / LONGEST_M) & (number <= 1 / SHORTEST_M[sensor])
+    compared = (number >= 1 / MAX_WAVELENGTH_M) & (number <= 1 / MIN_WAVELENGTH_M[sensor])
     observed = np.abs(np.fft.rfft(track.taper * track.texture_n, size)[compared]) ** 2
     floor = float((track.taper**2 * track.noise_n2).sum())
     window = np.abs(np.fft.fft(track.taper, FINE * size)) ** 2
@@ -96,7 +99,7 @@ def felt_track(seed: int, index: int, rig: slide.SlideRig) -> SlideTrack:
     place = ((at_m - at_m.min()) / STEP_M).astype(int).ravel()
     total = np.bincount(place, weight.ravel())
     summed = np.bincount(place, (weight * texture_n).ravel())
-    enough = total > LEAST * total.max()
+    enough = total > MIN_WEIGHT * total.max()
     span = slice(enough.argmax(), len(enough) - enough[::-1].argmax())
     total, summed, enough = total[span], summed[span], enough[span]
     divisor = np.where(enough, total, 1.0)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 REST_S = 0.2  # time at the start whose median is the level without load, where no segmentation gave a level
-LARGEST = 0.995  # quantile that is the end of a scale: a single wrong reading would darken all others
-LEAST = 0.5  # smallest end of a scale, in the unit of the values
+SCALE_QUANTILE = 0.995  # quantile that is the end of a scale: a single wrong reading would darken all others
+MIN_SCALE = 0.5  # smallest end of a scale, in the unit of the values
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ def scale(values: Floats) -> tuple[float, float]:
     low, high = float(finite.min()), float(finite.max())
     if low > 0.2 * high > 0:
         return low, high
-    reach = max(float(np.quantile(np.abs(finite), LARGEST)), LEAST)
-    return (-reach, reach) if float(np.quantile(finite, 1 - LARGEST)) < -0.1 * reach else (0.0, reach)
+    reach = max(float(np.quantile(np.abs(finite), SCALE_QUANTILE)), MIN_SCALE)
+    return (-reach, reach) if float(np.quantile(finite, 1 - SCALE_QUANTILE)) < -0.1 * reach else (0.0, reach)
 
 
 def binned(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: int) -> Floats:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow refuses its store of files
 MLFLOW_EXPERIMENT = "tacpipe"
 MLFLOW_TAG = "tacpipe.run"
-LONGEST_PARAM = 500  # letters of a param that every release stores
+MAX_PARAM_LENGTH = 500  # letters of a param that every release stores
 _DEFAULTS = {  # defaults where a user has not set these
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
@@ -76,7 +76,7 @@ class MLflow:
                 )
         else:
             self._run = self._client.create_run(experiment, run_name=name, tags={MLFLOW_TAG: name}).info.run_id
-            logged_params = [Param(key, str(value)[:LONGEST_PARAM]) for key, value in params.items()]
+            logged_params = [Param(key, str(value)[:MAX_PARAM_LENGTH]) for key, value in params.items()]
             self._client.log_batch(self._run, params=logged_params)
         return f"run {name} of experiment {experiment_name} at {self._uri}"
 

@@ -17,8 +17,8 @@ from tacpipe.arrays import Bools, Bytes, Floats, Int64s
 from tacpipe.plugins import extras
 
 NEEDED_BY = "Tracking markers"  # begins the error of a missing extra
-LEAST_DARKNESS = 0.12  # fraction by which a marker is darker than the gel around it
-LEAST_AREA_PX = 12  # smallest area of a marker
+MIN_DARKNESS = 0.12  # fraction by which a marker is darker than the gel around it
+MIN_AREA_PX = 12  # smallest area of a marker
 AREA_RATIO = 3.0  # largest ratio of a marker's area to the median area
 NEIGHBOURHOOD = 8  # the gel around a marker is a square of the image's width divided by this
 NEXT = 0.4  # distance from an expected place, in pitches, within which a detection is that marker
@@ -51,11 +51,11 @@ def detect(grey: Bytes) -> Floats:
     side = max(3, grey.shape[1] // NEIGHBOURHOOD | 1)
     smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
     around = cv2.boxFilter(smooth, -1, (side, side), borderType=cv2.BORDER_REPLICATE)
-    excess = np.clip(1 - smooth / np.maximum(around, 1) - LEAST_DARKNESS, 0, None)  # (height, width)
+    excess = np.clip(1 - smooth / np.maximum(around, 1) - MIN_DARKNESS, 0, None)  # (height, width)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((excess > 0).astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
     inside = (left > 0) & (top > 0) & (left + width < grey.shape[1]) & (top + height < grey.shape[0])
-    is_dot = inside & (area >= LEAST_AREA_PX) & (np.maximum(width, height) < 2.5 * np.minimum(width, height))
+    is_dot = inside & (area >= MIN_AREA_PX) & (np.maximum(width, height) < 2.5 * np.minimum(width, height))
     is_dot[0] = False  # the gel
     if not is_dot.any():
         return np.empty((0, 2))

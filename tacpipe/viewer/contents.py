@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 StageChain = Sequence[Mapping[str, Any]]  # the chain of a manifest: stages with their params
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
-MOST_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
+MAX_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
 STRIP_FRAMES = 8
 STRETCHES = 1200  # the image of all taxels has as many bins
 
@@ -170,7 +170,7 @@ def _strip(stream: str, stored: Columns) -> FrameStrip:
 
 
 def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: StageChain) -> DrawnContents:
-    long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MOST_VALUES}
+    long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MAX_VALUES}
     tables = {
         stream: _thinned(stored) if stream in long else stored.read(stored.column_names)
         for stream, stored in columns.items()
@@ -341,7 +341,7 @@ def _frames(stream: str, table: pa.Table) -> list[Frames]:
     return frames
 
 
-MOST = 40  # labels
+MAX_LABELS = 40  # labels
 
 
 def to_markdown(contents: DrawnContents) -> str:
@@ -350,8 +350,8 @@ def to_markdown(contents: DrawnContents) -> str:
     labels = contents.labels
     if labels:
         lines += ["| label | value |", "| --- | --- |"]
-        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(labels.items())[:MOST]]
-        lines += [f"| … | {len(labels) - MOST} more |"] if len(labels) > MOST else []
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(labels.items())[:MAX_LABELS]]
+        lines += [f"| … | {len(labels) - MAX_LABELS} more |"] if len(labels) > MAX_LABELS else []
     lines += ["", "| stream | rows | Hz |", "| --- | --- | --- |"]
     lines += [
         f"| {_cell(name or '-')} | {rows} | {rate_hz or ''} |" for name, (rows, rate_hz) in contents.rates.items()
@@ -362,7 +362,9 @@ def to_markdown(contents: DrawnContents) -> str:
         lines += [f"| the label | {_cell(contents.classification.label)} |"] if contents.classification.label else []
     elif contents.predicted:
         lines += ["", "| predicted | value |", "| --- | --- |"]
-        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(contents.predicted.items())[:MOST]]
+        lines += [
+            f"| {_cell(name)} | {_cell(value)} |" for name, value in list(contents.predicted.items())[:MAX_LABELS]
+        ]
     lines += [
         "",
         "**Maps of taxels**: colour is the distance from rest, an arrow the shear along x and y.",

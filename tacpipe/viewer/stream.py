@@ -29,9 +29,7 @@ NAMED = "named"
 AXES = "xyz"
 COMPARED = ("predicted", "residual")
 FRAMES_HZ = 60.0  # largest rate of maps and paths: that of a display
-MOST_ROWS = (
-    30_000  # points of a plot's line; a viewer cannot draw millions, so longer lines are drawn as their envelope
-)
+MAX_ROWS = 30_000  # points of a plot's line; a viewer cannot draw millions, so longer lines are drawn as their envelope
 POINTS = 4000  # points of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # bins and height of the carpet, in pixels
 BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in its rows
@@ -90,7 +88,7 @@ class RerunStream:
             [drawing.rgb(colour) for _, colour in names_and_colours],
         )
         if not self._all_rows:
-            t_ns, values = envelope(t_ns, values, MOST_ROWS)
+            t_ns, values = envelope(t_ns, values, MAX_ROWS)
         self._static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(names_and_colours)))
         self._columns(parts, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
 
@@ -119,7 +117,7 @@ class RerunStream:
         """Write the maps of fingers that share a scale of colours and of arrows."""
         low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
         shear = np.concatenate([np.linalg.norm(finger.change[:, :, :2], axis=2).ravel() for finger in fingers])
-        longest = max(float(np.nanquantile(shear, taxels.LARGEST)), taxels.LEAST) if group == "3" else 1.0
+        longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE) if group == "3" else 1.0
         for finger in fingers:
             self._map((MAPS, finger.name), finger, low, high, longest)
 
@@ -177,11 +175,11 @@ class RerunStream:
             magnitudes = np.concatenate([last.predicted.magnitude.ravel(), last.measured.magnitude.ravel()])
             low, high = taxels.scale(magnitudes)
             shear = np.linalg.norm(last.measured.change[:, :, :2], axis=2)
-            longest = max(float(np.nanquantile(shear, taxels.LARGEST)), taxels.LEAST)
+            longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE)
             predicted, residual = (map_name(name, compared, last.step) for compared in COMPARED)
             self._map((MAPS, predicted), last.predicted, low, high, longest)
             low, high = taxels.scale(last.residual.magnitude)  # one of its own, or small errors are not seen
-            self._map((MAPS, residual), last.residual, low, high, max(high, taxels.LEAST))
+            self._map((MAPS, residual), last.residual, low, high, max(high, taxels.MIN_SCALE))
 
     def _errors(self, name: str, steps: Sequence[DrawnForecast]) -> None:
         """Write the load of a finger as measured and as predicted at each step, and the errors."""

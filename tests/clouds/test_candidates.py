@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacpipe.arrays import Floats
-from tacpipe.clouds.candidates import MOST, Candidate, candidates
+from tacpipe.clouds.candidates import MAX_POINTS, Candidate, candidates
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError, UsageError
@@ -118,14 +118,14 @@ def test_the_order_of_points_does_not_matter(seed: int) -> None:
 
 
 def test_a_seed_gives_the_same_candidates_again_and_another_one_others() -> None:
-    cloud = shapes.cylinder(0.03, 0.2, points=MOST + 2000)  # More points than are looked at
+    cloud = shapes.cylinder(0.03, 0.2, points=MAX_POINTS + 2000)  # More points than are looked at
     first_ends, repeated_ends, other_ends = (ends(candidates(cloud, seed=seed)) for seed in (4, 4, 5))
     np.testing.assert_array_equal(first_ends, repeated_ends)
     assert not np.array_equal(first_ends, other_ends)
 
 
 def test_of_a_cloud_of_many_points_those_looked_at_lie_all_over_it() -> None:
-    dense = shapes.cylinder(0.03, 0.2, points=3 * MOST)
+    dense = shapes.cylinder(0.03, 0.2, points=3 * MAX_POINTS)
     along = Cloud(
         dense.points_m[np.argsort(dense.points_m[:, 1])]
     )  # the first third of the points is a third of the body

@@ -124,7 +124,7 @@ def test_a_contact_that_nothing_is_seen_of_has_no_shape() -> None:
 def test_colours_by_hand_those_of_contacts_being_the_nearest_points() -> None:
     cloud, grasp = on_box(points=2000)
     colours = np.zeros((2000, 3), np.uint8)
-    nearest = np.argsort(np.linalg.norm(cloud.points_m - grasp.g2_m, axis=1))[: geometry.NEAREST]
+    nearest = np.argsort(np.linalg.norm(cloud.points_m - grasp.g2_m, axis=1))[: geometry.COLOUR_POINTS]
     colours[nearest] = (200, 100, 50)
     features = geometry.features(Cloud(cloud.points_m, colours), grasp)
     assert [features[f"g2_colour_{name}"] for name in "rgb"] == [200, 100, 50]

@@ -96,7 +96,7 @@ def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interva
 
 def test_too_few_recordings_for_a_verdict_are_stated() -> None:
     comparison = compared(weighed(SMALL[:3], "a"))
-    assert f"below {headline.FEWEST}" in comparison.tables()[0].caption
+    assert f"below {headline.MIN_CLUSTERS}" in comparison.tables()[0].caption
     assert "below" not in compared(*WIDTHS).tables()[0].caption
 
 

@@ -616,7 +616,7 @@ def test_results_are_sent_while_others_are_computed_and_objects_still_come_befor
 
     monkeypatch.setattr(files, "create", creating)
     computers.run("first", SIMULATE.replace("--trials 3", "--trials 12"))
-    assert overlapping.is_set() and 1 < under_way[1] <= computing.AT_ONCE
+    assert overlapping.is_set() and 1 < under_way[1] <= computing.MAX_PENDING
     expect_whole(files)
     assert not [path for path in computers.store.root.glob("leases/*") if not path.name.startswith("run-")]
     computers.run("second", SIMULATE.replace("--trials 3", "--trials 12"))

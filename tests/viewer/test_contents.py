@@ -57,7 +57,7 @@ def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: p
     label = pa.table({"t_ns": touched["t_ns"], "contact": hand.labels()["contact"]}, hand.labels().schema.remove(2))
     recording = hand.recording(xela1=lost, marks=label)
     every_row = contents.of(recording)  # type: ignore[arg-type]
-    monkeypatch.setattr(contents, "MOST_VALUES", 100)
+    monkeypatch.setattr(contents, "MAX_VALUES", 100)
     monkeypatch.setattr(contents, "STRETCHES", 10)
     brief = contents.for_picture(recording)  # type: ignore[arg-type]
 

@@ -116,7 +116,7 @@ def test_spans_begin_and_end_at_their_moments(tmp_path: Path) -> None:
 
 
 def test_long_lines_are_envelopes_unless_all_rows_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.viewer.stream.MOST_ROWS", 500)
+    monkeypatch.setattr("tacpipe.viewer.stream.MAX_ROWS", 500)
     drawn = contents.of(hand.recording())  # type: ignore[arg-type]
     path = next(iter(name for name in write_and_read(tmp_path)[1] if name.startswith("/series/robot/robot\\ position")))
     for all_rows, row_limit in ((False, 500), (True, hand.SECONDS * hand.ARM_HZ)):

@@ -71,7 +71,7 @@ def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
 
 
 NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-_MOST = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
+_MAX_BATCH = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
 _CONNECT_S = 10
 _POLL_S = 1.0
 _abandoned: list[contextlib.ExitStack] = []  # clusters of an interrupted command, kept so that nothing closes them
@@ -141,7 +141,7 @@ class Dask:
             return
         versions = local_versions(tasks[0].name)
         workers = max(len(self._workers()), self._expected)
-        task_chunks = [[_absolute(task) for task in chunk] for chunk in divide_into_chunks(tasks, workers, _MOST)]
+        task_chunks = [[_absolute(task) for task in chunk] for chunk in divide_into_chunks(tasks, workers, _MAX_BATCH)]
         summary = f"{len(tasks)} tasks were given to {workers} workers"
         with (
             self._followed(tasks) as topic,

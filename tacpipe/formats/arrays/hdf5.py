@@ -30,7 +30,7 @@ BROKEN = (
     TypeError,
 )  # errors of h5py for damaged bytes
 ATTRIBUTE_BYTES = 1 << 27  # memory limit for reading an attribute
-MOST_RATIO = 10_000  # bytes of values that a byte of the file may hold
+MAX_COMPRESSION_RATIO = 10_000  # bytes of values that a byte of the file may hold
 FILTERS = {  # HDF5 numbers of the accepted filters; others may need libraries of the file's author
     *(1, 2, 3, 4, 5, 6),  # built into HDF5: deflate, shuffle, fletcher32, szip, nbit, scale-offset
     *(307, 32000, 32001, 32004, 32008, 32013, 32015, 32026),  # bzip2, lzf, blosc, lz4, bitshuffle, zfp, zstd, blosc2
@@ -91,7 +91,7 @@ class Hdf5Tree:
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` if they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        limit_bytes = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
+        limit_bytes = memory.MAX_BLOCK_BYTES + array.row_bytes * max(stop - start, 1) * 4
         place = f"{self.path}, {plain(array.path, 200)},"
         with (
             memory.bounded(limit_bytes, place) if array.dtype.hasobject else contextlib.nullcontext(),
@@ -251,9 +251,11 @@ def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescrip
         problem = "holds nothing"
     elif unknown := [number for number in _filters(member) if number not in FILTERS]:
         problem = f"is stored with the filter {unknown[0]}, which is not read"
-    elif member.chunks and (chunk_bytes := int(np.prod(member.chunks)) * member.dtype.itemsize) > memory.MOST_BLOCK:
+    elif (
+        member.chunks and (chunk_bytes := int(np.prod(member.chunks)) * member.dtype.itemsize) > memory.MAX_BLOCK_BYTES
+    ):
         problem = f"has chunks of {memory.readable_size(chunk_bytes)}, which are not read"
-    elif member.nbytes > max(memory.MOST_BLOCK, MOST_RATIO * member.id.get_storage_size()):
+    elif member.nbytes > max(memory.MAX_BLOCK_BYTES, MAX_COMPRESSION_RATIO * member.id.get_storage_size()):
         stored = memory.readable_size(member.id.get_storage_size())
         problem = f"declares {memory.readable_size(member.nbytes)} of values and holds {stored}"
     chunk_rows = member.chunks[0] if member.chunks else 0

@@ -33,9 +33,9 @@ from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
 MARKS = (".zgroup", ".zarray", "zarr.json")  # files that mark a folder as a group or an array
-MOST_CHUNKS = 1 << 20  # chunks per array
+MAX_CHUNKS = 1 << 20  # chunks per array
 UNPACKED_BYTES = 1 << 27  # memory limit for reading chunks, in addition to their values
-MOST_BYTES = 1 << 26  # size of a metadata file
+MAX_METADATA_BYTES = 1 << 26  # size of a metadata file
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
 BROKEN = (  # errors of zarr and its codecs for damaged bytes
     *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
@@ -129,9 +129,9 @@ class ZarrTree:
         spans = [range(math.ceil(size / step)) for size, step in zip(array.shape, shape, strict=True)]
         if spans:
             spans[0] = range(start // shape[0], math.ceil(stop / shape[0]))
-        if (count := math.prod(map(len, spans))) > MOST_CHUNKS:
+        if (count := math.prod(map(len, spans))) > MAX_CHUNKS:
             raise TacpipeError(
-                f"{self.path}: {plain(array.path, 200)} declares {count:,} chunks, and {MOST_CHUNKS:,} are read at most. "
+                f"{self.path}: {plain(array.path, 200)} declares {count:,} chunks, and {MAX_CHUNKS:,} are read at most. "
                 f"Write larger chunks; if its source is untrusted, do not use it."
             )
         return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
@@ -199,10 +199,10 @@ class ZarrTree:
         if self.names is None:
             path = regular.inside(self.path, name)
             with regular.failing(path):
-                return regular.content(path, MOST_BYTES)
+                return regular.content(path, MAX_METADATA_BYTES)
         with _archive(self.path) as archive:
-            if archive.getinfo(name).file_size > MOST_BYTES:
-                raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MOST_BYTES:,} bytes.")
+            if archive.getinfo(name).file_size > MAX_METADATA_BYTES:
+                raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MAX_METADATA_BYTES:,} bytes.")
             return archive.read(name)
 
     @contextlib.contextmanager
@@ -302,7 +302,7 @@ def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, A
         codecs = {str(codec) for codec in _codec_names(about)}
     except (TypeError, AttributeError):
         codecs = {"unnamed"}
-    if math.prod(steps) * kind.itemsize > memory.MOST_BLOCK and "sharding_indexed" not in codecs:
+    if math.prod(steps) * kind.itemsize > memory.MAX_BLOCK_BYTES and "sharding_indexed" not in codecs:
         problem = f"has chunks of {memory.readable_size(math.prod(steps) * kind.itemsize)}"
     if unknown := sorted(codecs - CODECS):
         problem = f"is stored with the codec {excerpt(unknown[0])}"

@@ -110,9 +110,9 @@ def _read_head(file: BinaryIO) -> tuple[int, int]:
 
 def _read_content(file: BinaryIO, length: int) -> bytes:
     """Return the next ``length`` bytes, or as many as there are: what is declared takes no memory."""
-    if length > memory.MOST_BLOCK:
+    if length > memory.MAX_BLOCK_BYTES:
         raise BrokenRecordError(
-            f"a record declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read"
+            f"a record declares {length:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are read"
         )
     parts: list[bytes] = []
     while length and (part := file.read(min(length, PIECE_BYTES))):
@@ -177,8 +177,8 @@ class _RecordConverter:
         (length,) = struct.unpack_from("<I", content, _CHUNK.size)
         begin = _CHUNK.size + 4 + length
         compression = bytes(content[_CHUNK.size + 4 : begin]).decode(errors="replace")
-        if size > memory.MOST_BLOCK:
-            problem = f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
+        if size > memory.MAX_BLOCK_BYTES:
+            problem = f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
             return LostChunk(problem, first_ns, last_ns)
         inside = _decompress(compression, content[begin + 8 :], size)
         view = memoryview(inside)

@@ -293,8 +293,10 @@ def _read_content(file: BinaryIO, size: int) -> tuple[bytes, bool]:
     """Return the bytes that follow a word with their length, as far as the file has them, and whether they are all."""
     length = _read_length(file)
     available = min(length, size - file.tell())
-    if available > memory.MOST_BLOCK:
-        raise BrokenRecordError(f"a chunk declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read")
+    if available > memory.MAX_BLOCK_BYTES:
+        raise BrokenRecordError(
+            f"a chunk declares {length:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are read"
+        )
     content = file.read(available)
     return content, len(content) == length
 
@@ -315,8 +317,8 @@ def _read_length(file: BinaryIO) -> int:
 
 def _decompress(compression: bytes, content: bytes, size: int) -> tuple[bytes, str]:
     """Return the unpacked content of a chunk, as far as it is intact, and a problem that completes "a chunk …"."""
-    if size > memory.MOST_BLOCK:
-        return b"", f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
+    if size > memory.MAX_BLOCK_BYTES:
+        return b"", f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
     inside = content
     try:
         if compression == b"bz2":

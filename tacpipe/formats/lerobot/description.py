@@ -322,6 +322,6 @@ def _column_names(path: Path) -> Sequence[str]:
 
 
 def _read_table(path: Path, names: Sequence[str] | None = None) -> Any:
-    parquet.require_claims(path, names, max_bytes=memory.MOST_BLOCK)
+    parquet.require_claims(path, names, max_bytes=memory.MAX_BLOCK_BYTES)
     with parquet_errors(path), regular.opened(path) as file:
         return pq.ParquetFile(file).read(columns=list(names) if names is not None else None)

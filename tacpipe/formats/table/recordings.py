@@ -243,7 +243,7 @@ def _describe_values(names: tuple[str, ...], values: tuple[str, ...]) -> str:
 
 
 LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates beyond these are probably stamps in another unit
-FEWEST_ROWS = 10  # rows needed to estimate a rate
+MIN_ROWS = 10  # rows needed to estimate a rate
 SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
 
 
@@ -319,7 +319,7 @@ def _with_rate_noted(
 
 def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> None:
     measured = [field for field in rows.schema if field.name != TIME and not pa.types.is_string(field.type)]
-    step_ns = float(np.median(np.diff(rows.column(TIME).to_numpy()))) if rows.num_rows >= FEWEST_ROWS else 0.0
+    step_ns = float(np.median(np.diff(rows.column(TIME).to_numpy()))) if rows.num_rows >= MIN_ROWS else 0.0
     if measured and step_ns and not LOWEST_HZ <= 1e9 / step_ns <= HIGHEST_HZ:
         notes.append(
             f"The stamps of {name} are {step_ns / 1e9:g} s apart, {1e9 / step_ns:,.6g} Hz, which few sensors have. Check "

@@ -129,7 +129,7 @@ DECIMAL = pa.decimal128(38, 18)  # the type that text is parsed as
 _UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
 _USUAL = 450_000_000  # limit for the high word of seconds (year 2233) below which products fit 64 bits
 _BEYOND = 10**37 >> 64  # limit for the high word, later than 2262 in every unit
-_LARGEST = 1e19  # later than 2262 in every unit, and below the least number that Arrow reads as another decimal
+_MAX_STAMP = 1e19  # later than 2262 in every unit, and below the least number that Arrow reads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, written by Python's logging
 
@@ -240,7 +240,7 @@ def overflows(rounded: pa.ChunkedArray) -> Bools:
     >>> overflows(pa.chunked_array([[1744849152.5, None, -1e34]]))
     array([False, False,  True])
     """
-    return np.asarray(np.abs(rounded.fill_null(0).to_numpy()) >= _LARGEST)
+    return np.asarray(np.abs(rounded.fill_null(0).to_numpy()) >= _MAX_STAMP)
 
 
 def _decimal_words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:

@@ -92,7 +92,7 @@ def _device(folder: Path, name: str) -> Path:
 
 LOOK_NS = 20_000_000  # period of checks for events without a descriptor
 FILL_S = 0.1  # period of checks whether to plan more frames
-LONGEST_S = 0.02  # longest wait
+MAX_WAIT_S = 0.02  # longest wait
 UNPACED_HZ = 2.0  # rate of sensors that state none, such as clouds
 
 
@@ -231,7 +231,7 @@ class Emulator:
                 }
             now_ns = time.monotonic_ns()
             next_ns = min([transmission.next_ns for transmission in transmissions])
-            wait_s = min(LONGEST_S, max(0.0, (next_ns - now_ns) / 1e9))
+            wait_s = min(MAX_WAIT_S, max(0.0, (next_ns - now_ns) / 1e9))
             ready, _, _ = select.select(owners, [], [], wait_s)
             now_ns = time.monotonic_ns()
             for number in ready:

@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 GET_SIZE, GET_DESCRIPTOR = 0x80044801, 0x90044802  # HIDIOCGRDESCSIZE and HIDIOCGRDESC of <linux/hidraw.h>
-MOST = 4096  # bytes of a descriptor or a report
+MAX_REPORT_BYTES = 4096  # bytes of a descriptor or a report
 LOOK_S = 0.02  # period of checks of a device that no host has open
 
 
@@ -47,7 +47,7 @@ def answering(descriptor: bytes) -> Any:
         if request == GET_SIZE:
             client.get_arg().resolve(0, 4).update(0, len(descriptor).to_bytes(4, "little"))
         elif request == GET_DESCRIPTOR:
-            client.get_arg().resolve(0, 4 + MOST).update(4, descriptor)
+            client.get_arg().resolve(0, 4 + MAX_REPORT_BYTES).update(4, descriptor)
         else:
             return False
         client.complete(0, 0)
@@ -60,7 +60,7 @@ def hear(number: int, board: int) -> None:
     """Report what hosts write to a device."""
     while select.select([board], [], []):
         try:
-            data = os.read(board, MOST)
+            data = os.read(board, MAX_REPORT_BYTES)
         except OSError:  # taken by another, or no host has it open
             time.sleep(LOOK_S)
             continue

@@ -55,7 +55,7 @@ def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
 
 TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
 TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
-MOST_READ = 4096
+MAX_READ_BYTES = 4096
 
 
 class HostPort:
@@ -125,7 +125,7 @@ class Pty:
     def ready(self, descriptor: int) -> list[tuple[HostPort, bytes]]:
         """Return what the host wrote."""
         try:
-            data = os.read(self._master, MOST_READ)
+            data = os.read(self._master, MAX_READ_BYTES)
         except BlockingIOError:
             return []
         except OSError:  # EIO: the host closed its port

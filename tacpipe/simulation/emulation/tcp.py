@@ -17,7 +17,7 @@ from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.endpoint import stretched
 
 HOST = "127.0.0.1"
-MOST_READ = 65_536
+MAX_READ_BYTES = 65_536
 
 
 class Connection:
@@ -62,7 +62,7 @@ class Connection:
     def read(self) -> bytes | None:
         """Return what the host wrote; None when it is gone."""
         try:
-            return self.socket.recv(MOST_READ) or None
+            return self.socket.recv(MAX_READ_BYTES) or None
         except BlockingIOError:
             return b""
         except OSError:

@@ -53,7 +53,7 @@ def next_due_ns(taken_ns: Times, pace: FramePace, after_ns: int, rng: np.random.
 
 AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
 IDLE_NS = 20_000_000  # period of checks of a stream without a receiver
-MOST_MESSAGES = 1000  # messages of the host that the ledger keeps
+MAX_MESSAGES = 1000  # messages of the host that the ledger keeps
 PAUSE_NS = 2_000_000  # pause between two tries of a patient device
 
 
@@ -227,7 +227,7 @@ class Transmission:
         """Have the device take what a host wrote: replies go first, then the frames that were asked for."""
         if not data:
             self.ledger.enter(now_ns, "connected")
-        elif len(self.ledger.events) < MOST_MESSAGES:
+        elif len(self.ledger.events) < MAX_MESSAGES:
             self.ledger.enter(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
         if replies and self._late and peer is self._awaited:  # after the frame that is half sent

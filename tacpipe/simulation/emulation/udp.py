@@ -12,8 +12,8 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
 
 HOST = "127.0.0.1"
-MOST = 65_536
-MOST_WAITING = 65_536  # bytes, of the 200 KiB that a queue has by default
+MAX_DATAGRAM_BYTES = 65_536
+MAX_WAITING_BYTES = 65_536  # bytes, of the 200 KiB that a queue has by default
 
 
 class Correspondent:
@@ -28,7 +28,7 @@ class Correspondent:
 
     def full(self) -> bool:
         """Return whether the host's queue is so full that the kernel may soon drop packets."""
-        return (waiting(self.target[1]) or 0) > MOST_WAITING
+        return (waiting(self.target[1]) or 0) > MAX_WAITING_BYTES
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send each piece as a datagram; those that the network refuses are lost."""
@@ -57,7 +57,7 @@ class Udp:
     def ready(self, descriptor: int) -> list[tuple[Correspondent, bytes]]:
         """Return the datagram that came; its sender is who is written to from now on."""
         try:
-            data, sender = self._socket.recvfrom(MOST)
+            data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
         except OSError:  # nothing came after all, or a refusal of what was sent
             return []
         if self._away:

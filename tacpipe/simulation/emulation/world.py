@@ -21,8 +21,8 @@ from tacpipe.signals import kinematics
 from tacpipe.simulation import mechanics, pick_and_move, trajectory
 
 READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # start pose of the robot's own examples
-LOWEST_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # Franka Emika, Panda documentation
-HIGHEST_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
+MIN_JOINT_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # Franka Emika, Panda documentation
+MAX_JOINT_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
 HAND_M = 0.107 + 0.1034  # distance of the fingertips from the last joint's frame, along its axis
 HAND_RAD = -np.pi / 4  # angle between the hand and the flange
 WAYPOINT_ROWS = 10  # rows of 1 ms between solved angles; interpolation moves the hand by less than 0.1 mm
@@ -65,7 +65,7 @@ def solved(position_m: Floats, yaw_rad: Floats) -> Floats:
         jacobian = np.concatenate([linear, axes], axis=2).transpose(0, 2, 1)  # (time, 6, joint)
         square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING * np.eye(6)
         step = np.einsum("tij,ti->tj", jacobian, np.linalg.solve(square, off[:, :, None])[:, :, 0])
-        angle = np.clip(angle + np.clip(step, -0.2, 0.2), LOWEST_RAD, HIGHEST_RAD)
+        angle = np.clip(angle + np.clip(step, -0.2, 0.2), MIN_JOINT_RAD, MAX_JOINT_RAD)
     return angle
 
 

@@ -40,7 +40,7 @@ UNCONDITIONAL = (
 )
 COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
 SHOWN = 2  # recordings whose forecast is drawn with its band
-MOST_ROWS = 600  # rows of each
+MAX_ROWS = 600  # rows of each
 STEP = 10  # ahead, that is drawn; the last one where the model predicts fewer
 
 
@@ -175,7 +175,7 @@ class _Drawn:
 
     def example(self, percents: Sequence[int]) -> dict[str, Any]:
         """Return the curves: time in s, what was measured, and each quantile."""
-        columns = np.array(self._rows[:MOST_ROWS]).T
+        columns = np.array(self._rows[:MAX_ROWS]).T
         names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
         return {
             **self._about,

@@ -30,8 +30,8 @@ HIDDEN = 32
 PASSES = 1200  # steps of the optimiser
 BATCH = 1024  # values of each, a value being a channel of a window
 LEARNING_RATE = 3e-3
-FEWEST = 100  # values to fit on
-LOWEST = 1e-3  # unit of a channel that never errs, as a fraction of the mean unit
+MIN_VALUES = 100  # values to fit on
+MIN_UNIT_FRACTION = 1e-3  # unit of a channel that never errs, as a fraction of the mean unit
 FARTHEST = 8.0  # deviations at which a feature is cut
 
 
@@ -56,15 +56,15 @@ class ResidualQuantiles:
         channel, feature). ``passes`` are steps of the optimiser. The same seed gives the same weights. Raises
         `TacpipeError` for fewer than 100 values, and where one is not finite.
         """
-        if errors.shape[0] * errors.shape[1] < FEWEST:
+        if errors.shape[0] * errors.shape[1] < MIN_VALUES:
             raise TacpipeError(
                 f"{errors.shape[0]} windows of {errors.shape[1]} channels are too few to fit quantiles on; there must be "
-                f"{FEWEST} values or more. Give longer recordings, or more of them."
+                f"{MIN_VALUES} values or more. Give longer recordings, or more of them."
             )
         if not (np.isfinite(features).all() and np.isfinite(errors).all()):
             raise TacpipeError("Some features or errors are not finite, so that no quantiles can be fitted to them.")
         unit = np.abs(errors).mean(axis=0)  # (channel, step)
-        unit = np.maximum(unit, LOWEST * unit.mean() or 1.0).astype(np.float32)
+        unit = np.maximum(unit, MIN_UNIT_FRACTION * unit.mean() or 1.0).astype(np.float32)
         rows = features.reshape(-1, features.shape[2])
         centre = rows.mean(axis=0, dtype=np.float64)
         spread = rows.std(axis=0, dtype=np.float64)
@@ -169,7 +169,7 @@ def _scaled(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:
 
 
 SIGNS = 13  # features beside the predicted change at each step
-LATEST = 3  # rows whose change is looked at beside that of the whole context
+LATEST_ROWS = 3  # rows whose change is looked at beside that of the whole context
 
 
 def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, scale: AnyFloats) -> Float32s:
@@ -193,7 +193,7 @@ def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, 
         np.log1p(np.abs(last) * 10),
         np.log1p(level.std(axis=1) * 100),
         np.arcsinh((last - level[:, 0]) * 100),
-        np.arcsinh((last - level[:, -min(LATEST, context)]) * 100),
+        np.arcsinh((last - level[:, -min(LATEST_ROWS, context)]) * 100),
         np.log1p(np.abs(steps).mean(axis=1) * 100) if context > 1 else np.zeros_like(last),
         repeated.mean(axis=1),
         *np.arcsinh((ahead / scale - last[:, None]) * 100).transpose(1, 0, 2),

@@ -14,7 +14,7 @@ from tacpipe.arrays import AnyArray, Bools, Float32s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
-from tacpipe.metrics.headline import FEWEST
+from tacpipe.metrics.headline import MIN_CLUSTERS
 from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.tasks.material.classifier import CONFIG, UNKNOWN_ANSWER, Classifier
 from tacpipe.tasks.material.sensor_calibration import (
@@ -202,7 +202,7 @@ def _rate(name: str, flags: Bools, materials: AnyArray | None = None) -> Tree:
     """Return the fraction of slides that are so, of how many, and its 95 % interval; nothing without slides.
 
     With ``materials`` (slide,) the interval is over materials, because the rate is about materials that nobody has seen,
-    and slides of one are alike: it is left out where these are fewer than `FEWEST`. Else it is Wilson's over slides.
+    and slides of one are alike: it is left out where these are fewer than `MIN_CLUSTERS`. Else it is Wilson's over slides.
     """
     if not len(flags):
         return {}
@@ -211,7 +211,7 @@ def _rate(name: str, flags: Bools, materials: AnyArray | None = None) -> Tree:
         low, high = wilson(int(flags.sum()), len(flags))
         return {**tree, f"{name}_low": low, f"{name}_high": high}
     tree[f"{name}_materials"] = len(np.unique(materials))
-    if tree[f"{name}_materials"] < FEWEST:
+    if tree[f"{name}_materials"] < MIN_CLUSTERS:
         return tree
     interval = share_interval(flags[:, None].astype(np.float64), np.ones((len(flags), 1)), materials).first
     return {**tree, f"{name}_low": interval.low, f"{name}_high": interval.high}

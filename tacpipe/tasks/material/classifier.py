@@ -35,7 +35,7 @@ from tacpipe.training.scaling import Affine
 
 TASK = "material"
 CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
-MOST_FRAMES = 100_000  # longest slide
+MAX_FRAMES = 100_000  # longest slide
 NEEDED = {
     **dict.fromkeys(("classes", "quantities"), list),
     **dict.fromkeys(("sensors", "params", "trained_on"), dict),
@@ -209,7 +209,7 @@ class Classifier:
         if self.naming.names and not set(self.classes) <= set(range(len(self.naming.names))):
             raise ValueError(f"there are {len(self.naming.names)} names for classes up to {max(self.classes)}")
         for name, layout in self.layouts.items():
-            if not 0 < layout.frames <= MOST_FRAMES:
+            if not 0 < layout.frames <= MAX_FRAMES:
                 raise ValueError(f"slides of {name} have {layout.frames} frames")
             noise = np.random.default_rng(0).normal(size=(2, layout.frames, len(layout.channels))).astype(np.float32)
             if self.baselines:

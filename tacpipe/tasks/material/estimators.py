@@ -30,8 +30,8 @@ from tacpipe.tasks.material.params import Estimator, MaterialModelParams, Networ
 SCHEMA = "schema.json"
 WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all members of a zip
 TRIED = 2  # slides
-SMALLEST = 1e-12  # probability
-LARGEST = 2**31  # bytes that a file may unpack to
+MIN_PROBABILITY = 1e-12  # probability
+MAX_UNPACKED_BYTES = 2**31  # bytes that a file may unpack to
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class FittedEstimator:
         """
         read = self._features(frames)
         if hasattr(self.estimator, "predict_proba"):
-            found: Floats = np.log(np.clip(self.estimator.predict_proba(read), SMALLEST, None))
+            found: Floats = np.log(np.clip(self.estimator.predict_proba(read), MIN_PROBABILITY, None))
         else:
             found = np.asarray(self.estimator.decision_function(read))
             found = np.stack([-found, found], axis=1) / 2 if found.ndim == 1 else found  # two classes
@@ -116,8 +116,8 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEs
         from skops.io import get_untrusted_types, loads
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as file:
-            if sum(member.file_size for member in file.infolist()) > LARGEST:
-                raise TacpipeError(f"{name} unpacks to more than {LARGEST >> 30} GiB, so it is not read.")
+            if sum(member.file_size for member in file.infolist()) > MAX_UNPACKED_BYTES:
+                raise TacpipeError(f"{name} unpacks to more than {MAX_UNPACKED_BYTES >> 30} GiB, so it is not read.")
         untrusted_types = get_untrusted_types(data=content)
         if refused := _refused(untrusted_types, params):
             raise TacpipeError(

@@ -41,7 +41,7 @@ COMPONENTS = 300  # upper limit
 PATTERNS = "patterns."  # begins the names of the tensors of patterns
 NAMES = ("classes", "centre", "projection", "gain", "overall", "slides", "labels")
 STEADY = 1e-6  # standard deviation below which a feature is constant
-SMALLEST = 1e-9  # squared distance
+MIN_SQUARED_DISTANCE = 1e-9  # squared distance
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _means(placed: Floats, labels: Ints) -> Floats:
 def _log_distances(slides: Floats, references: Floats) -> Floats:
     """Return the logarithm of the squared distance of each slide (slide, component) to each reference (slide, reference)."""
     squared = np.stack([np.square(slide - references).sum(axis=1) for slide in slides])
-    distances: Floats = np.log(np.maximum(squared, SMALLEST))
+    distances: Floats = np.log(np.maximum(squared, MIN_SQUARED_DISTANCE))
     return distances
 
 

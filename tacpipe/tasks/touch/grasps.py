@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 STREAMS = ("cloud", "grasp")
 READING = "reading"
-FEWEST = 3  # points of a cloud; fewer have neither surface nor main axis
+MIN_POINTS = 3  # points of a cloud; fewer have neither surface nor main axis
 FARTHEST_M = 0.1  # largest distance of a grasp point, maybe on a hidden side, from the cloud of its object
 
 
@@ -92,9 +92,9 @@ def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[.
 
 def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
     """Raise `TacpipeError` if a cloud has fewer than 3 points or lies more than 10 cm from a grasp point."""
-    if len(cloud) < FEWEST:
+    if len(cloud) < MIN_POINTS:
         raise TacpipeError(
-            f"{name} has a cloud of {len(cloud)} points; there must be {FEWEST} or more. Segment it again or leave it out."
+            f"{name} has a cloud of {len(cloud)} points; at least {MIN_POINTS} are needed. Segment it again or leave it out."
         )
     for point, place in (("g1", grasp.g1_m), ("g2", grasp.g2_m)):
         nearest_m = float(np.linalg.norm(cloud.points_m - place, axis=1).min())

@@ -26,7 +26,7 @@ from tacpipe.tasks.touch.inputs import Arrays, CloudInputs, CloudSources, PatchO
 from tacpipe.training.scaling import Affine
 
 LOSSES = ("rmse", "balanced")
-SMALLEST = 1e-6  # added under the root, as in the group's published code
+EPSILON = 1e-6  # added under the root, as in the group's published code
 WATCHED = 64  # grasps of a batch when nothing is learned
 SEEDS = 2**62
 
@@ -109,7 +109,7 @@ class TouchWork:
             )
         squared = (predicted - values) ** 2
         if self.loss_name == "rmse":
-            return torch.sqrt(squared.mean() + SMALLEST)
+            return torch.sqrt(squared.mean() + EPSILON)
         return (squared * self.weights).mean()
 
 
@@ -132,7 +132,7 @@ def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Flo
 
 
 NetworkParams = params_of.Patches | params_of.Pointnet
-LARGEST = 100_000  # points of a cloud, and times that they are drawn
+MAX_POINTS = 100_000  # points of a cloud, and times that they are drawn
 
 
 class Member(Protocol):
@@ -222,7 +222,7 @@ def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
 def checked(params: NetworkParams) -> None:
     """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
     for name, value in (("draws", params.draws), ("points", params.points)):
-        if not 0 < value <= LARGEST:
+        if not 0 < value <= MAX_POINTS:
             raise ValueError(f"{name} is {value}")
 
 

@@ -36,7 +36,7 @@ from tacpipe.tasks.touch.quantiles import ReadingQuantiles
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
-NEAREST = 3  # training grasps whose mean is predicted
+NEIGHBOUR_COUNT = 3  # training grasps whose mean is predicted
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Baselines:
         names = np.array(self.objects)
         same = [(names == name) & (names != "") for name in grasps.objects]  # (grasp)(training grasp,)
         reference_masks = [mask if mask.any() else np.ones_like(mask) for mask in same]
-        nearest = [np.argsort(np.abs(self.t_ns - t_ns), kind="stable")[:NEAREST] for t_ns in grasps.t_ns]
+        nearest = [np.argsort(np.abs(self.t_ns - t_ns), kind="stable")[:NEIGHBOUR_COUNT] for t_ns in grasps.t_ns]
         return {
             CONSTANT: {name: np.tile(values.mean(axis=0), (len(grasps), 1)) for name, values in self.readings.items()},
             OBJECT_MEAN: {
@@ -103,7 +103,7 @@ class Baselines:
         return cls(readings, objects, tensors["t_ns"].astype(np.int64))
 
 
-FEWEST = 3  # objects; with two, a model of one is asked about the other
+MIN_OBJECTS = 3  # objects; with two, a model of one is asked about the other
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ def fit_shrinkage(
     """
     names = np.asarray(objects)
     object_names = sorted(set(objects) - {""})
-    if len(object_names) < FEWEST:
+    if len(object_names) < MIN_OBJECTS:
         raise UsageError(
-            f"shrink_novel is set and training grasps are of {len(object_names)} objects; it needs {FEWEST} or more, which "
-            f"are left out one by one. Label objects, or leave out --shrink-novel."
+            f"--shrink-novel needs training grasps of at least {MIN_OBJECTS} objects, not {len(object_names)}, since each "
+            f"is left out once. Label objects, or leave out --shrink-novel."
         )
     products = {name: [0.0, 0.0] for name in readings}  # prediction times truth, prediction squared
     for name in object_names:

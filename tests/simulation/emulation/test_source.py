@@ -85,7 +85,7 @@ def test_the_hand_is_where_the_joints_carry_it() -> None:
     place, _ = world.hand_pose(kinematics.joint_frames(kinematics.PANDA, WORLD.joint_angles(t_ns)))
     assert np.abs(place - WORLD.arm(t_ns)[:, 1:4]).max() < 5e-4
     angles = WORLD.joint_angles(t_ns)
-    assert (angles >= world.LOWEST_RAD).all() and (angles <= world.HIGHEST_RAD).all()
+    assert (angles >= world.MIN_JOINT_RAD).all() and (angles <= world.MAX_JOINT_RAD).all()
 
 
 def test_the_joints_speeds_are_those_of_their_angles() -> None:

@@ -71,7 +71,7 @@ def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
     monkeypatch.setattr(training, "IN_MEMORY", 0)
     monkeypatch.setattr(training, "BLOCK_ROWS", 7)
     monkeypatch.setattr(spill, "SEGMENT_BYTES", 1 << 14)
-    monkeypatch.setattr(spill, "MOST_READ", 0)
+    monkeypatch.setattr(spill, "MAX_READ_BYTES", 0)
     assert model("on-disk") == in_memory
 
 

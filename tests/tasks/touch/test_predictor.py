@@ -145,7 +145,7 @@ def test_a_grasp_far_from_the_cloud_is_refused_with_the_distance(kind: str, mode
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_cloud_of_next_to_no_points_is_refused(kind: str, points: int, models: dict[str, TouchModel]) -> None:
     tiny = Cloud(np.tile(grasp(0).g1_m, (points, 1)).astype(np.float32), np.zeros((points, 3), np.uint8))
-    with pytest.raises(TacpipeError, match=f"The grasp has a cloud of {points} points; there must be 3 or more"):
+    with pytest.raises(TacpipeError, match=f"The grasp has a cloud of {points} points; at least 3 are needed"):
         models[kind].predict(tiny, grasp(0))
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 LOAD, SLIP = "load", "slip"
 NAMES = (LOAD, SLIP)
-LEAST = 1e-9  # smallest level: a forecast of no change never exceeds it
+MIN_LEVEL = 1e-9  # smallest level: a forecast of no change never exceeds it
 WORDS = {UNKNOWN: "unknown", OFF: "off", ON: "on"}
 
 
@@ -108,7 +108,7 @@ class Alarms:
 def _state(scores: AnyFloats, levels: AnyFloats) -> State:
     """Return the state of an alarm with these scores and levels (one,): the largest of those that have a level counts."""
     set_for = np.isfinite(levels)
-    score = float((scores[set_for] / np.maximum(levels[set_for], LEAST)).max(initial=0.0))  # NaN stays one
+    score = float((scores[set_for] / np.maximum(levels[set_for], MIN_LEVEL)).max(initial=0.0))  # NaN stays one
     is_known = bool(set_for.any()) and math.isfinite(score)
     return State(UNKNOWN if not is_known else ON if score > 1 else OFF, score if is_known else math.nan)
 

@@ -31,7 +31,7 @@ from tacpipe.tasks.forward.slips import events as events_of
 
 GAP_PERIODS = 5.0  # periods without a forecast that break the line
 BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip that is drawn enlarged
-MOST_SLIPS = 6  # slips that are drawn enlarged
+MAX_DRAWN_SLIPS = 6  # slips that are drawn enlarged
 MEASURED, PREDICTED, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
 
 
@@ -54,7 +54,7 @@ def draw(
     start_ns = int(truth_ns[0])
     alarm = recording.table("alarm").to_pandas()
     alarm_ns = alarm["t_device_ns"].to_numpy()
-    columns = max(1, min(MOST_SLIPS, len(slips_ns)))
+    columns = max(1, min(MAX_DRAWN_SLIPS, len(slips_ns)))
     figure = pyplot.figure(figsize=(12, 7.5), layout="constrained")
     grid = figure.add_gridspec(3, columns, height_ratios=(2, 1, 2))
     upper = figure.add_subplot(grid[0, :])
@@ -66,7 +66,7 @@ def draw(
         for begins_ns in slips_ns[:, 0].tolist():
             axes.axvline((begins_ns - start_ns) / 1e9, color=SLIPPED, linewidth=0.6, alpha=0.6)
     nears: list[Any] = []
-    for place, begins_ns in enumerate(slips_ns[:MOST_SLIPS, 0].tolist()):
+    for place, begins_ns in enumerate(slips_ns[:MAX_DRAWN_SLIPS, 0].tolist()):
         near = figure.add_subplot(grid[2, place], sharey=nears[0] if nears else None)
         nears.append(near)
         _near(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)

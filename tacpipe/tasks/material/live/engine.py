@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 GAP_NS = 50_000_000  # age of the newest sample of the finger, from which on its stream is silent
-LONGEST_NS = 120_000_000_000  # longest recording: its rows are kept until it ends
+MAX_DURATION_NS = 120_000_000_000  # longest recording: its rows are kept until it ends
 IDLE_NS = 20_000_000
 RESTARTED = "the model's process was started anew, and lacks what came before"
 THROWN = "blocks were thrown away under overload"
@@ -216,8 +216,10 @@ class MaterialEngine(Engine):
         if silent_ns > GAP_NS:
             return Answer(None, cause=f"nothing new comes from {self._finger}")
         t_ns = streams[self._finger].column("t_ns")
-        if t_ns[-1].as_py() - t_ns[0].as_py() > LONGEST_NS:
-            self._lacks = f"the recording is longer than {LONGEST_NS / 1e9:g} s; begin another one for the next slide"
+        if t_ns[-1].as_py() - t_ns[0].as_py() > MAX_DURATION_NS:
+            self._lacks = (
+                f"the recording is longer than {MAX_DURATION_NS / 1e9:g} s; begin another one for the next slide"
+            )
             return Answer(None, cause=self._lacks)
         return self._slide.answer(streams)
 

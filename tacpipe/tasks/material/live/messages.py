@@ -17,7 +17,7 @@ from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Val
 WAITING, SLIDING, ENDED, FINAL = "waiting", "sliding", "ended", "final"  # states of a slide
 MATERIAL = "material"  # the recorded stream
 RECORDED = (MATERIAL, LSL)
-LEAST_SEEN = 0.25  # default of the fraction of a slide before which its material is unknown
+MIN_SEEN = 0.25  # default of the fraction of a slide before which its material is unknown
 
 
 def _probability_columns(sizes: MessageSizes) -> list[LiveColumn]:

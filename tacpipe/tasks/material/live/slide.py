@@ -23,7 +23,7 @@ from tacpipe.sensors.live import LATENCY
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS
-from tacpipe.tasks.material.live.messages import LEAST_SEEN, MATERIAL
+from tacpipe.tasks.material.live.messages import MATERIAL, MIN_SEEN
 from tacpipe.tasks.material.slides import STREAM, difference
 
 if TYPE_CHECKING:
@@ -275,7 +275,7 @@ def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[R
         attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))
     )
     rate_hz = attributes.get("rate_hz")
-    least_seen = float(attributes.get(LEAST, LEAST_SEEN))
+    least_seen = float(attributes.get(LEAST, MIN_SEEN))
     slide = SlideSoFar(classifier, params, sensor, least_seen, float(rate_hz) if rate_hz else None)
     pause_ns = round(float(attributes.get(PAUSE, 0.0)) * 1e9)
     numbered_parts = enumerate(parts(slide, stream, pause_ns, tables), start=1)

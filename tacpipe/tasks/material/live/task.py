@@ -10,7 +10,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
 from tacpipe.printable import listed
-from tacpipe.tasks.material.live.messages import DECLARATION, LEAST_SEEN, MATERIAL, MaterialDescription
+from tacpipe.tasks.material.live.messages import DECLARATION, MATERIAL, MIN_SEEN, MaterialDescription
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
@@ -30,7 +30,7 @@ class MaterialSettings(TaskSettings):
     sensor: str = ""  # Sensor of the rig, of those that the model knows; by default its only one
     every_ms: Annotated[float, Range(10, 10_000)] = 100.0  # Time between two answers, ms [100]
     # Fraction of a slide before which its material is unknown [0.25]
-    least: Annotated[float, Range(above=0, maximum=1)] = LEAST_SEEN
+    least: Annotated[float, Range(above=0, maximum=1)] = MIN_SEEN
     # Pause after which a slide is over and another may begin, s; 0: a recording is one slide [0]
     pause_s: Annotated[float, Range(0, 60)] = 0.0
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
 
 
-MOST_PAIRS = 3  # pairs of materials in words
+MAX_PAIRS = 3  # pairs of materials in words
 CONFUSION_NOTE = (
     "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
 )
@@ -73,7 +73,7 @@ def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | lis
 def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
     """Return the materials most often taken for another, in words."""
     wrong = counts - np.diag(np.diag(counts))
-    order = np.argsort(-wrong, axis=None, kind="stable")[:MOST_PAIRS]
+    order = np.argsort(-wrong, axis=None, kind="stable")[:MAX_PAIRS]
     described = []
     for place in order:
         row, column = np.unravel_index(place, wrong.shape)

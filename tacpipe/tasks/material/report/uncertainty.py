@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ANSWERS = "answers.csv"
 UNKNOWN = "unknown"  # the answer for a slide like no material
-FEWEST = 20  # answers of a bin of stated probabilities
+MIN_BIN_COUNT = 20  # answers of a bin of stated probabilities
 RATES = np.linspace(0, 1, 101)  # rates of known slides answered unknown, at which curves are averaged over runs
 RELIABLE = (
     "Right against stated, in bins of as many slides each: on the thin line probabilities are frequencies. As trained: in "
@@ -115,9 +115,9 @@ def rate_of(rows: pd.DataFrame, column: str) -> Rate:
 def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
     """Return in which fraction of slides of unknown materials a column is true, with its interval over materials.
 
-    Ends are NaN with fewer than `headline.FEWEST` materials, and in results that do not name them.
+    Ends are NaN with fewer than `headline.MIN_CLUSTERS` materials, and in results that do not name them.
     """
-    if "label" not in rows or rows.label.nunique() < headline.FEWEST:
+    if "label" not in rows or rows.label.nunique() < headline.MIN_CLUSTERS:
         return rate_of(rows, column)._replace(low=float("nan"), high=float("nan"))
     interval = share_interval(rows[[column]].to_numpy(float), np.ones((len(rows), 1)), rows.label.to_numpy(str)).first
     return Rate(*interval, rows.recording.nunique())
@@ -139,7 +139,9 @@ def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
 def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFrame) -> Chart:
     """Return accuracy by stated probability, before and after the temperature."""
     known_rows = read[read.known].sort_values("probability", kind="stable")
-    bins = np.array_split(np.arange(len(known_rows)), int(np.clip(len(known_rows) // FEWEST, 1, calibration.BINS)))
+    bins = np.array_split(
+        np.arange(len(known_rows)), int(np.clip(len(known_rows) // MIN_BIN_COUNT, 1, calibration.BINS))
+    )
     binned = [
         (float(known_rows.iloc[indices].probability.mean()), rate_of(known_rows.iloc[indices], "right"))
         for indices in bins

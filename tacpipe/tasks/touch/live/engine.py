@@ -25,7 +25,7 @@ from tacpipe.tasks.touch.live.messages import TouchDescription, TouchMessage
 from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
 
 NPZ = ".npz"
-LARGEST_BYTES = 1 << 28  # limit of an NPZ file
+MAX_NPZ_BYTES = 1 << 28  # limit of an NPZ file
 
 
 def requested_grasps(record: Any) -> list[Grasp]:
@@ -76,8 +76,8 @@ def _file(name: str, folder: str) -> Cloud:
 
 def _npz(path: Path) -> Cloud:
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise TacpipeError(f"{path} is larger than {LARGEST_BYTES >> 20} MiB.")
+        if path.stat().st_size > MAX_NPZ_BYTES:
+            raise TacpipeError(f"{path} is larger than {MAX_NPZ_BYTES >> 20} MiB.")
         with np.load(path, allow_pickle=False) as content:
             points = np.asarray(content["points_m"], np.float32)
             colours = np.asarray(content["colours"]) if "colours" in content else None

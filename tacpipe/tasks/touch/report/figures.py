@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 PRESSURES = ("pdc_th", "pdc_mf")
-MOST_GRASPS = 800  # grasps of a figure
+MAX_GRASPS = 800  # grasps of a figure
 
 
 def pressure_folds(method: Method) -> list[Fold]:
@@ -48,7 +48,7 @@ def pressure_folds(method: Method) -> list[Fold]:
 def _pressure_chart(method: Method, target: str) -> Chart:
     rows = method.details[0].predictions
     total = len(rows.recordings)
-    rows = rows.rows(np.unique(np.linspace(0, total - 1, MOST_GRASPS).astype(int)))
+    rows = rows.rows(np.unique(np.linspace(0, total - 1, MAX_GRASPS).astype(int)))
     values = rows.true[target][:, 0], rows.predicted[MODEL][target][:, 0]
     dots = [
         {
@@ -187,7 +187,7 @@ def draw_fingertips(rows: Sequence[dict[str, object]]) -> charts.Spec:
 
 
 CLOUD, GRASP = "cloud", "grasp"
-MOST_CLOUDS = 3
+MAX_CLOUDS = 3
 NEAR_MM = 10.0  # distance to a grasp point: about where a fingertip of 6.7 mm radius lies
 POINTS = 700  # points of a cloud that are drawn
 VIEWS = {"from the camera": 0, "from the side": 2}  # coordinate that runs across; down is y in both
@@ -210,7 +210,7 @@ def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[
     shards = {name: shard for dataset in datasets for name, shard in dataset.recordings.items() if _has_grasp(shard)}
     if not shards:
         return []
-    first = dict.fromkeys(sorted(shards)[:MOST_CLOUDS], "")
+    first = dict.fromkeys(sorted(shards)[:MAX_CLOUDS], "")
     described = {name: words for name, words in chosen.items() if name in shards} or first
     drawn = [_cloud_chart(shards[name], words) for name, words in described.items()]
     return fold("Clouds and their grasps", Charts(drawn), SmallPrint(CLOUD_COLOURS))
