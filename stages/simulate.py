@@ -157,3 +157,39 @@ def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
     del values["trials"]
     seed = values.pop("seed")
     return simulate_trial(seed, trial, GraspRig(**values))
+
+
+@dataclass(frozen=True)
+class GelParams:
+    """Trials of the simulated pick-and-move rig with a gel in each finger, and the cameras behind the gels."""
+
+    trials: PositiveInt = 12  # recordings
+    seed: Seed = 0  # random seed
+    # length of a recording: approach, grasp, lift and move, then further moves
+    duration_s: Annotated[float, Range(4), Unit("s")] = 6.0
+    # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
+    effort: NonNegativeFloat = 0.0
+    friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
+    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
+    frame_rate_hz: PositiveInt = 25  # frames per second of each camera
+    drop_probability: Fraction = 0.002  # fraction of frames that are lost
+    noise_scale: NonNegativeFloat = 1.0  # times the noise of the cameras
+    # mean and standard deviation of a frame's latency
+    jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 2.0
+
+
+@stage(version=1)
+def gel(params: GelParams, trial: Trial) -> RecordingOutput:
+    """Simulate gels with printed markers, seen by cameras.
+
+    Each recording has the videos gel1 and gel2 of 320x240 pixels, robot and, with ground truth, truth, gel1_truth and
+    gel2_truth: the displacement of each marker, in pixels.
+
+    Example: tacpipe simulate gel --trials 4 -o data/gels
+    """
+    from tacpipe.simulation.gel import GelRig, simulate_trial
+
+    values = asdict(params)
+    del values["trials"]
+    seed = values.pop("seed")
+    return simulate_trial(seed, trial, GelRig(**values))

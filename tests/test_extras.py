@@ -95,6 +95,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest gelsight-slip gels -o {o}": "video",
+    "simulate gel --trials 1 --duration-s 4 -o {o}": "video",
     "extract difference data/gels -o {o}": "video",
     "extract markers data/gels -o {o}": "video",
     "ingest table workbooks --guess": "xlsx",

@@ -178,23 +178,33 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     return PickScene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
 
 
-def touch(scene: PickScene, finger: int, true_ns: Times, *, creep: float = taxels.CREEP) -> Floats:
-    """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis)."""
+def touch(
+    scene: PickScene,
+    finger: int,
+    true_ns: Times,
+    *,
+    creep: float = taxels.CREEP,
+    places_m: Floats = taxels.PLACES_M,
+) -> Floats:
+    """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis).
+
+    ``places_m`` (taxel, 2) are the taxels' places along the hand's x and z.
+    """
     contact = scene.contact
     rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
     at = interpolation(scene, true_ns)
     displacement, torque = at(contact.displacement_m), at(contact.torque_nm)
     pressures = [
-        at(contact.normal_n[:, j])[:, None] * taxels.fractions(skin, displacement, torque)
+        at(contact.normal_n[:, j])[:, None] * taxels.fractions(skin, displacement, torque, places_m)
         for j, skin in enumerate(scene.skins)
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
     pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
     late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
-    fraction = taxels.fractions(scene.skins[finger], displacement, torque)
+    fraction = taxels.fractions(scene.skins[finger], displacement, torque, places_m)
     pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * fraction
-    columns = slice(finger * schema.TAXELS, (finger + 1) * schema.TAXELS)
-    return np.concatenate([pulled[:, columns] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
+    columns = slice(finger * len(places_m), (finger + 1) * len(places_m))
+    return np.concatenate([pulled[:, columns] + taxels.bulge(pressed, places_m), pressed[:, :, None]], axis=2)
 
 
 def _measured(

@@ -57,14 +57,15 @@ def skin(rng: np.random.Generator) -> Skin:
     return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
 
 
-def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
+def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats, places_m: Floats = PLACES_M) -> Floats:
     """Return the fraction of the normal force that each taxel bears (time, taxel); they add up to one.
 
-    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it.
+    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it; taxels lie at
+    ``places_m`` (taxel, axis).
     """
     moved = skin.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
-    distance2 = ((PLACES_M - centre[:, None]) ** 2).sum(axis=2)
+    distance2 = ((places_m - centre[:, None]) ** 2).sum(axis=2)
     fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * skin.sigma_m**2))
     normalised: Floats = fraction / fraction.sum(axis=1, keepdims=True)
     return normalised
@@ -92,10 +93,10 @@ def shear(cap_n: Floats, load_n: Floats) -> Floats:
     return pulled
 
 
-def bulge(pressed_n: Floats) -> Floats:
+def bulge(pressed_n: Floats, places_m: Floats = PLACES_M) -> Floats:
     """Return by how much pressure (time, taxel) pushes each taxel outwards (time, taxel, 2), nothing in sum."""
     total = np.maximum(pressed_n.sum(axis=1, keepdims=True), 1e-12)
-    outwards = PLACES_M - (pressed_n @ PLACES_M / total)[:, None]
+    outwards = places_m - (pressed_n @ places_m / total)[:, None]
     pushed: Floats = BULGE * pressed_n[:, :, None] * outwards / PITCH_M
     return pushed
 

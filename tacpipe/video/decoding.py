@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.arrays import AnyArray, Bytes
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.printable import plain
+from tacpipe.video.encoding import RGB, JpegEncoder
 from tacpipe.video.stream import (
     BATCH_ROWS,
     DTS,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NEEDED_BY = "Reading video"  # begins the error of a missing extra
 MAX_DELAY = 16  # frames that a decoder may hold back
 DECODERS = {"av1": "libdav1d"}  # FFmpeg's own decoder of AV1 needs a graphics card
-RGB, GREY = "rgb24", "gray"  # FFmpeg's names
+GREY = "gray"  # FFmpeg's name
 
 
 def decode_frames(
@@ -59,16 +59,9 @@ def decode_samples(video_format: VideoFormat, batches: Iterable[pa.Table]) -> It
 
 def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, bytes]]:
     """Yield row number and JPEG of each frame as `decode_frames` does, for viewers: decoded, and encoded with some loss."""
-    with extras.explain_missing(NEEDED_BY):
-        import av
-    encoder: Any = av.CodecContext.create("mjpeg", "w")
-    encoder.width, encoder.height = video_format.width_px, video_format.height_px
-    encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 1000)
-    encoder.options = {"qmin": "2", "qmax": "2"}  # best quality
+    encoder = JpegEncoder(video_format.width_px, video_format.height_px, "yuvj420p")
     for row, frame in _decode(video_format, batches):
-        image = frame.reformat(format="yuvj420p")
-        image.pts, image.time_base = row, encoder.time_base
-        yield row, b"".join(bytes(packet) for packet in encoder.encode(image))
+        yield row, encoder.encode(frame)
 
 
 def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> Iterator[pa.Table]:

@@ -244,6 +244,7 @@ STAGES = (
     *_cases_of_chain("material", {3: "train.material"}),
     *_cases_of_chain("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
     *_cases_of_chain("touch", {3: "train.touch"}),
+    Case("simulate.gel", "simulate gel --trials 2 --duration-s 4 -o data/g", ()),
     Case(
         "extract.markers",
         "extract markers data/gels -o data/m --rows 2 --columns 3",

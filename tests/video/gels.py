@@ -7,6 +7,7 @@ import numpy as np
 from tacpipe.arrays import Bytes, Floats
 
 HEIGHT, WIDTH = 240, 320
+ERROR_PX = 0.2  # largest error that is promised
 RADIUS_PX, PITCH_PX = 5.0, 32.0
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from tacpipe.arrays import Bytes, Floats
 from tacpipe.video.markers import UNCONFIRMED_FRAMES, MarkerGrid, MarkerTracker, detect, find_grid
 from tests.video import gels
-
-ERROR_PX = 0.2  # largest error that is promised
+from tests.video.gels import ERROR_PX
 
 
 def grey(places_px: Floats, seed: int = 0) -> Bytes:
