@@ -6,13 +6,15 @@ import functools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
 
+Value = TypeVar("Value")
 
-def tensors_under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
+
+def tensors_under(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the entries whose name begins with ``prefix``, without it.
 
     >>> tensors_under("a.", {"a.weight": 1, "b.weight": 2})

@@ -16,16 +16,16 @@ from tacpipe.datasets import manifest
 from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import terminal
+from tacpipe.io import Json, terminal
 from tacpipe.io.hashing import digest
 from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
 from tacpipe.store.location import locate
 from tacpipe.store.store import Store
+from tacpipe.training.following import Line, NetworkLabels, TrainedNetwork, read_history
 from tacpipe.training.schedule import learning_rate
 
 Scalar = str | int | float | bool
-_LABELS = ("target", "network")  # labels in the lines of several networks
 
 
 class Tracker(Protocol):
@@ -47,7 +47,7 @@ class Tracker(Protocol):
         """End the run: its model or results are at ``path``, with these figures, or None if they were not made."""
 
 
-def flat_params(nested: Mapping[str, Any]) -> dict[str, Scalar]:
+def flat_params(nested: Json) -> dict[str, Scalar]:
     """Return params by dotted name; lists as text.
 
     >>> flat_params({"epochs": 2, "sweep": {"kind": "pca", "widths": [2, 4]}, "init": None})
@@ -56,7 +56,7 @@ def flat_params(nested: Mapping[str, Any]) -> dict[str, Scalar]:
     return dict(_leaves(nested, "."))
 
 
-def flat_figures(nested: Mapping[str, Any], under: str = "") -> dict[str, float]:
+def flat_figures(nested: Json, under: str = "") -> dict[str, float]:
     """Return the numbers in nested values by their path; what is not a finite number is left out.
 
     >>> flat_figures({"val_loss": 0.5, "best": True, "val": {"biotac": {"accuracy": 0.25}}, "note": "x"}, "a/")
@@ -65,26 +65,32 @@ def flat_figures(nested: Mapping[str, Any], under: str = "") -> dict[str, float]
     return {f"{under}{name}": float(value) for name, value in _leaves(nested, "/") if _is_number(value)}
 
 
-def flat_metrics(line: Mapping[str, Any], *, labelled: bool) -> dict[str, float]:
+def flat_metrics(line: Line, learning_rate: float | None = None, *, labelled: bool) -> dict[str, float]:
     """Return the metrics of a line of a history, below its labels if ``labelled``: where there are several networks.
 
     >>> flat_metrics({"epoch": 3, "val_loss": 0.5, "target": "pdc_th", "network": 1}, labelled=True)
     {'pdc_th/1/val_loss': 0.5}
     """
-    under = "".join(f"{line[name]}/" for name in _LABELS if name in line) if labelled else ""
-    return flat_figures({name: value for name, value in line.items() if name not in ("epoch", *_LABELS)}, under)
+    labels = _labels(line) if labelled else ()
+    metrics = {name: value for name, value in line.items() if name not in ("epoch", "target", "network")}
+    rate = {} if learning_rate is None else {LEARNING_RATE: learning_rate}
+    return flat_figures({**metrics, **rate}, "".join(f"{label}/" for label in labels if label is not None))
 
 
-def has_several_networks(lines: Iterable[Mapping[str, Any]]) -> bool:
+def has_several_networks(lines: Iterable[Line]) -> bool:
     """Return whether the lines of a history are of several networks."""
-    return len({tuple(line.get(name) for name in _LABELS) for line in lines}) > 1
+    return len({_labels(line) for line in lines}) > 1
+
+
+def _labels(line: Line) -> tuple[str | None, int | None]:
+    return line.get("target"), line.get("network")
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _leaves(value: Mapping[str, Any], between: str, name: str = "") -> Iterable[tuple[str, Scalar]]:
+def _leaves(value: Json, between: str, name: str = "") -> Iterable[tuple[str, Scalar]]:
     for key, entry in value.items():
         path = f"{name}{between}{key}" if name else str(key)
         if isinstance(entry, Mapping):
@@ -98,7 +104,6 @@ def _leaves(value: Mapping[str, Any], between: str, name: str = "") -> Iterable[
 CONFIG, HISTORY = "config.json", "history.jsonl"
 LEARNING_RATE = "learning_rate"
 _DIGITS = 8  # digits of a key that make a run's name unique
-Line = Mapping[str, Any]
 
 
 def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
@@ -137,24 +142,24 @@ class Tracking:
     failures: list[str] = field(default_factory=list)
     _started: bool = False
     _lines: int = 0
-    _labels: Mapping[str, Any] = field(default_factory=dict)
+    _labels: NetworkLabels = field(default_factory=NetworkLabels)
     _labelled: bool = False
 
     # ---- as a follower of trainings
 
-    def begin(self, network: Any, history: Sequence[Line]) -> None:
+    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Start the run with the first network, and add the epochs before an interruption."""
         self.start()
         self._labels, self._labelled = network.labels, network.count > 1
         for line in history:
-            self._add({**line, **self._labels}, {})
+            self._add({**line, **self._labels}, None)
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
         """Nothing: trackers have epochs."""
 
     def line(self, line: Line, rate: float) -> None:
         """Add an epoch."""
-        self._add({**line, **self._labels}, {LEARNING_RATE: rate})
+        self._add({**line, **self._labels}, rate)
 
     def end(self, *, trained: bool) -> None:
         """Nothing: the run ends once its model is published."""
@@ -177,10 +182,11 @@ class Tracking:
         did not come from another computer.
         """
         config = _tree(files.get(CONFIG, b"{}"))
+        model_params = flat_params(config.get("params", {}))
         if not self._started:  # nothing was trained: a stored model, or a result, whose params are its model's
-            self.params = {**flat_params(config.get("params", {})), **self.params}
+            self.params = {**model_params, **self.params}
         self.start()
-        self.replay(files.get(HISTORY, b""), config.get("params", {}))
+        self.replay(files.get(HISTORY, b""), model_params)
         values = flat_figures(config.get("validation") or {}, "best/")
         if headline.FILE in files:  # a result: those of an older version have no summary
             stored = _tree(files.get(headline.SUMMARY, b"{}"))
@@ -188,9 +194,9 @@ class Tracking:
         for option, tracker_client in list(self.trackers.items()):
             self._call(option, functools.partial(tracker_client.end, path, values))
 
-    def replay(self, history: bytes, model_params: Mapping[str, Any]) -> None:
+    def replay(self, history: bytes, model_params: Mapping[str, Scalar]) -> None:
         """Add the epochs of a stored history that were not added yet; ``model_params`` state the learning rate."""
-        lines = [json.loads(line) for line in history.splitlines() if line.strip()]
+        lines = read_history(history)
         self._labelled = has_several_networks(lines)
         for line in lines[self._lines :]:
             self._add(line, _rate(model_params, line["epoch"]))
@@ -201,9 +207,9 @@ class Tracking:
             for option, tracker_client in list(self.trackers.items()):
                 self._call(option, functools.partial(tracker_client.end, None, {}))
 
-    def _add(self, line: Line, additions: Mapping[str, float]) -> None:
+    def _add(self, line: Line, rate: float | None) -> None:
         self._lines += 1
-        values = flat_metrics({**line, **additions}, labelled=self._labelled)
+        values = flat_metrics(line, rate, labelled=self._labelled)
         for option, tracker_client in list(self.trackers.items()):
             self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), values))
 
@@ -222,15 +228,15 @@ class Tracking:
             return None
 
 
-def _rate(model_params: Mapping[str, Any], epoch: int) -> dict[str, float]:
-    """Return the learning rate of an epoch of a stored model, or nothing if its params do not state it."""
+def _rate(model_params: Mapping[str, Scalar], epoch: int) -> float | None:
+    """Return the learning rate of an epoch of a stored model, or None if its params do not state it."""
     peak, epochs = model_params.get("learning_rate"), model_params.get("epochs")
     if not isinstance(peak, int | float) or not isinstance(epochs, int) or epochs < 1:
-        return {}
-    return {LEARNING_RATE: learning_rate(peak, (epoch - 1) / epochs, cycle=bool(model_params.get("cycle")))}
+        return None
+    return learning_rate(peak, (epoch - 1) / epochs, cycle=bool(model_params.get("cycle")))
 
 
-def _tree(content: bytes) -> dict[str, Any]:
+def _tree(content: bytes) -> Json:
     value = json.loads(content)
     return value if isinstance(value, dict) else {}
 

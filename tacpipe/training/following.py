@@ -9,16 +9,49 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import NotRequired, Protocol, TypedDict
 
 from tacpipe.io import terminal, termination
 
 HISTORY = "history.jsonl"
-Line = dict[str, Any]  # one line of the history: the results of an epoch, as JSON holds them
+
+
+def read_history(content: bytes) -> list[Line]:
+    """Return the lines of a history file."""
+    return [json.loads(line) for line in content.splitlines() if line.strip()]
+
+
+def history_bytes(history: Iterable[Line]) -> bytes:
+    """Return the content of a history file: one JSON line per epoch."""
+    return "".join(json.dumps(line) + "\n" for line in history).encode()
+
+
+class NetworkLabels(TypedDict, total=False):
+    """Names of a network in its lines, where a stage trains several."""
+
+    target: str
+    network: int
+
+
+class Validated(TypedDict):
+    """Results of a validation: the loss, and of joint training those of each sensor."""
+
+    val_loss: float
+    alignment: NotRequired[float | None]
+    train: NotRequired[dict[str, dict[str, float | None]]]  # sensor to the mean of each part of the training loss
+    val: NotRequired[dict[str, dict[str, float]]]  # sensor to the validation accuracy and the parts of its loss
+
+
+class Line(Validated, NetworkLabels):
+    """One line of the history: the results of an epoch, as JSON holds them."""
+
+    epoch: int  # from 1
+    train_loss: float
+    best: NotRequired[bool]  # true if a part of the model was never as good before
 
 
 @dataclass(frozen=True)
@@ -28,7 +61,7 @@ class TrainedNetwork:
     epochs: int  # upper limit
     number: int = 1
     count: int = 1
-    labels: Mapping[str, Any] = field(default_factory=dict)  # are added to each of its lines
+    labels: NetworkLabels = field(default_factory=NetworkLabels)  # are added to each of its lines
 
     @property
     def name(self) -> str:
@@ -130,7 +163,7 @@ class _HistoryFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._handle: int | None = None
-        self._labels: Mapping[str, Any] = {}
+        self._labels: NetworkLabels = {}
         self._failed = False
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
@@ -148,7 +181,7 @@ class _HistoryFile:
     def line(self, line: Line, learning_rate: float) -> None:
         if self._handle is not None:
             with self._forgiven():
-                os.write(self._handle, (json.dumps({**line, **self._labels}) + "\n").encode())
+                os.write(self._handle, history_bytes([{**line, **self._labels}]))
 
     def end(self, *, trained: bool) -> None:
         pass
@@ -175,18 +208,39 @@ class _HistoryFile:
 
 
 BATCH_S = 0.5  # least time between two messages about batches: each reads the loss
-Message = dict[str, Any]
+
+
+class NetworkFields(TypedDict):
+    """The fields of `TrainedNetwork`."""
+
+    epochs: int
+    number: int
+    count: int
+    labels: NetworkLabels
+
+
+class TrainingMessage(TypedDict, total=False):
+    """A call of a follower as JSON: ``begin`` and ``history``, ``batch`` and ``loss``, ``line`` and its rate, or ``end``."""
+
+    begin: NetworkFields
+    history: list[Line]
+    batch: float
+    loss: float
+    line: Line
+    learning_rate: float
+    end: bool
 
 
 class Sender:
     """A follower that sends what it is called with."""
 
-    def __init__(self, send: Callable[[Message], None]) -> None:
+    def __init__(self, send: Callable[[TrainingMessage], None]) -> None:
         self._send, self._sent_s = send, time.monotonic()
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Send which network is trained, and its epochs before an interruption."""
-        self._send({"begin": {**asdict(network), "labels": dict(network.labels)}, "history": list(history)})
+        fields = NetworkFields(epochs=network.epochs, number=network.number, count=network.count, labels=network.labels)
+        self._send({"begin": fields, "history": list(history)})
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
         """Send how far an epoch is, every half second at most."""
@@ -215,7 +269,7 @@ class Receiver:
         self._network: TrainedNetwork | None = None
         self._epochs = 0  # epochs of the network that the followers have received
 
-    def take(self, message: Message) -> None:
+    def take(self, message: TrainingMessage) -> None:
         """Call the followers with what a message holds."""
         if "begin" in message:
             self._begin(TrainedNetwork(**message["begin"]), message["history"])

@@ -30,7 +30,7 @@ from tacpipe.io.files import readable_errors, sync_folder, write_whole
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.models.tensors import tensors_under
 from tacpipe.training import following
-from tacpipe.training.following import Followers, TrainedNetwork
+from tacpipe.training.following import Followers, NetworkLabels, TrainedNetwork, Validated
 from tacpipe.training.following import Line as Line
 from tacpipe.training.schedule import Schedule as Schedule
 
@@ -105,13 +105,14 @@ FILE = "checkpoint"
 log = logging.getLogger(__name__)
 
 
-def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Sequence[Line]) -> None:
     """Replace the checkpoint in ``folder``; after return it is on disk, and before it the old one is whole.
 
-    Its first line is the digest of the rest, a safetensors file with the state as JSON in its header: two files could be
+    Its first line is the digest of the rest, a safetensors file with the history as JSON in its header: two files could be
     torn apart by a crash between them, and training must not resume from a weight that a disk has changed.
     """
-    content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": json.dumps(state)})
+    state = json.dumps({"history": history})
+    content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": state})
     signed = bytes_digest(content).encode() + b"\n" + content
     with readable_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -121,8 +122,8 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], state: Mapping
         sync_folder(str(folder))
 
 
-def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Return tensors and state of the checkpoint in ``folder``, or None if there is none or it is damaged."""
+def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], list[Line]] | None:
+    """Return tensors and history of the checkpoint in ``folder``, or None if there is none or it is damaged."""
     path = folder / FILE
     try:
         signed = regular.content(path, follow=False)
@@ -138,7 +139,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | 
             raise ValueError("its bytes do not give its digest")
         size = int.from_bytes(content[:8], "little")
         state = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["state"])
-        return load(content), state
+        return load(content), state["history"]
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, error)
         return None
@@ -164,7 +165,7 @@ class TrainingWork(Protocol):
     def loss(self, model: nn.Module, batch: Any, epoch: int) -> tuple[Tensor, int]:
         """Return the loss to be lowered and the weight of the batch in the epoch's mean."""
 
-    def watch(self, model: nn.Module) -> Line:
+    def watch(self, model: nn.Module) -> Validated:
         """Return ``val_loss`` and whatever else the epoch's line of the history shall hold."""
 
     def ranks(self, line: Line) -> Mapping[str, Sequence[float]]:
@@ -198,7 +199,7 @@ class WindowTraining:
         """Return the mean loss of the windows with these indices, and their number."""
         return self.training.loss(model, batch), len(batch)
 
-    def watch(self, model: nn.Module) -> Line:
+    def watch(self, model: nn.Module) -> Validated:
         """Return the mean loss over all validation windows."""
         total: Tensor | float = 0.0
         for indices in _pieces(torch.arange(self.validation.count), self.batch):
@@ -218,11 +219,6 @@ class Trained:
     history: list[Line]
     last: dict[str, Tensor]
 
-    @property
-    def history_lines(self) -> bytes:
-        """The history as JSON lines, one an epoch."""
-        return "".join(json.dumps(line) + "\n" for line in self.history).encode()
-
 
 @dataclass
 class _TrainingState:
@@ -239,13 +235,13 @@ class _TrainingState:
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
         tensors |= {f"adam.{slot}.{name}": value for slot, moments in slots.items() for name, value in moments.items()}
         tensors["random"] = torch.get_rng_state()
-        write_checkpoint(folder, tensors, {"history": self.history})
+        write_checkpoint(folder, tensors, self.history)
 
     def resume(self, folder: Path) -> None:
         saved = read_checkpoint(folder)
         if saved is None:
             return
-        tensors, state = saved
+        tensors, self.history = saved
         self.model.load_state_dict(tensors_under("model.", tensors))
         self.best = tensors_under("best.", tensors)
         slots: dict[int, dict[str, Tensor]] = {}
@@ -254,7 +250,6 @@ class _TrainingState:
             slots.setdefault(int(slot), {})[tensor] = value
         self.optimiser.load(slots)
         torch.set_rng_state(tensors["random"])
-        self.history = state["history"]
 
     def over(self, schedule: Schedule) -> bool:
         if len(self.history) >= schedule.epochs:
@@ -272,7 +267,7 @@ def train(
     weight_decay: float = 0.0,
     number: int = 1,
     count: int = 1,
-    labels: Mapping[str, Any] | None = None,
+    labels: NetworkLabels | None = None,
 ) -> Trained:
     """Return the best weights of the model that ``build`` makes, trained to lower the loss of ``work``.
 
@@ -334,7 +329,7 @@ def _epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, follower
     run.model.eval()
     with torch.no_grad():
         watched = work.watch(run.model)
-    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}
+    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}  # type: ignore[typeddict-item]  # no labels
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."

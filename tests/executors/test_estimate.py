@@ -8,17 +8,20 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import grid
-from tacpipe.training.following import TrainedNetwork
+from tacpipe.training.following import Line, TrainedNetwork
 from tests.conftest import Lab
 
 TRAIN = "train forward data/segments --split data/split --hidden 8 --epochs 2"
+
+
+EPOCH: Line = {"epoch": 1, "train_loss": 1.0, "val_loss": 0.5}
 
 
 def test_what_is_left_of_all_networks_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 10.0, 11.0, 13.0, 15.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     stopwatch = grid._Stopwatch()
-    stopwatch.begin(TrainedNetwork(epochs=20, number=2, count=3), [{}] * 5)
+    stopwatch.begin(TrainedNetwork(epochs=20, number=2, count=3), [EPOCH] * 5)
     stopwatch.batch(0.1, lambda: 0.0)  # the first one is not counted
     stopwatch.batch(0.2, lambda: 0.0)
     with pytest.raises(grid._TimedError):

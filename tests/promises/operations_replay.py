@@ -51,9 +51,9 @@ class Replay:
             self._read = noted
             return noted
 
-        def saving(folder: Path, tensors: Any, state: Any) -> None:
-            self._events.append(("save", {name: tensor.clone() for name, tensor in tensors.items()}, _copy(state)))
-            self._save(folder, tensors, state)
+        def saving(folder: Path, tensors: Any, history: Any) -> None:
+            self._events.append(("save", {name: tensor.clone() for name, tensor in tensors.items()}, _copy(history)))
+            self._save(folder, tensors, history)
 
         def resuming(folder: Path) -> Any:
             self._events.append(("resume",))

@@ -17,6 +17,7 @@ from tacpipe.plugins import registry
 from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracking
 from tacpipe.training import following, loop
+from tacpipe.training.following import Line, history_bytes
 from tacpipe.training.loop import Trained
 from tests.chain import TRAIN
 from tests.conftest import Lab
@@ -56,30 +57,28 @@ def training(folder: Path, *trackers: Kept, loss_of: Any = loss) -> tuple[Traine
         return run(folder, loss_of), tracked
 
 
-def history(lines: list[dict[str, Any]]) -> bytes:
-    return "".join(json.dumps(line) + "\n" for line in lines).encode()
-
-
 def test_a_tracker_gets_params_then_every_epoch_then_the_figures_and_the_path(tmp_path: Path) -> None:
     tracker = Kept()
     trained, tracked = training(tmp_path, tracker)
-    files = {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(trained.history)}
+    files = {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history_bytes(trained.history)}
     tracked.finish(Path("models/m"), files)  # no epoch of the history is given again
 
     assert tracker.calls[0] == ("start", "m-1", {"a": 1})
     for call, line in zip(tracker.calls[1:-1], trained.history, strict=True):
-        losses = {name: line[name] for name in ("train_loss", "val_loss")}
+        losses = {"train_loss": line["train_loss"], "val_loss": line["val_loss"]}
         assert call == ("line", line["epoch"], {**losses, "learning_rate": SCHEDULE.learning_rate})
     assert tracker.calls[-1] == ("end", Path("models/m"), {"best/loss": 0.25, "best/epoch": 2.0})
 
 
 def test_epochs_whose_messages_did_not_come_are_given_at_the_end() -> None:
     tracker = Kept()
-    tracked, line = Tracking({"kept": tracker}, "m-1", {}), {"train_loss": 0.5, "val_loss": 0.25}
+    tracked = Tracking({"kept": tracker}, "m-1", {})
+    lines: list[Line] = [{"epoch": epoch, "train_loss": 0.5, "val_loss": 0.25} for epoch in (1, 2, 3)]
     tracked.begin(following.TrainedNetwork(3), [])
-    tracked.line({"epoch": 1, **line}, 0.5)
-    lines = [{"epoch": epoch, **line} for epoch in (1, 2, 3)]
-    tracked.finish(Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(lines)})
+    tracked.line(lines[0], 0.5)
+    tracked.finish(
+        Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history_bytes(lines)}
+    )
 
     assert [call[1] for call in tracker.calls if call[0] == "line"] == [1, 2, 3]
 
@@ -114,7 +113,7 @@ def test_a_stored_history_gives_the_lines_that_its_training_gave(tmp_path: Path)
     trained, tracked = training(tmp_path, live)
     tracked.finish(Path("m"), {})
     params = {"learning_rate": SCHEDULE.learning_rate, "epochs": SCHEDULE.epochs, "cycle": SCHEDULE.cycle}
-    files = {"config.json": json.dumps({"params": params}).encode(), "history.jsonl": trained.history_lines}
+    files = {"config.json": json.dumps({"params": params}).encode(), "history.jsonl": history_bytes(trained.history)}
     Tracking({"kept": replayed}, "m-1", {}).finish(Path("m"), files)
 
     assert replayed.calls[1:-1] == live.calls[1:-1]
@@ -122,15 +121,14 @@ def test_a_stored_history_gives_the_lines_that_its_training_gave(tmp_path: Path)
 
 
 def test_lines_of_several_networks_are_told_apart_and_nested_figures_named_by_their_path() -> None:
-    lines = [
-        {"epoch": 1, "val_loss": 0.5, "val": {"biotac": {"accuracy": 0.25}}, "best": True, "target": name, "network": 0}
-        for name in ("pdc_th", "e_th")
-    ]
+    line: Line = {"epoch": 1, "train_loss": 1.0, "val_loss": 0.5, "val": {"biotac": {"accuracy": 0.25}}, "best": True}
+    lines: list[Line] = [{**line, "target": name, "network": 0} for name in ("pdc_th", "e_th")]
+    figures = {"train_loss": 1.0, "val_loss": 0.5, "val/biotac/accuracy": 0.25}
     tracker = Kept()
-    Tracking({"kept": tracker}, "m", {}).finish(Path("m"), {"history.jsonl": history(lines)})
+    Tracking({"kept": tracker}, "m", {}).finish(Path("m"), {"history.jsonl": history_bytes(lines)})
 
     assert [call[2] for call in tracker.calls[1:-1]] == [
-        {f"{name}/0/val_loss": 0.5, f"{name}/0/val/biotac/accuracy": 0.25} for name in ("pdc_th", "e_th")
+        {f"{name}/0/{metric}": value for metric, value in figures.items()} for name in ("pdc_th", "e_th")
     ]
 
 

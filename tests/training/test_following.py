@@ -82,7 +82,7 @@ def test_the_history_file_grows_with_every_epoch_and_ends_as_the_history(tmp_pat
     trained = followed(tmp_path, follower)
 
     assert counts == list(range(1, len(trained.history) + 1))
-    assert (tmp_path / following.HISTORY).read_bytes() == trained.history_lines
+    assert (tmp_path / following.HISTORY).read_bytes() == following.history_bytes(trained.history)
 
 
 def test_a_resumed_training_states_its_epoch_and_the_file_is_whole(
@@ -162,7 +162,7 @@ def test_a_file_that_cannot_be_written_is_reported_once_and_ends_no_training(
         patch.setattr(os, "write", full)
         with following.network(TrainedNetwork(2), []) as followers:
             for epoch in (1, 2):
-                followers.line({"epoch": epoch}, 0.1)
+                followers.line({"epoch": epoch, "train_loss": 1.0, "val_loss": 0.5}, 0.1)
     assert capsys.readouterr().err.count("No space left") == 1
 
 

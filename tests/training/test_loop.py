@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.training import loop
+from tacpipe.training.following import Line, Validated
 from tacpipe.training.loop import Loss, Schedule, Trained, WindowSet, WindowTraining, train
 
 SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
@@ -85,18 +86,21 @@ def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCapt
     assert "training starts over" in caplog.text
 
 
+LINE: Line = {"epoch": 1, "train_loss": 1.0, "val_loss": 0.5}
+
+
 def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    loop.write_checkpoint(tmp_path, {"a": torch.zeros(2)}, {"epoch": 1})
+    loop.write_checkpoint(tmp_path, {"a": torch.zeros(2)}, [LINE])
 
     def dies(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("os.fsync", dies)
     with pytest.raises(KeyboardInterrupt):
-        loop.write_checkpoint(tmp_path, {"a": torch.ones(2)}, {"epoch": 2})
+        loop.write_checkpoint(tmp_path, {"a": torch.ones(2)}, [LINE, LINE])
     checkpoint = loop.read_checkpoint(tmp_path)
     assert checkpoint is not None
-    assert checkpoint[1] == {"epoch": 1}
+    assert checkpoint[1] == [LINE]
     assert torch.equal(checkpoint[0]["a"], torch.zeros(2))
 
 
@@ -191,10 +195,10 @@ class TwoHalves:
     def loss(self, model: nn.Module, batch: int, epoch: int) -> tuple[Tensor, int]:
         return sum(((weight - epoch) ** 2).sum() for weight in model.parameters()), 1  # type: ignore[return-value]
 
-    def watch(self, model: nn.Module) -> dict[str, float]:
+    def watch(self, model: nn.Module) -> Validated:
         return {"val_loss": 1.0}
 
-    def ranks(self, line: dict[str, float]) -> dict[str, tuple[float, ...]]:
+    def ranks(self, line: Line) -> dict[str, tuple[float, ...]]:
         return {"a.": (abs(line["epoch"] - 2),), "b.": (abs(line["epoch"] - 4),)}
 
 

@@ -9,16 +9,24 @@ from tacpipe.training import following
 from tacpipe.training.following import TrainedNetwork
 from tests.training.test_following import Seen, followed
 
-NETWORK = TrainedNetwork(4, number=2, count=3, labels={"member": 1})
+NETWORK = TrainedNetwork(4, number=2, count=3, labels={"network": 1})
 
 
-def line(epoch: int) -> following.Message:
-    return {"line": {"epoch": epoch, "val_loss": 0.5}, "learning_rate": 0.25}
+def epoch_line(epoch: int) -> following.Line:
+    return {"epoch": epoch, "train_loss": 1.0, "val_loss": 0.5}
 
 
-def begin(*epochs: int, network: TrainedNetwork = NETWORK) -> following.Message:
-    messages: list[following.Message] = []
-    following.Sender(messages.append).begin(network, [{"epoch": epoch} for epoch in epochs])
+def line(epoch: int) -> following.TrainingMessage:
+    return {"line": epoch_line(epoch), "learning_rate": 0.25}
+
+
+def end(*, trained: bool) -> following.TrainingMessage:
+    return {"end": trained}
+
+
+def begin(*epochs: int, network: TrainedNetwork = NETWORK) -> following.TrainingMessage:
+    messages: list[following.TrainingMessage] = []
+    following.Sender(messages.append).begin(network, [epoch_line(epoch) for epoch in epochs])
     return json.loads(json.dumps(messages[0]))  # type: ignore[no-any-return]
 
 
@@ -34,7 +42,7 @@ def test_followers_elsewhere_see_what_followers_in_the_process_see(tmp_path: Pat
 
 
 def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
-    sent: list[following.Message] = []
+    sent: list[following.TrainingMessage] = []
     sender = following.Sender(sent.append)
     for number in range(1000):
         sender.batch(number / 1000, lambda: 1.0)
@@ -48,9 +56,9 @@ def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
 def test_epochs_that_another_worker_repeats_or_takes_over_are_given_once() -> None:
     follower = Seen()
     receiver = following.Receiver([follower])
-    for message in (begin(), line(1), line(2), {"end": False}):
+    for message in (begin(), line(1), line(2), end(trained=False)):
         receiver.take(message)
-    for message in (begin(1, 2, 3), line(4), {"end": True}):  # one epoch's message was lost with the worker
+    for message in (begin(1, 2, 3), line(4), end(trained=True)):  # one epoch's message was lost with the worker
         receiver.take(message)
 
     assert follower.networks == [(NETWORK, [])]
@@ -81,8 +89,8 @@ def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
 def test_the_next_network_is_begun_once_the_one_before_has_ended() -> None:
     follower = Seen()
     receiver = following.Receiver([follower])
-    next_network = TrainedNetwork(4, number=3, count=3, labels={"member": 2})
-    for message in (begin(), line(1), {"end": True}, begin(network=next_network), line(1), {"end": True}):
+    next_network = TrainedNetwork(4, number=3, count=3, labels={"network": 2})
+    for message in (begin(), line(1), end(trained=True), begin(network=next_network), line(1), end(trained=True)):
         receiver.take(message)
 
     assert [network for network, _ in follower.networks] == [NETWORK, next_network]

@@ -173,7 +173,7 @@ class Dask:
                 yield ""
                 return
             topic = f"tacpipe-{uuid.uuid4().hex}"
-            messages: Queue[following.Message | None] = Queue()
+            messages: Queue[following.TrainingMessage | None] = Queue()
             thread = threading.Thread(target=_passed_on, args=(messages, followers), daemon=True)
             thread.start()
             self.client.subscribe_topic(topic, lambda event: messages.put(event[1]))  # type: ignore[no-untyped-call]
@@ -318,7 +318,7 @@ def _absolute(task: WorkerTask) -> WorkerTask:
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
-def _passed_on(messages: Queue[following.Message | None], followers: Sequence[following.Follower]) -> None:
+def _passed_on(messages: Queue[following.TrainingMessage | None], followers: Sequence[following.Follower]) -> None:
     """Call followers with what comes, until None does."""
     receiver = following.Receiver(followers)
     while (message := messages.get()) is not None:

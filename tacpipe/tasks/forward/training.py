@@ -55,6 +55,7 @@ from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
+from tacpipe.training.following import history_bytes
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -152,7 +153,7 @@ def train(
     files |= {WEIGHTS: save_tensors(weights), CONFIG: model_files.to_json(config)}
     if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
-    return {**files, CONFIG: model_files.to_json(config), HISTORY: trained.history_lines}
+    return {**files, CONFIG: model_files.to_json(config), HISTORY: history_bytes(trained.history)}
 
 
 def _built(

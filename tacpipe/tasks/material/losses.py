@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, permutations
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +22,8 @@ from tacpipe.models.recurrent_autoencoder import (
     RecurrentAutoencoder,
     RecurrentClassifier,
 )
-from tacpipe.training.loop import Line, precise
+from tacpipe.training.following import Line, Validated
+from tacpipe.training.loop import precise
 
 NONE = -1  # stands where a sensor has no slide in a row of a batch, and for the class of a slide without label
 PAIRINGS = ("random", "fixed", "permuted")
@@ -321,7 +321,7 @@ class JointWork:
         valid[filled] = (self.training[sensor].classes[rows[filled]] != NONE).cpu()
         return latents, valid.to(latents.device)
 
-    def watch(self, model: nn.Module) -> Line:
+    def watch(self, model: nn.Module) -> Validated:
         """Return the epoch's losses, and losses and accuracy of each sensor on its validation slides."""
         evaluated = {
             sensor: self._evaluated(model.get_submodule(sensor), slides) for sensor, slides in self.validation.items()
@@ -365,7 +365,7 @@ class JointWork:
             else {**measures, "reconstruction": reconstruction / count}
         )
 
-    def ranks(self, line: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    def ranks(self, line: Line) -> dict[str, tuple[float, ...]]:
         """Return the error rate on validation slides, of equals the later epoch being better."""
         wrong = {sensor: 1 - measures["accuracy"] for sensor, measures in line["val"].items()}
         later = -line["epoch"]

@@ -49,6 +49,7 @@ from tacpipe.tasks.material.params import (
 from tacpipe.tasks.material.params import NetworkParams as NetworkParams
 from tacpipe.tasks.material.slides import BySensor, Slides
 from tacpipe.training import devices, loop
+from tacpipe.training.following import Line, history_bytes
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def _described(
 def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict[str, bytes]:
     """Return the files of trained networks: the weights that were selected, and the last ones next to them."""
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
-    files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: trained.history_lines}
+    files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: history_bytes(trained.history)}
     if params.select == "best":
         files[LAST] = save_tensors(last)
     return files
@@ -263,10 +264,10 @@ def _built(
     return built
 
 
-def _validation(history: Sequence[loop.Line], joint: bool) -> dict[str, Any]:
+def _validation(history: Sequence[Line], joint: bool) -> dict[str, Any]:
     """Return the epoch that each sensor's weights come from, and the accuracy at that epoch."""
 
-    def chosen(sensor: str) -> loop.Line:
+    def chosen(sensor: str) -> Line:
         sensors = list(history[0]["val"]) if joint else [sensor]
         return max(history, key=lambda line: (sum(line["val"][name]["accuracy"] for name in sensors), line["epoch"]))
 

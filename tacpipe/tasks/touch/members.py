@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from tacpipe.models.point_networks import PointNetworkShape
 from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Arrays, CloudInputs, CloudSources, PatchOptions, PatchSources, require_colours
+from tacpipe.training.following import Line, Validated
 from tacpipe.training.scaling import Affine
 
 LOSSES = ("rmse", "balanced")
@@ -91,13 +92,13 @@ class TouchWork:
         arrays = self.training.sources.draw(batch.tolist(), rng)
         return self._loss(output(model, arrays), self.training.values[batch]), len(batch)
 
-    def watch(self, model: nn.Module) -> dict[str, Any]:
+    def watch(self, model: nn.Module) -> Validated:
         """Return the loss over all watched grasps, always with the same points."""
         predicted = predictions(model, self.watched.sources, len(self.watched), draws=1)
         values = self.watched.values
         return {"val_loss": float(self._loss(torch.from_numpy(predicted).to(values), values))}
 
-    def ranks(self, line: dict[str, Any]) -> dict[str, tuple[float]]:
+    def ranks(self, line: Line) -> dict[str, tuple[float]]:
         """Return the loss of what is watched."""
         return {"": (float(line["val_loss"]),)}
 

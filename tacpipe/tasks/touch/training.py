@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,6 +41,7 @@ from tacpipe.tasks.touch.predictor import (
     Baselines,
 )
 from tacpipe.training import devices, loop
+from tacpipe.training.following import Line, NetworkLabels, history_bytes
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class FittedModel:
 
     config: Config  # holds ``members``, one description for each member
     tensors: dict[str, Tensor] = field(default_factory=dict)
-    history: list[loop.Line] = field(default_factory=list)
+    history: list[Line] = field(default_factory=list)
 
     def add_member(self, described: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
         """Add a member of the model: its description, and its tensors by name."""
@@ -109,7 +109,7 @@ def train(
     config = model.config
     files = {WEIGHTS: save_tensors(model.tensors)}
     if model.history:
-        files[HISTORY] = "".join(json.dumps(line) + "\n" for line in model.history).encode()
+        files[HISTORY] = history_bytes(model.history)
     if params.baselines:
         config["learned_objects"] = list(training_grasps.objects)
         files[BASELINES] = save_arrays(Baselines.from_grasps(training_grasps).tensors())
@@ -214,7 +214,10 @@ def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: Fitted
             place = grasps.workspace / f"{'-'.join(group)}-{number}"
             schedule = loop.Schedule.from_params(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
-            labels = {"target": "all" if params.multi_target else group[0], "network": number}
+            labels: NetworkLabels = {
+                "target": "all" if params.multi_target else group[0],
+                "network": number,
+            }
             trained = loop.train(
                 build,
                 work,

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import AutoencoderShape, RecurrentAutoencoder, RecurrentClassifier
 from tacpipe.tasks.material.losses import NONE, BatchPairs, JointWork, ScaledSlides, Weights
+from tacpipe.training.following import Line
 
 CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": AutoencoderShape(4, 3, hidden=6, latents=5), "b": AutoencoderShape(7, 3, hidden=6, latents=5)}
@@ -120,7 +121,8 @@ def test_an_epochs_line_tells_accuracy_as_a_share_of_all_validation_slides() -> 
 
 
 def test_joint_networks_are_chosen_together_and_others_each_for_itself() -> None:
-    line = {"epoch": 7, "val": {"a": {"accuracy": 0.5}, "b": {"accuracy": 1.0}}}
+    accuracies = {"a": {"accuracy": 0.5}, "b": {"accuracy": 1.0}}
+    line: Line = {"epoch": 7, "train_loss": 1.0, "val_loss": 0.5, "val": accuracies}
     assert work(Weights()).ranks(line) == {"": (0.25, -7)}
     assert work(Weights(alignment=0.0)).ranks(line) == {"a.": (0.5, -7), "b.": (0.0, -7)}
 

@@ -96,7 +96,7 @@ def test_the_loss_of_a_batch_draws_points_anew_and_what_is_watched_stays() -> No
     assert first.item() != second.item()
     expected = np.sqrt(np.mean(np.arange(7.0) ** 2) + 1e-6)
     assert [touch_work.watch(model)["val_loss"] for _ in range(2)] == pytest.approx([expected] * 2)
-    assert touch_work.ranks({"val_loss": 0.25}) == {"": (0.25,)}
+    assert touch_work.ranks({"epoch": 1, "train_loss": 1.0, "val_loss": 0.25}) == {"": (0.25,)}
 
 
 def test_the_same_generator_draws_the_same_points() -> None:
