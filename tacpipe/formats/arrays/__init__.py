@@ -1,1 +1,1 @@
-"""Files that hold a tree of named arrays (HDF5, Zarr), read as streams of recordings."""
+"""Read files with a tree of named arrays (HDF5, Zarr) as streams of recordings."""

@@ -1,4 +1,4 @@
-"""HDF5 files and Zarr stores as containers of streams (`tacpipe.formats.container`)."""
+"""Read HDF5 files and Zarr stores as containers of streams (`tacpipe.formats.container`)."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
-LOOK_ROWS = 3  # rows that a look reads
-BLOCK_BYTES = 1 << 25  # bytes read at once; a larger chunk of the file is read as a whole
+LOOK_ROWS = 3  # number of rows read by `ArrayContainer.look`
+BLOCK_BYTES = 1 << 25  # number of bytes read at once; a larger chunk of the file is read as a whole
 OBJECT_BYTES = 200  # assumed size of a text in memory
-MASK = "mask"  # the group of robomimic's lists
-MAX_DEPTH = 4  # levels of JSON in attributes
+MASK = "mask"  # group with robomimic's lists of recordings
+MAX_DEPTH = 4  # maximum depth of JSON in attributes
 RowsOf = Callable[[Tree, Episode, StreamArrays], "pa.Table | Batched"]
 
 
 @dataclass(frozen=True)
 class ArrayContainer:
-    """A file of arrays; ``open_tree`` opens it."""
+    """A file of arrays that ``open_tree`` opens."""
 
     path: Path
     open_tree: Callable[[], AbstractContextManager[Tree]]
 
     def episodes(self) -> Sequence[str]:
-        """Return the names of the recordings inside, or None if the whole is one."""
+        """Return the names of the recordings in the file, or None if the file is one recording."""
         with self.open_tree() as tree:
             return [episode.name for episode in episodes.find_episodes(tree) if episode.name is not None]
 
     @property
     def names_itself(self) -> bool:
-        """True if the file states the names of its recordings."""
+        """Whether the file contains the names of its recordings."""
         with self.open_tree() as tree:
             return all(episode.name_is_stated for episode in episodes.find_episodes(tree))
 
@@ -64,12 +64,12 @@ class ArrayContainer:
             return _read_contents(tree, episodes.find_episode(tree, episode), None, _first_rows)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
-        """Return the streams of a recording, all or those of some sources; of long ones the rows stay in the file."""
+        """Return the streams of a recording, optionally only those of ``sources``. Rows of long streams are read later."""
         with self.open_tree() as tree:
             return _read_contents(tree, episodes.find_episode(tree, episode), sources, self._rows)
 
     def _rows(self, tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table | Batched:
-        """Return the rows of a stream, block by block from the file where they are more than one block."""
+        """Return the rows of a stream. More than one block is read block by block when needed."""
         start, count = episode.start, episodes.row_count(episode, part)
         step = _block_rows(tree, episode, part)
         edges = [start, *range((start // step + 1) * step, start + count, step), start + count]
@@ -86,7 +86,7 @@ class ArrayContainer:
         return Batched(schema, count, read)
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
-        """Return the chunks that a recording is read from, and what metadata state of it; None of a single file."""
+        """Return the chunks and metadata that a recording is read from, or None for a single file."""
         with self.open_tree() as tree:
             array_episode = episodes.find_episode(tree, episode)
             contents = episodes.group_into_parts(tree, array_episode)
@@ -116,14 +116,14 @@ class ArrayContainer:
 
 
 def open_hdf5(path: Path) -> ArrayContainer:
-    """Return the container of an HDF5 file. Raises `MissingModuleError` without h5py."""
+    """Return the container of an HDF5 file. Raises `MissingModuleError` if h5py is not installed."""
     with extras.explain_missing("Reading HDF5"):
         from tacpipe.formats.arrays import hdf5
     return ArrayContainer(path, lambda: hdf5.open_hdf5(path))
 
 
 def open_zarr(path: Path) -> ArrayContainer:
-    """Return the container of a Zarr store. Raises `MissingModuleError` without zarr."""
+    """Return the container of a Zarr store. Raises `MissingModuleError` if zarr is not installed."""
     extras.require("Reading Zarr", "zarr")
     return ArrayContainer(path, lambda: zarr.open_zarr(path))
 
@@ -166,7 +166,7 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
 
 
 def _masks(tree: Tree, episode: Episode) -> dict[str, Attribute]:
-    """Return in which lists of recordings (``mask/train``, ``mask/valid`` of robomimic) one is, by name."""
+    """Return for each list of recordings (robomimic's ``mask/train``, ``mask/valid``) whether it contains this recording."""
     if not episode.group or not tree.is_group(MASK):
         return {}
     lists = [mask for mask in tree.members(MASK)[0] if is_text(mask) and len(mask.shape) == 1]
@@ -178,7 +178,7 @@ def _decode_texts(values: AnyArray) -> set[str]:
 
 
 def _stream_names(parts_read: Sequence[StreamArrays]) -> dict[str, str]:
-    """Return a name for each stream by its source: the last part of it where no other has the same."""
+    """Return a name for each stream by its source: the last part of the path if that is unique."""
     last = [part.source.rpartition("/")[2] for part in parts_read]
     root = "steps" if "steps" not in last else episodes.ROOT
     called = {
@@ -196,7 +196,7 @@ def _first_rows(tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table:
 
 
 def _block_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
-    """Return how many rows of a stream are read at once: whole chunks, since a file gives no less."""
+    """Return the number of rows read at once. It covers whole chunks, because a file cannot read less."""
     row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all_arrays)
     if part.frames and episodes.row_count(episode, part):
         row_bytes += encoded_size(tree, part.arrays[0], episode.start)
@@ -223,7 +223,7 @@ def _rows_table(tree: Tree, episode: Episode, part: StreamArrays, start: int, st
 
 
 def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute], dict[str, str]]:
-    """Return the attributes of a recording's group and those above, and which texts are too long for one."""
+    """Return the attributes of a recording's group and its parents, and the texts that are too long for attributes."""
     attributes: dict[str, Attribute] = {}
     long: dict[str, str] = {}
     for group in episodes.parent_groups(episode.group):
@@ -239,7 +239,7 @@ def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute]
 
 
 def _flatten_json(text: Any) -> dict[str, Any]:
-    """Return the values of a JSON object in a text, with dots between the names; nothing for other text.
+    """Return the values of a JSON object in a text, with dotted names; an empty dictionary for other text.
 
     >>> _flatten_json('{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}')
     {'env_name': 'Lift', 'env_kwargs.control_freq': 20}

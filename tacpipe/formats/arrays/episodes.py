@@ -1,4 +1,4 @@
-"""Find the recordings of a tree of arrays, the arrays of each stream, and their stamps or rate."""
+"""Find the recordings in a tree of arrays, the arrays of each stream, and their timestamps or rate."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from tacpipe.printable import plain
 NUMBERED = re.compile(
     r"(demo|episode|ep|traj|trajectory|trial|run|recording|rollout|seq|sequence)s?[_-]?\d+", re.IGNORECASE
 )
-ENDS = ("meta/episode_ends", "episode_ends")  # arrays with the row behind the last of each recording
-NAMES, LABELS = "recordings", "labels"  # attributes of their group: the name of each, and its labels by name
+ENDS = ("meta/episode_ends", "episode_ends")  # arrays with the end row (exclusive) of each recording
+NAMES, LABELS = "recordings", "labels"  # attributes of the group: recording names, and labels by name
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording within a tree: its group, or its rows where arrays hold those of several."""
+    """One recording in a tree: its group, or its rows if arrays contain several recordings."""
 
-    name: str | None  # None: the tree is one recording
+    name: str | None  # None if the tree is one recording
     group: str = ""
     start: int = 0
-    stop: int | None = None  # None: to the end of each array
-    number: int = 0  # position among the ``count`` recordings that share arrays
+    stop: int | None = None  # None for the end of each array
+    number: int = 0  # index among the ``count`` recordings that share arrays
     count: int = 0
-    total: int = 0  # rows of all of them
-    ends_group: str | None = None  # the group of the array that states where they end
+    total: int = 0  # number of rows of all recordings
+    ends_group: str | None = None  # group of the array with the ends
     labels: Mapping[str, Any] = field(default_factory=dict)
-    name_is_stated: bool = False  # True if the file states its name
+    name_is_stated: bool = False  # whether the file contains the name
 
     def inside(self, path: str) -> str:
-        """Return the path of a group or an array within the recording's group."""
+        """Return the path of a group or array in the recording's group."""
         return path[len(self.group) :].strip("/")
 
 
 def find_episodes(tree: Tree) -> list[Episode]:
-    """Return the recordings of a tree, in order: by number where names have one. Raises `TacpipeError`."""
+    """Return the recordings of a tree in order, by number if names contain one. Raises `TacpipeError`."""
     cut = _episodes_from_ends(tree)
     if cut:
         return cut
     groups: list[str] = []
-    for group in tree.members("")[1]:  # the groups of recordings lie here, or one level below
+    for group in tree.members("")[1]:  # the groups of recordings are here or one level below
         groups += [group] if _is_numbered(group) else filter(_is_numbered, tree.members(group)[1])
     names = Counter(group.rpartition("/")[2] for group in groups)
     return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=_natural_order)] or [
@@ -64,13 +64,13 @@ def _is_numbered(group: str) -> bool:
 
 
 def _episode_name(group: str, names: Mapping[str, int]) -> str:
-    """Return the name of a recording's group, with the group above where two have the same last part."""
+    """Return the name of a recording's group, with its parent's name if the last part is ambiguous."""
     last = group.rpartition("/")[2]
     return last if names[last] == 1 else group
 
 
 def find_episode(tree: Tree, name: str | None) -> Episode:
-    """Return the recording of this name, without a look at the others. Raises `TacpipeError` if there is none."""
+    """Return the recording with this name without reading the others. Raises `TacpipeError` if there is none."""
     if name is None:
         (*others, episode) = find_episodes(tree)
         if others or episode.name is not None:
@@ -88,7 +88,7 @@ def find_episode(tree: Tree, name: str | None) -> Episode:
 
 
 def _episodes_from_ends(tree: Tree) -> list[Episode]:
-    """Return the recordings that an array cuts all others into, or None if there is no such array."""
+    """Return the recordings delimited by an array of ends; an empty list if there is no such array."""
     for path in ENDS:
         group = path.rpartition("/")[0]
         array = (
@@ -155,28 +155,28 @@ TIME = re.compile(
     re.IGNORECASE,
 )
 SENSOR_TIME = re.compile(r"\w+_(time_?stamps?|stamps?|time)(_?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
-LENGTHS = "compress_len"  # ALOHA: lengths of frames before padding
-NEXT = "next_obs"  # robomimic: obs, one step later
-ROOT = "/"  # the source of arrays that lie in the recording's own group
+LENGTHS = "compress_len"  # ALOHA: frame lengths before padding
+NEXT = "next_obs"  # robomimic: ``obs``, one step later
+ROOT = "/"  # source of arrays in the recording's own group
 
 
 @dataclass(frozen=True)
 class StreamArrays:
-    """The arrays of one stream: ``source`` names it within the recording, ``time`` is the array of its stamps."""
+    """The arrays of one stream. ``source`` is its name in the recording, ``time`` its array of timestamps."""
 
     source: str
     arrays: Sequence[ArrayDescription]
     time: ArrayDescription | None
-    frames: bool = False  # True if its one array holds encoded pictures
+    frames: bool = False  # whether its only array contains encoded images
 
     @property
     def all_arrays(self) -> Sequence[ArrayDescription]:
-        """The arrays with that of the stamps."""
+        """The arrays including the timestamps."""
         return [*([] if self.time is None else [self.time]), *self.arrays]
 
     @property
     def clock(self) -> str:
-        """The column with the stamps: an array, or a field of a compound one, or empty if there is none."""
+        """The column of timestamps: an array, or a field of a compound array; empty if there is none."""
         if self.time is not None:
             return self.time.name
         kind = self.arrays[0].dtype
@@ -185,7 +185,7 @@ class StreamArrays:
 
 @dataclass(frozen=True)
 class StreamParts:
-    """The streams of a recording, arrays of one value, and what is left out with the reason."""
+    """The streams of a recording, its arrays with one value, and the skipped arrays with reasons."""
 
     parts: Sequence[StreamArrays]
     scalars: Sequence[ArrayDescription] = ()
@@ -193,11 +193,13 @@ class StreamParts:
 
 
 def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
-    """Return the streams of a recording, in the order of the file."""
+    """Return the streams of a recording in the file's order."""
     parts: list[StreamArrays] = []
     scalars: list[ArrayDescription] = []
     skipped: dict[str, str] = {}
-    stamps: list[ArrayDescription] = []  # stamps in groups above, for arrays of their length without own stamps
+    stamps: list[
+        ArrayDescription
+    ] = []  # timestamps in parent groups, used for arrays of the same length without their own
     for group, arrays in walk(tree, episode.group):
         inside = episode.inside(group)
         if inside.rpartition("/")[2] == NEXT:
@@ -219,7 +221,7 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
 
 
 def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
-    """Return why an array is left out, or empty if it is not."""
+    """Return the reason why an array is skipped, or an empty string."""
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
     one_each = array.group == episode.ends_group and array.shape == (episode.count,)
@@ -230,7 +232,7 @@ def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
 
 
 def _is_column(array: ArrayDescription, neighbours: Sequence[ArrayDescription], episode: Episode) -> bool:
-    """Return whether an array has a value a row rather than one of the recording."""
+    """Return whether an array has one value per row rather than one per recording."""
     lengths = {neighbour.shape[0] for neighbour in neighbours if neighbour.shape}
     return bool(array.shape) and (array.shape != (1,) or lengths == {1} or episode.stop is not None)
 
@@ -238,7 +240,7 @@ def _is_column(array: ArrayDescription, neighbours: Sequence[ArrayDescription], 
 def _divide_by_length(
     arrays: Sequence[ArrayDescription], group: str, episode: Episode, above: Sequence[ArrayDescription]
 ) -> Iterator[StreamArrays]:
-    """Yield the streams of one group's arrays, named by the group where it holds one, else by the first array of each."""
+    """Yield one stream per array length. A group's only stream has the group's name, others that of their first array."""
     single_streams = [
         array
         for array in arrays
@@ -263,7 +265,7 @@ def _divide_by_length(
 
 
 def _clock_array(same: Sequence[ArrayDescription], above: Sequence[ArrayDescription]) -> ArrayDescription | None:
-    """Return the array that holds the stamps of arrays of one length: among them, else in a group above."""
+    """Return the timestamps for arrays of one length: one of them, or an array in a parent group."""
     clocks = [array for array in same if _is_time(array)]
     clock = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
     length = same[0].shape[0] if same else None
@@ -286,11 +288,11 @@ UNITS: Mapping[str, TimeUnit] = {
     "nanoseconds": "ns",
 }
 SINCE_1970: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns"))
-MIN_UNIX_S = 1e8  # seconds since 1970: what is less counts from the start of a recording
+MIN_UNIX_S = 1e8  # Unix time in seconds; smaller values count from the start of a recording
 
 
 def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
-    """Return where the stamps of a stream come from; an empty `Time` where the file states neither stamps nor a rate."""
+    """Return the source of a stream's timestamps, or an empty `Time` if the file has neither timestamps nor a rate."""
     if part.clock:
         unit = _stamp_unit(part, size := _last_stamp(tree, episode, part))
         if unit is not None:
@@ -302,13 +304,13 @@ def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
 
 
 def row_count(episode: Episode, part: StreamArrays) -> int:
-    """Return how many rows of a stream belong to a recording."""
+    """Return the number of rows of a stream in a recording."""
     length = part.arrays[0].shape[0]
     return max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
 
 
 def parent_groups(group: str) -> list[str]:
-    """Return a group and those above it, the root first.
+    """Return a group and its parents, the root first.
 
     >>> parent_groups("data/demo_0")
     ['', 'data', 'data/demo_0']
@@ -318,7 +320,7 @@ def parent_groups(group: str) -> list[str]:
 
 
 def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
-    """Return the last stamp of a stream as its file holds it, without sign, or 0 if there is none."""
+    """Return the absolute value of a stream's last stored timestamp, or 0 if there is none."""
     array = part.time or part.arrays[0]
     last = episode.start + row_count(episode, part)
     last_row = np.asarray(tree.read(array, max(last - 1, 0), last))
@@ -327,7 +329,7 @@ def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
 
 
 def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
-    """Return the unit of stamps, as an attribute, the name or their size shows it, or None if nothing does."""
+    """Return the unit of timestamps from an attribute, the name or the magnitude; None if it is unknown."""
     attributes = part.time.attributes if part.time is not None else {}
     declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
     suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)
@@ -336,7 +338,7 @@ def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
 
 
 def declared_rate_hz(tree: Tree, episode: Episode, part: StreamArrays | None) -> float | None:
-    """Return the rate that attributes of a stream's arrays, its group or one above state, or that all recordings have."""
+    """Return the rate declared by a stream's arrays, its group, a parent group, or all recordings; None if there is none."""
     arrays = part.arrays if part is not None else ()
     groups = [*reversed(parent_groups(arrays[0].group))] if arrays else []
     attribute_sets = [*(attributes.attributes for attributes in arrays), *map(tree.attributes, groups)]

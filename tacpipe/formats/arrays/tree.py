@@ -38,7 +38,7 @@ class ArrayDescription:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     chunk_rows: int = 0  # rows of a chunk, or 0 if the file has none
     problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
-    time_axis: int = 0  # the dimension of the file's array that is the first of ``shape``
+    time_axis: int = 0  # axis of the file's array that becomes the first axis of ``shape``
 
     @property
     def name(self) -> str:
@@ -47,12 +47,12 @@ class ArrayDescription:
 
     @property
     def group(self) -> str:
-        """The path of the group that holds it; empty for the root."""
+        """The path of the parent group; empty for the root."""
         return self.path.rpartition("/")[0]
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row in memory."""
+        """The size of a row in memory, in bytes."""
         return int(np.prod(self.shape[1:], dtype=np.int64)) * max(self.dtype.itemsize, 1)
 
 
@@ -65,34 +65,34 @@ class Tree(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """Sentences about the missing part of a truncated file."""
+        """Sentences about missing parts of a truncated file."""
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
-        """Return the arrays in a group, and the paths of the groups in it."""
+        """Return the arrays and the paths of the groups in a group."""
 
     def is_group(self, path: str) -> bool:
-        """Return True if a group has this path."""
+        """Return whether a group has this path."""
 
     def identity(self, group: str) -> Any:
-        """Return a value that is equal for all paths of one group; links can give a group several paths."""
+        """Return a value that identifies a group; links can give one group several paths."""
 
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group."""
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-        """Return the rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
+        """Return the rows ``start`` to ``stop`` (exclusive) of an array, or a scalar. Raises `TacpipeError`."""
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
-        """Return the files that hold rows of an array, by path within the store, or None if all lies in one file."""
+        """Return the files with these rows by path in the store, or None if the tree is a single file."""
 
     def encoding_metadata(self, array: ArrayDescription) -> Any:
-        """Return how the rows of an array are encoded, as JSON, without their number."""
+        """Return the encoding of an array's rows as JSON, without the number of rows."""
 
 
 def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription]:
-    """Return the arrays of a group with the dimension of time first: the one that is as long as the group's 1-D arrays.
+    """Return the arrays of a group with the time axis first: the axis that is as long as the group's 1-D arrays.
 
-    Where no dimension is, time is the first unless it is a small part of the longest.
+    If no axis has that length, time is the first axis, unless that is much shorter than the longest.
 
     >>> arrays = [ArrayDescription("tactile", (18, 3, 400), np.dtype("f4")), ArrayDescription("t", (400,), np.dtype("f8"))]
     >>> [array.shape for array in with_time_first(arrays)]
@@ -123,7 +123,7 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
 
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescription]]]:
-    """Yield each group below a group, itself first, with the arrays in it; one of several paths has a problem instead."""
+    """Yield ``group`` and each group below it with its arrays. An array with several paths is marked with a problem."""
     first_paths: dict[Any, str] = {}
     pending = [group]
     while pending:
@@ -139,7 +139,7 @@ def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescripti
 
 
 def is_frames(array: ArrayDescription) -> bool:
-    """Return whether an array may hold an encoded picture a row: bytes without fixed length, or padded with zeros."""
+    """Return whether an array may contain one encoded image per row: bytes of variable length, or padded with zeros."""
     if array.dtype.kind == "O":
         return (
             array.dtype.metadata is not None and array.dtype.metadata.get("vlen") == np.uint8 and len(array.shape) == 1
@@ -148,7 +148,7 @@ def is_frames(array: ArrayDescription) -> bool:
 
 
 def is_image(array: ArrayDescription) -> bool:
-    """Return whether an array holds a decoded picture a row.
+    """Return whether an array contains one decoded image per row.
 
     >>> is_image(ArrayDescription("obs/agentview_image", (9, 84, 84, 3), np.dtype("uint8")))
     True
@@ -184,13 +184,13 @@ def reason_left_out(array: ArrayDescription) -> str:
 
 
 def is_text(array: ArrayDescription) -> bool:
-    """Return whether an array holds text."""
+    """Return whether an array contains text."""
     about = array.dtype.metadata
     return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
 
 
 def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
-    """Return the attributes that are a text of some length, a number, or true or false, as plain values.
+    """Return the attributes that are a short text, a number or a boolean, as plain Python values.
 
     >>> plain_attributes({"a": np.float32(0.5), "b": b"x", "c": np.array([1, 2]), "d": np.array([3])})
     {'a': 0.5, 'b': 'x', 'd': 3}
@@ -213,8 +213,8 @@ def _named_as_image(path: str) -> bool:
     return any(word in path.lower() for word in IMAGE_NAMES)
 
 
-PICTURE = "data"  # name of the column, equal to that of image messages
-MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # how pictures begin
+PICTURE = "data"  # column name, the same as for image messages
+MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # image formats by their first bytes
 
 
 def picture_encoding(content: bytes) -> str:
@@ -227,17 +227,17 @@ def picture_encoding(content: bytes) -> str:
 
 
 def is_encoded(tree: Tree, array: ArrayDescription, row: int) -> bool:
-    """Return whether a row of an array is an encoded picture, by its first bytes."""
+    """Return whether a row is an encoded image, judged by its first bytes."""
     return bool(picture_encoding(_rows_as_bytes(tree.read(array, row, row + 1))[0]))
 
 
 def encoded_size(tree: Tree, array: ArrayDescription, row: int) -> int:
-    """Return how many bytes a row of an array of pictures has."""
+    """Return the size in bytes of a row of an image array."""
     return len(_rows_as_bytes(tree.read(array, row, row + 1))[0])
 
 
 def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field, pa.Array]:
-    """Return field and values of the column of pictures: bytes as they were written, without the zeros behind them."""
+    """Return field and values of an image column: the bytes as written, without trailing zeros."""
     pictures = picture_array(array, values)
     kind = next(filter(None, (picture_encoding(picture.as_py()) for picture in pictures)), "")
     about = {"quantity": "image", **({"encoding": kind} if kind else {})}
@@ -245,10 +245,10 @@ def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field,
 
 
 def picture_array(array: ArrayDescription, values: AnyArray) -> pa.Array:
-    """Return rows of bytes, without the zeros behind those that are padded."""
+    """Return rows of bytes without the trailing zeros of padded rows."""
     rows = _rows_as_bytes(values)
     if array.dtype.kind != "O":
-        rows = [row.rstrip(b"\0") for row in rows]  # a JPEG ends in FF D9, a PNG in its check sum of IEND
+        rows = [row.rstrip(b"\0") for row in rows]  # a JPEG ends with FF D9, a PNG with the checksum of IEND
     return pa.array(rows, pa.binary())
 
 
@@ -257,17 +257,17 @@ def _rows_as_bytes(values: AnyArray) -> list[bytes]:
 
 
 AXES = ("x", "y", "z")
-BLOCK_BYTES = 1 << 20  # bytes transposed at once
+BLOCK_BYTES = 1 << 20  # number of bytes transposed at once
 
 
 def columns_of_array(
     tree: Tree, array: ArrayDescription, start: int, stop: int, meanings: list[ColumnMeaning] | None = None
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
-    """Yield field and values of each column of an array, the rows from ``start`` up to ``stop``.
+    """Yield field and values of each column of an array, rows ``start`` to ``stop`` (exclusive).
 
-    An array (time,) or (time, 1) is a column NAME, one (time, n) is n columns NAME_0, NAME_1, …, or NAME_x, … of a vector
-    whose components are known; more dimensions have an index each. A compound array has a column a field.
-    ``meanings`` replaces the meanings that names show.
+    An array (time,) or (time, 1) becomes the column NAME. An array (time, n) becomes n columns NAME_0, NAME_1, …, or
+    NAME_x, … for a vector with known components. Further axes add an index each. A compound array has one column per
+    field. ``meanings`` replaces the meanings inferred from names.
     """
     if array.dtype.names is not None:
         yield from _compound_columns("", tree.read(array, start, stop), array)
@@ -277,7 +277,7 @@ def columns_of_array(
 
 
 def read_transposed(tree: Tree, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-    """Return the rows of an array as (value, row): in blocks that a processor's cache holds, of whole chunks."""
+    """Return the rows of an array as (value, row), read in whole chunks and transposed in blocks that fit the CPU cache."""
     width = int(np.prod(array.shape[1:], dtype=np.int64))
     if width == 1 or array.dtype.hasobject:
         values = tree.read(array, start, stop)
@@ -312,7 +312,7 @@ def _value_columns(
     path: str,
     meanings: list[ColumnMeaning] | None,
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
-    """Yield the columns of values (value, row) that have this shape in a row."""
+    """Yield the columns of values (value, row) whose rows have this shape."""
     width = len(flat)
     declared = column_names.declared_metadata(array.attributes)
     about = meanings or column_names.meanings(path, width, flat.dtype.kind in "iub")
@@ -338,7 +338,7 @@ def _value_columns(
 
 
 def _taxel_and_axis(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) -> dict[str, str]:
-    """Return taxel and axis of a channel of a tactile array (…, taxel, axis) or (row, column).
+    """Return the taxel and axis of a channel of a tactile array (…, taxel, axis) or (row, column).
 
     >>> _taxel_and_axis("tactile", (16, 3), (2, 1)), _taxel_and_axis("tactile", (4, 4), (1, 0))
     ({'taxel': '3', 'axis': 'y'}, {'taxel': '5'})
@@ -353,7 +353,7 @@ def _taxel_and_axis(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) 
 
 
 def _native_values(values: AnyArray, array: ArrayDescription) -> AnyArray:
-    """Return values as one of the types that a column has."""
+    """Return values converted to a type that columns support."""
     if is_frames(array) and values.dtype.kind == "O":
         return values
     if is_text(array) or values.dtype.kind in "SUOT":

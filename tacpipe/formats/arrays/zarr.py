@@ -1,7 +1,7 @@
-"""Zarr stores as trees of arrays: folders and zip files, format 2 and 3.
+"""Zarr stores as trees of arrays: folders and zip files, formats 2 and 3.
 
-Metadata are read as the JSON that they are, values by the library zarr. A chunk that is not there is refused unless that
-was allowed: by the specification it holds fill values alone, and so zarr reads a lost file as zeros without a word.
+Metadata are read as JSON, values by the library zarr. By the specification a missing chunk contains only fill values,
+so zarr silently reads a lost file as zeros. Here a missing chunk is an error unless it was allowed.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
 MARKS = (".zgroup", ".zarray", "zarr.json")  # files that mark a folder as a group or an array
-MAX_CHUNKS = 1 << 20  # chunks per array
+MAX_CHUNKS = 1 << 20  # maximum number of chunks per array
 UNPACKED_BYTES = 1 << 27  # memory limit for reading chunks, in addition to their values
-MAX_METADATA_BYTES = 1 << 26  # size of a metadata file
+MAX_METADATA_BYTES = 1 << 26  # maximum size of a metadata file
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
-BROKEN = (  # errors of zarr and its codecs for damaged bytes
+BROKEN = (  # errors that zarr and its codecs raise for damaged bytes
     *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
     SystemError,  # raised by blosc
 )
-CODECS = {  # accepted codecs of numcodecs and zarr: none runs stored code, as pickle does
+CODECS = {  # accepted codecs of numcodecs and zarr; unlike pickle, none runs stored code
     *("adler32", "astype", "bitround", "blosc", "bytes", "bz2", "crc32", "crc32c", "delta", "fixedscaleoffset"),
     *("fletcher32", "gzip", "jenkins_lookup3", "lz4", "lzma", "packbits", "quantize", "sharding_indexed", "shuffle"),
     *("transpose", "vlen-utf8", "zlib", "zstd"),
 }
-_filled: ContextVar[bool] = ContextVar("filled", default=False)  # True: a missing chunk holds fill values
+_filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether missing chunks are read as fill values
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
 @dataclass(frozen=True)
 class ZarrTree:
-    """A Zarr store: ``path`` is a folder or a zip file, ``names`` what a zip file holds, None of a folder."""
+    """A Zarr store. ``path`` is a folder or a zip file; ``names`` are the members of a zip file, None for a folder."""
 
     path: Path
     names: frozenset[str] | None
@@ -72,12 +72,12 @@ class ZarrTree:
         return arrays, below
 
     def is_group(self, path: str) -> bool:
-        """Return whether there is a group of this path."""
+        """Return whether a group has this path."""
         node = self._node(path)
         return node is not None and "shape" not in node[0]
 
     def identity(self, group: str) -> str:
-        """Return the path of a group: it has no other."""
+        """Return the path of a group, which is unique."""
         return group
 
     def attributes(self, group: str) -> Mapping[str, Any]:
@@ -86,7 +86,7 @@ class ZarrTree:
         return node[1] if node is not None else {}
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-        """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
+        """Return the rows of an array. Raises `TacpipeError` for damaged and for missing chunks."""
         zarr = _library()
         stop = min(stop, array.shape[0]) if array.shape else 1
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
@@ -96,7 +96,7 @@ class ZarrTree:
             if name not in lost:
                 path = regular.inside(self.path, name)
                 with regular.failing(path):
-                    regular.require(path, path.stat().st_mode)  # zarr would wait for a pipe
+                    regular.require(path, path.stat().st_mode)  # zarr would block on a named pipe
         if lost and not _filled.get():
             raise TacpipeError(
                 f"{self.path} lacks {listed(lost, 2)}, which hold{'s' * (len(lost) == 1)} rows of {plain(array.path, 200)}. "
@@ -120,7 +120,7 @@ class ZarrTree:
             ) from error
 
     def chunks(self, array: ArrayDescription, start: int, stop: int) -> list[str]:
-        """Return the names, within the store, of the files that hold rows of an array."""
+        """Return the names of the files in the store that contain rows of an array."""
         node = self._node(array.path)
         assert node is not None
         shape, key = _chunk_grid(node[0])
@@ -137,13 +137,13 @@ class ZarrTree:
         return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
-        """Return the files that hold rows of an array; None of a zip file."""
+        """Return the files that contain rows of an array, or None for a zip file."""
         if self.names is not None:
             return None
         return {name: self.path / name for name in self.chunks(array, start, stop) if self._has(name)}
 
     def encoding_metadata(self, array: ArrayDescription) -> Any:
-        """Return the metadata of an array but for its shape, which grows with each recording that is added."""
+        """Return the metadata of an array except its shape, which grows with each added recording."""
         node = self._node(array.path)
         return {key: value for key, value in node[0].items() if key != "shape"} if node is not None else None
 
@@ -220,7 +220,7 @@ class ZarrTree:
 
 @contextlib.contextmanager
 def allow_missing_chunks(*, filled: bool) -> Iterator[None]:
-    """Have chunks that are not there read as fill values in the block, or refused, as they are without it."""
+    """Read missing chunks as fill values within the ``with`` block if ``filled``, otherwise raise an error for them."""
     before = _filled.set(filled)
     try:
         yield
@@ -249,16 +249,18 @@ def open_zarr(path: Path) -> Iterator[ZarrTree]:
 
 @functools.cache
 def _library() -> Any:
-    """Return the library zarr.
+    """Return the library zarr, with its lock created for forked processes.
 
-    Its codecs have a lock between processes, which is made here as for processes that are forked: it has no name in the
-    system then. A worker of ours ends at once, and would leave the name behind, which Python complains about.
+    The lock of its codecs would otherwise have a name in the system. Workers end without cleanup, so the name would
+    remain and Python would warn about it.
     """
     import zarr
     import zarr.storage
     from numcodecs import blosc
 
-    zarr.config.set({"threading.max_workers": 1})  # commands have a process a core; and the order of reads is one
+    zarr.config.set(
+        {"threading.max_workers": 1}
+    )  # each command already uses one process per core, and reads keep their order
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method("fork", force=True)
     try:
@@ -277,7 +279,7 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except OSError as error:
-            if error.errno != errno.EINVAL:  # a place before the file's first byte, where its table is wrong
+            if error.errno != errno.EINVAL:  # an offset before the start of the file, because its table is damaged
                 with regular.failing(path):
                     raise
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error
@@ -329,7 +331,7 @@ def _parse_dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
 
 
 def _codec_names(about: Mapping[str, Any]) -> Iterator[Any]:
-    """Yield the names of the codecs of an array, without the prefix of those that zarr has from numcodecs."""
+    """Yield the codec names of an array, without the prefix of codecs from numcodecs."""
     if about.get("zarr_format") != 3:
         yield from (_entry(codec, "id") for codec in (about.get("compressor"), *(about.get("filters") or ())) if codec)
         return
@@ -348,7 +350,7 @@ def _entry(codec: Any, key: str) -> Any:
 
 
 def _chunk_grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
-    """Return the shape of a chunk, and a function from its place in the grid to its name within the array."""
+    """Return the shape of a chunk, and a function from its grid position to its name in the array."""
     if about.get("zarr_format") == 3:
         encoding = about.get("chunk_key_encoding", {"name": "default"})
         between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")

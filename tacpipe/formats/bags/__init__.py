@@ -1,6 +1,6 @@
 """ROS bags and MCAP files: `tacpipe ingest rosbag` and `tacpipe ingest mcap`.
 
-A bag is read in one pass, from its first byte on (`ros_files`): no index is needed, so a file that was cut off gives what is
-in it. Messages of a topic are decoded together rather than one by one (`wire`): those whose lengths agree have every value
-at the same place, so a column is a view of their bytes. What the values measure follows from the message type (`meanings`).
+`ros_files` reads a bag in one pass from its first byte. It needs no index, so truncated files are readable up to the
+cut. `wire` decodes the messages of a topic together: messages of equal lengths have every value at the same offset, so
+a column is a view of their bytes. `meanings` derives quantities and units from the message type.
 """

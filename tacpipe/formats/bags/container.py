@@ -1,8 +1,8 @@
 """Read a bag as a container of streams: one pass over the records of its files, decoded topic by topic.
 
-A bag that `tacpipe export mcap` wrote comes back as it was. The metadata of a stream's channel hold the names of the
-stream and its columns (key ``tacpipe``, JSON). Topics that repeat some columns as usual messages name the topic that they
-are derived from. The metadata record ``tacpipe`` holds the attributes.
+A bag that `tacpipe export mcap` wrote is restored exactly. The metadata of a stream's channel contain the names of the
+stream and its columns (key ``tacpipe``, JSON). Topics that repeat columns as standard messages name the topic that they
+are derived from. The metadata record ``tacpipe`` contains the attributes.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class ExportedStream:
     stream: str
     derived: bool  # True if the topic only repeats another one
     columns: Mapping[str, tuple[str, Mapping[str, str]]]  # column name and metadata by field of the message
-    time: Mapping[str, str]  # metadata of ``t_ns``
+    time: Mapping[str, str]  # metadata of the column ``t_ns``
 
 
 def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
-    """Return the stream that the metadata of a channel describe, or None if tacpipe did not write them."""
+    """Return the stream that a channel's metadata describe, or None if tacpipe did not write them."""
     metadata_json = _json_object(metadata.get(EXPORT_KEY, ""))
     if "derived_from" in metadata_json:
         return ExportedStream("", True, {}, {})
@@ -59,7 +59,7 @@ def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
 
 
 def exported_attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
-    """Return the attributes that the metadata record holds."""
+    """Return the attributes in the metadata record."""
     metadata_json = _json_object(values.get("attributes", ""))
     return {
         str(name): value
@@ -69,15 +69,18 @@ def exported_attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
 
 
 def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStream:
-    """Return a stream with the names and the metadata that its columns had."""
-    fields: dict[str, pa.Field] = {}  # restored fields by the name of the column in the bag
+    """Return a stream with its original column names and metadata."""
+    fields: dict[str, pa.Field] = {}  # restored fields by column name in the bag
     for column in stream.schema:
         if column.name in exported.columns:
             name, metadata = exported.columns[column.name]
             fields[column.name] = pa.field(name, column.type, metadata=dict(metadata))
         elif column.name == stream.time.column:
             fields[column.name] = pa.field(HEADER, column.type, metadata=dict(exported.time))
-        elif column.name not in (LOG, HEADER):  # exported log times equal the header stamps, 0 of which count as unset
+        elif column.name not in (
+            LOG,
+            HEADER,
+        ):  # exported log times equal the header stamps; a stamp of 0 counts as unset
             fields[column.name] = column
     schema = pa.schema(list(fields.values()))
 
@@ -100,32 +103,32 @@ def _texts(values: Mapping[str, Any]) -> dict[str, str]:
     return {str(key): str(value) for key, value in values.items()}
 
 
-LOOK_MESSAGES = 20_000  # messages per file that a look reads
-MAX_DESCRIPTION_BYTES = 1 << 22  # size of a metadata.yaml
+LOOK_MESSAGES = 20_000  # maximum number of messages read per file by `Bag.look`
+MAX_DESCRIPTION_BYTES = 1 << 22  # maximum size of metadata.yaml
 READERS = {".mcap": mcap_file.read_records, ".db3": ros_files.read_sqlite_records, ".bag": ros_files.read_bag_records}
-UNPACKED_BYTES = 1 << 20  # bytes decompressed at once
-ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
-ACTIVE = ".active"  # ending of a ROS 1 bag that is being written, or whose recorder was killed
-SUFFIX_MARK = ":"  # separates a topic from the suffix of one of its streams, as "/tf:gripper"
-ROS2_METADATA = "rosbag2"  # the metadata record that a ROS 2 bag writes about itself
+UNPACKED_BYTES = 1 << 20  # number of bytes decompressed at once
+ZSTD = ".zstd"  # suffix of a file that is compressed as a whole
+ACTIVE = ".active"  # suffix of a ROS 1 bag that is being written, or whose recorder was killed
+SUFFIX_MARK = ":"  # separates a topic from a stream suffix, as in "/tf:gripper"
+ROS2_METADATA = "rosbag2"  # name of the metadata record that ROS 2 writes
 
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag: one file, or a folder of ROS 2 with its ``metadata.yaml``."""
+    """A bag: one file, or a ROS 2 folder with ``metadata.yaml``."""
 
     path: Path
 
     def episodes(self) -> Sequence[str]:
-        """Return nothing: a bag is one recording."""
+        """Return an empty sequence, because a bag is one recording."""
         return ()
 
     def look(self, episode: str | None) -> EpisodeContents:
-        """Return the streams of the first messages."""
+        """Return the streams in the first `LOOK_MESSAGES` messages of each file."""
         return self._read(None, LOOK_MESSAGES)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
-        """Return the streams of these topics, or of all."""
+        """Return the streams of the topics in ``sources``, or of all topics if it is None."""
         return self._read(sources, None)
 
     def _read(self, sources: Collection[str] | None, max_messages: int | None) -> EpisodeContents:
@@ -145,7 +148,7 @@ def open_bag(path: Path) -> Bag:
 
 
 def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, list[str]]:
-    """Return the files of a bag in their order, whether each message is compressed, and notes about its files."""
+    """Return the files of a bag in order, whether each message is compressed, and notes about the files."""
     if not path.is_dir():
         return [_unpack_file(path, stack)], False, []
     about = _bag_description(path / "metadata.yaml")
@@ -155,7 +158,9 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
     bag_files = sorted(file for file in file_system.listed(path) if _file_ending(file) in READERS)
-    present_files = [regular.inside(path, name) for name in names if name not in missing] or bag_files  # renamed since
+    present_files = [
+        regular.inside(path, name) for name in names if name not in missing
+    ] or bag_files  # metadata.yaml may list names from before a rename
     if unlisted := [file.name for file in bag_files if file not in present_files]:
         notes.append(
             f"{path} holds {listed(unlisted, 3)}, which its metadata.yaml does not name and which are not read."
@@ -176,7 +181,7 @@ def _read_records(path: Path) -> Iterator[Record]:
 
 
 def _read_compressed(path: Path) -> Iterator[Record]:
-    """Yield the records of an MCAP file that is compressed as a whole."""
+    """Yield the records of a compressed MCAP file."""
     import zstandard
 
     with (
@@ -191,7 +196,7 @@ def _read_compressed(path: Path) -> Iterator[Record]:
 
 
 def _file_ending(path: Path) -> str:
-    """Return the ending of a file in lower case, without .zstd of a compressed file or .active of an unfinished one."""
+    """Return a file's suffix in lower case, ignoring a trailing .zstd or .active."""
     return (path.with_suffix("") if path.suffix.lower() in (ZSTD, ACTIVE) else path).suffix.lower()
 
 
@@ -209,7 +214,7 @@ def _bag_description(path: Path) -> dict[str, Any]:
 
 
 def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
-    """Return a file, a database unpacked into a temporary folder where it is compressed as a whole."""
+    """Return ``path``, or the path of a temporary unpacked copy if it is a compressed database."""
     if path.suffix.lower() != ZSTD or _file_ending(path) == ".mcap":
         return path
     import zstandard
@@ -227,7 +232,7 @@ def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
 
 @dataclass
 class _BagReading:
-    """Collect the topics and attributes of a bag while its records pass."""
+    """Collects the topics and attributes of a bag from its records."""
 
     path: Path
     sources: Collection[str] | None
@@ -237,15 +242,17 @@ class _BagReading:
     types: dict[str, str] = field(default_factory=dict)  # message type by topic
     skipped: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Attribute] = field(default_factory=dict)
-    exported: dict[str, ExportedStream] = field(default_factory=dict)  # streams that tacpipe exported, by topic
+    exported: dict[str, ExportedStream] = field(default_factory=dict)  # exported streams by topic
     notes: list[str] = field(default_factory=list)
     spill: Spill = field(default_factory=Spill)  # decoded messages
-    undescribed: int = 0  # messages of channels that no record describes
-    _described: dict[tuple[int, int], TopicConnection] = field(default_factory=dict)  # file and number to channel
-    _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
+    undescribed: int = 0  # number of messages in channels without a description
+    _described: dict[tuple[int, int], TopicConnection] = field(
+        default_factory=dict
+    )  # channel by file number and channel number
+    _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # topic by file number and channel number
 
     def add_records(self, records: Iterator[Record], file: int, max_messages: int | None) -> None:
-        """Add the records of one file of the bag, with at most ``max_messages`` messages."""
+        """Add the records of one file, up to ``max_messages`` messages."""
         for record in records:
             if isinstance(record, BagMessage):
                 self._message(record, file)
@@ -262,7 +269,7 @@ class _BagReading:
     def _channel(self, channel: TopicConnection, file: int) -> None:
         topic = channel.topic
         before = self._described.setdefault((file, channel.number), channel)
-        if before is not channel:  # chunks repeat the channels of their messages
+        if before is not channel:  # chunks repeat channel descriptions
             if before != channel:
                 raise TacpipeError(
                     f"{self.path} describes the channel {channel.number} twice, as {plain(before.topic)} and as "

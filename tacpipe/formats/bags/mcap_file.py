@@ -1,4 +1,4 @@
-"""Read the records of an MCAP file from the first byte on, without its indexes, which a damaged file may lack."""
+"""Read the records of an MCAP file sequentially, without its index, which a damaged file may lack."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from tacpipe.printable import plain
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
-PIECE_BYTES = 1 << 20  # bytes read at once
-INDEX_ENTRY = 16  # bytes of a message in the index of a chunk
+PIECE_BYTES = 1 << 20  # number of bytes read at once
+INDEX_ENTRY = 16  # size of a message's entry in a chunk index
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQI")  # first and last time, size and check sum of what is inside
+_CHUNK = struct.Struct("<QQQI")  # first and last log time, size and checksum of the content
 
 
 def read_records(path: Path) -> Iterator[Record]:
@@ -42,7 +42,7 @@ def read_records(path: Path) -> Iterator[Record]:
 
 
 def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
-    """Yield the records of ``file``, the bytes of an MCAP file from the first on. Raises as `read_records` does."""
+    """Yield the records in ``file``, an MCAP file at its first byte. Raises the same errors as `read_records`."""
     if file.read(len(MAGIC)) != MAGIC:
         raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
     reader = _RecordConverter(path)
@@ -59,7 +59,7 @@ def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
 
 
 def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
-    """Yield the records before the summary at the end of a file."""
+    """Yield the records before the summary section."""
     lost: LostChunk | None = None
     while True:
         kind, length = _read_head(file)
@@ -83,12 +83,12 @@ def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
                 yield from reader.record(kind, memoryview(content))
             if len(content) < length:
                 raise BrokenRecordError(CUT_OFF)
-        else:  # an index, or what is newer
+        else:  # an index, or an operation code of a later version
             _skip_bytes(file, length)
 
 
 def _declared_message_count(file: BinaryIO) -> int | None:
-    """Return how many messages the summary states, or None if there is none, or where it is damaged."""
+    """Return the number of messages in the summary, or None if it is missing or damaged."""
     try:
         while True:
             kind, length = _read_head(file)
@@ -100,7 +100,7 @@ def _declared_message_count(file: BinaryIO) -> int | None:
 
 
 def _read_head(file: BinaryIO) -> tuple[int, int]:
-    """Return kind and length in bytes of the next record."""
+    """Return the operation code and the length in bytes of the next record."""
     head = file.read(_RECORD.size)
     if len(head) < _RECORD.size:
         raise BrokenRecordError(CUT_OFF)
@@ -109,7 +109,7 @@ def _read_head(file: BinaryIO) -> tuple[int, int]:
 
 
 def _read_content(file: BinaryIO, length: int) -> bytes:
-    """Return the next ``length`` bytes, or as many as there are: what is declared takes no memory."""
+    """Return the next ``length`` bytes, or fewer at the end of the file; a false ``length`` costs no memory."""
     if length > memory.MAX_BLOCK_BYTES:
         raise BrokenRecordError(
             f"a record declares {length:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are read"
@@ -132,16 +132,16 @@ def _skip_bytes(file: BinaryIO, length: int) -> None:
 
 
 class _RecordConverter:
-    """Convert records to the types of `storages`; keeps schemas, which channels name by number."""
+    """Converts MCAP records to the record types of `ros_files`, and keeps the schemas that channels refer to."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.count = 0  # messages so far
-        self.last_ns = 0  # log time of the last one
+        self.count = 0  # number of messages so far
+        self.last_ns = 0  # log time of the latest message
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
 
     def record(self, kind: int, content: memoryview) -> Iterator[Record]:
-        """Yield a message, channel or metadata record; keep a schema for the channels that name it."""
+        """Yield the message, channel or metadata in a record; store a schema for later channels."""
         if kind == MESSAGE:
             yield self._message(content, 0, len(content))
             return
@@ -167,9 +167,9 @@ class _RecordConverter:
             raise BrokenRecordError(f"a record of kind {kind} is damaged") from error
 
     def chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
-        """Yield the records of a chunk; a truncated chunk yields the records that are left.
+        """Yield the records of a chunk; a truncated chunk yields its complete records.
 
-        Return a lost chunk where a complete chunk is damaged: none of its records can be trusted.
+        Returns a lost chunk if a complete chunk is damaged, because none of its records can be trusted.
         """
         if len(content) < _CHUNK.size + 4:
             return LostChunk("has no whole header") if complete else None
@@ -202,7 +202,7 @@ class _RecordConverter:
 
 
 def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
-    """Return kind, place and length of the complete records in a chunk, and the end of the last one."""
+    """Return operation code, offset and length of each complete record in a chunk, and the end of the last one."""
     spans: list[tuple[int, int, int]] = []
     end = 0
     while end + _RECORD.size <= len(view):
@@ -216,12 +216,12 @@ def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
 
 
 def _attachment_name(content: bytes) -> str:
-    """Return the name in an attachment, which follows two times and its own length."""
+    """Return the name of an attachment, which follows two timestamps and the name's length."""
     return plain(content[20 : 20 + int.from_bytes(content[16:20], "little")].decode(errors="replace"))
 
 
 def _decompress(compression: str, content: bytes, size: int) -> bytes:
-    """Return what a chunk of ``size`` bytes holds, as much of it as can be unpacked, and of a longer one a byte more."""
+    """Return the unpacked content of a chunk, up to ``size + 1`` bytes, or the part that can be unpacked."""
     if compression == "":
         return content
     if compression == "zstd":

@@ -1,7 +1,7 @@
 """Map ROS messages to columns with names, quantities and units, by message type.
 
-Units follow REP 103 (SI). Types are recognised at any depth of a message, so a lab's own message with a
-``geometry_msgs/Wrench`` in it has forces in newtons. Other values keep their path as name, without quantity.
+Units follow REP 103 (SI). Types are recognized at any depth, so forces in a custom message that contains a
+``geometry_msgs/Wrench`` are in newtons. Other values are named by their path and have no quantity.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from dataclasses import dataclass, field, replace
 
 from tacpipe.formats.bags.wire import TEXT, Leaf, MessageShape, Path
 
-MAX_COLUMNS = 4096  # longer arrays of bytes are one column of bytes
+MAX_COLUMNS = 4096  # byte arrays longer than this become one column of bytes
 _XYZ = ("x", "y", "z")
-_STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))  # Foxglove's own messages and logs have no header
+_STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))  # Foxglove messages and logs have no header
 _FRAMES = (("header", "frame_id"), ("frame_id",))
 
 
 @dataclass(frozen=True)
 class PartColumn:
-    """One column of a part: a leaf, or one number of its array."""
+    """One column of a part: a leaf, or one element of its array."""
 
     name: str
     leaf: Leaf
@@ -32,9 +32,12 @@ class PartColumn:
 
 @dataclass
 class MessagePart:
-    """Columns that were measured at one moment; most messages are one part, those with many sensors one each."""
+    """Columns measured at the same time.
 
-    suffix: str = ""  # end of the stream's name
+    Most messages have one part; a message of several sensors has one part per sensor.
+    """
+
+    suffix: str = ""  # suffix of the stream name
     columns: list[PartColumn] = field(default_factory=list)
     stamp: Leaf | None = None
     frame: Leaf | None = None
@@ -42,14 +45,14 @@ class MessagePart:
 
 @dataclass(frozen=True)
 class Meaning:
-    """The function that divides messages of a type into parts, and the leaves whose values name others."""
+    """How messages of a type are divided into parts, and which leaves are keys that name other values."""
 
     parts: Callable[[MessageShape], list[MessagePart]]
-    is_key: Callable[[Leaf], bool] = lambda leaf: False  # messages with different keys are decoded apart
+    is_key: Callable[[Leaf], bool] = lambda leaf: False  # messages with different keys are decoded separately
 
 
 def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
-    """Return name, quantity, unit and component of a value, by the message type around it and its path in that."""
+    """Return name, quantity, unit and component of a value by the enclosing message type and the value's path in it."""
     meanings: dict[tuple[str, Path], tuple[str, str, str, str]] = {}
 
     def vector(kind: str, path: Path, name: str, quantity: str, unit: str, parts: Sequence[str] = _XYZ) -> None:
@@ -109,9 +112,9 @@ _GEOMETRY = _geometry_meanings()
 
 
 def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
-    """Return name, quantity, unit and component of a value, and the length of the path of the type that defines them.
+    """Return a value's name, quantity, unit and component, and the path length of the type that defines them.
 
-    None if no enclosing type defines the value.
+    Returns None if no enclosing type defines the value.
     """
     for depth, kind in reversed(leaf.enclosing):
         meaning = _GEOMETRY.get((kind, leaf.path[depth:]))
@@ -121,12 +124,12 @@ def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
 
 
 def single_part(shape: MessageShape) -> list[MessagePart]:
-    """Return all values of a message as one part, with the meaning that the types inside give them."""
+    """Return all values of a message as one part."""
     return [part_from_leaves(shape.leaves)]
 
 
 def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> MessagePart:
-    """Return these values as a part; the first ``start`` names of their paths are left out of the columns' names."""
+    """Return a part with these leaves. Column names omit the first ``start`` names of each path."""
     result = MessagePart(suffix)
     places = {
         (name, leaf.path[:depth])
@@ -153,7 +156,7 @@ def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -
 
 
 def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] = ()) -> list[PartColumn]:
-    """Return the columns of a value: one per number of an array; long arrays of bytes are one column of bytes."""
+    """Return the columns of a value: one per array element, or one column of bytes for a long byte array."""
     if leaf.kind == "stamp":
         return [PartColumn(f"{name}_ns", leaf, about=about or (("unit", "ns"), ("quantity", "time")))]
     if leaf.count is None or leaf.kind == TEXT or is_bytes(leaf):
@@ -164,17 +167,17 @@ def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] 
 
 
 def is_bytes(leaf: Leaf) -> bool:
-    """Return whether an array is bytes, as those of an image, rather than channels."""
+    """Return whether an array contains binary data, such as an image, rather than channels."""
     if leaf.kind not in ("uint8", "byte", "char", "int8") or leaf.count is None:
         return False
-    if leaf.enclosing[-1][1].startswith("tacpipe_msgs/"):  # an export writes no other arrays of these types
+    if leaf.enclosing[-1][1].startswith("tacpipe_msgs/"):  # exports write no other arrays of these types
         return True
     arrays = "MultiArray" in leaf.enclosing[-1][1]
     return leaf.count > MAX_COLUMNS or (not arrays and leaf.path[-1] == "data")
 
 
 def _join_path(path: Path) -> str:
-    """Return a path as a name: positions count from 0, as those of arrays do.
+    """Return a path as a column name, with array positions counted from 0.
 
     >>> _join_path(("sensors", 0, "taxels", 3, "x"))
     'sensors_0_taxels_3_x'
@@ -186,7 +189,7 @@ def _metadata(quantity: str, unit: str, **metadata: str) -> tuple[tuple[str, str
     return tuple((key, value) for key, value in {"quantity": quantity, "unit": unit, **metadata}.items() if value)
 
 
-_JOINT = {  # name of the column, quantity, unit of a joint that turns
+_JOINT = {  # column name, quantity and unit of a revolute joint
     "position": ("joint{}_rad", "joint_position", "rad"),
     "velocity": ("joint{}_velocity_rad_s", "joint_velocity", "rad/s"),
     "effort": ("joint{}_torque_nm", "joint_torque", "N m"),
@@ -195,10 +198,10 @@ _SLIDES = re.compile(r"finger|prismatic|slid|linear|rail|lift", re.IGNORECASE)
 
 
 class _Joints:
-    """JointStates of one topic: one column per joint in the order of the first message, with its name in the metadata.
+    """JointStates of one topic: one column per joint, ordered as in the first message, with the joint's name as metadata.
 
-    Several drivers may write to the topic, each its own joints: each set of joints is a stream. The order of the joints may
-    differ between messages.
+    Several drivers may publish different joints on the topic; each set of joints becomes a stream. The order of joints
+    may differ between messages.
     """
 
     def __init__(self) -> None:
@@ -225,13 +228,13 @@ class _Joints:
 
 def _joint(leaf: Leaf, index: int, number: int, joint: str) -> PartColumn:
     name, quantity, unit = _JOINT[str(leaf.path[0])]
-    if _SLIDES.search(joint):  # its unit would be m; a message does not state which joints slide
+    if _SLIDES.search(joint):  # prismatic joints are in m; the message does not say which joints are prismatic
         name, unit = f"joint{{}}_{leaf.path[0]}", ""
     return PartColumn(name.format(number), leaf, index, _metadata(quantity, unit, joint=joint))
 
 
 def _multi_array_parts(shape: MessageShape) -> list[MessagePart]:
-    """Return an array of std_msgs with one column per number, placed in the dimensions that the layout names."""
+    """Return an array of std_msgs with one column per element, placed by the dimensions in its layout."""
     layout = {leaf.path[1:]: leaf for leaf in shape.leaves if leaf.path[0] == "layout"}
     dimensions = [
         (shape.text(layout[path]), shape.number(layout[(*path[:2], "size")])) for path in layout if path[-1] == "label"
@@ -268,7 +271,7 @@ def _single_transform(shape: MessageShape) -> list[MessagePart]:
 
 
 def _tactile_parts(shape: MessageShape) -> list[MessagePart]:
-    """Return a tactile_msgs/TactileState with one column per taxel of each sensor that the message names."""
+    """Return the parts of a tactile_msgs/TactileState, with one column per taxel of each sensor."""
     names = {leaf.path[1]: shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "sensors" and leaf.kind == TEXT}
     result = part_from_leaves([leaf for leaf in shape.leaves if leaf.path[0] == "header"])
     for leaf in shape.leaves:
@@ -284,7 +287,7 @@ def _tactile_parts(shape: MessageShape) -> list[MessagePart]:
 
 
 def _xela_parts(shape: MessageShape) -> list[MessagePart]:
-    """Return a xela_server_ros2/SensStream, one part per sensor; taxels have counts and, if calibrated, forces.
+    """Return the parts of a xela_server_ros2/SensStream, one per sensor. Taxels have counts and, if calibrated, forces.
 
     ``time`` is the server's Unix time in seconds; there is no header.
     """
@@ -323,7 +326,7 @@ _MEANINGS: Mapping[str, Callable[[], Meaning]] = {
 
 
 def meaning_of_type(name: str) -> Meaning:
-    """Return the meaning of the messages of one topic, whose type has this name."""
+    """Return the meaning of messages of the type ``name``."""
     if name.startswith("std_msgs/msg/") and name.endswith("MultiArray"):
         return Meaning(_multi_array_parts, lambda leaf: leaf.path[0] == "layout")
     return _MEANINGS.get(name, lambda: Meaning(single_part))()

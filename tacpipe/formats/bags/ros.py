@@ -1,4 +1,4 @@
-"""Decode ROS messages by the definitions that a file carries."""
+"""Decode ROS messages with the definitions in the file."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tacpipe.formats.bags.topics import FRAME, HEADER, Block, TopicError
 from tacpipe.formats.bags.wire import ROS1, TEXT, Encoding, Leaf, Matrix, MessageShape, Types
 from tacpipe.printable import plain
 
-MAX_SHAPES = 256  # shapes kept per topic
+MAX_SHAPES = 256  # maximum number of shapes cached per topic
 Definition = Literal["msg", "idl"]
 
 
 def normalize_type_name(name: str) -> str:
-    """Return a message type as ROS 2 writes it.
+    """Return a message type in ROS 2 notation.
 
     >>> normalize_type_name("std_msgs/String"), normalize_type_name("test_msgs/srv/BasicTypes_Event")
     ('std_msgs/msg/String', 'test_msgs/srv/BasicTypes_Event')
@@ -31,9 +31,9 @@ def normalize_type_name(name: str) -> str:
 
 
 def parse_definitions(name: str, kind: Definition, text: str) -> Types:
-    """Return the fields of a message type and of those inside it, from its definition.
+    """Return the fields of a message type and of its nested types, parsed from its definition.
 
-    Raises `TopicError` if the text is no definition. An empty one is looked up among ROS's own types.
+    An empty definition is looked up in ROS 2's standard types. Raises `TopicError` if the text is not a definition.
     """
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
@@ -60,7 +60,7 @@ def parse_definitions(name: str, kind: Definition, text: str) -> Types:
 
 
 def _builtin_types(name: str) -> Types:
-    """Return the fields of a type of ROS 2 itself, as those of bags before Humble, which carry no definitions."""
+    """Return the fields of a standard ROS 2 type; bags from before Humble contain no definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
@@ -71,16 +71,18 @@ def _builtin_types(name: str) -> Types:
 
 @dataclass
 class RosDecoder:
-    """The messages of a topic of a ROS type, in ROS 1's serialization or in CDR."""
+    """Decodes messages of a ROS type, serialized as in ROS 1 or in CDR."""
 
     name: str  # name of the message type
     types: Types
     cdr: bool
     _meaning: meanings.Meaning | None = None
-    _shapes: dict[bytes, list[MessageShape]] = field(default_factory=dict)  # keyed by the first bytes: the byte order
+    _shapes: dict[bytes, list[MessageShape]] = field(
+        default_factory=dict
+    )  # shapes by the first two bytes, which state the byte order
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages, grouped by shape; raises `TopicError` if they are not of the type."""
+        """Yield the columns of messages, grouped by shape. Raises `TopicError` if they do not match the type."""
         self._meaning = meaning = self._meaning or meanings.meaning_of_type(self.name)
         marks = np.array([bytes(message[:2]) for message in messages] if self.cdr else [b""] * len(messages))
         try:
@@ -99,7 +101,7 @@ class RosDecoder:
                     if len(rows) == 1:
                         own_shape = replace(
                             shape, first=matrix[0].tobytes()
-                        )  # the shape may be one of earlier messages
+                        )  # the shape may come from an earlier message
                         self._take(own_shape, int(chosen[rows[0]]), meaning, single)
                         continue
                     for same, message in _split_by_keys(shape, matrix, meaning):
@@ -113,7 +115,7 @@ class RosDecoder:
     def _take(
         self, shape: MessageShape, row: int, meaning: meanings.Meaning, single: dict[Any, _SingleMessages]
     ) -> None:
-        """Add a message that no other shares its shape with to those with the same leaves."""
+        """Add a message with a unique shape to the messages that have the same leaves."""
         keys = tuple(
             shape.first[leaf.offset : leaf.offset + leaf.size] for leaf in shape.leaves if meaning.is_key(leaf)
         )
@@ -123,7 +125,7 @@ class RosDecoder:
         single[same].add(shape, row)
 
     def _expect_fitting(self, message: bytes, encoding: Encoding) -> None:
-        """Use ROS's own definition of the type where the file's does not fit: old recorders wrote another type's."""
+        """Use ROS's own definition if the file's does not match; old recorders wrote the definition of another type."""
         try:
             wire.walk_message(message, self.types, self.name, encoding)
         except wire.WireError:
@@ -135,10 +137,10 @@ class RosDecoder:
 
 @dataclass
 class _SingleMessages:
-    """Messages with the same leaves but texts of different lengths, decoded value by value."""
+    """Messages with the same leaves but different string lengths, decoded value by value."""
 
     parts: list[meanings.MessagePart]
-    leaves: dict[Leaf, int]  # positions
+    leaves: dict[Leaf, int]  # position of each leaf
     rows: list[int] = field(default_factory=list)
     values: list[list[list[Any]]] = field(default_factory=list)  # (part, column, message)
 
@@ -195,7 +197,7 @@ def _free_name(name: str, columns: Mapping[str, Any]) -> str:
 def _split_by_keys(
     shape: MessageShape, matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[tuple[np.ndarray[Any, np.dtype[np.int64]], MessageShape]]:
-    """Yield rows (row,) with equal keys, and a shape whose first message has these keys."""
+    """Yield the rows (row,) with equal keys, and a shape whose first message has these keys."""
     keys = [leaf for leaf in shape.leaves if meaning.is_key(leaf)]
     remaining = np.arange(len(matrix))
     if not keys:
@@ -212,7 +214,7 @@ def _split_by_keys(
 def _decode_matrix(
     shape: MessageShape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[Block]:
-    cache: dict[int, Any] = {}  # numbers by the offset of their leaf: an array is viewed once for all of its columns
+    cache: dict[int, Any] = {}  # values by leaf offset: an array is viewed once for all of its columns
     for part in meaning.parts(shape):
         columns: dict[str, pa.Array] = {}
         about: dict[str, Mapping[str, str]] = {}

@@ -1,7 +1,7 @@
-"""Read the records of ROS 1 bags and of ROS 2's SQLite files: topics with their definitions, raw messages, metadata.
+"""Read the records of ROS 1 bags and ROS 2 SQLite files: topics with their definitions, raw messages, metadata.
 
-The readers of all three storages (MCAP, ROS 1 bags, SQLite) start at the first record, without its index, and yield the same
-types. A reader that stops early yields a `BagDamage` last.
+The readers of all three storages (MCAP, ROS 1, SQLite) read sequentially without the index and yield the same types. A
+reader that stops early yields a `BagDamage` last.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ CUT_OFF = "the file ends within a record: it was cut off, and what came after is
 
 
 class BrokenRecordError(Exception):
-    """A record that cannot be read; the message is a clause with the reason."""
+    """A record cannot be read; the message is a clause with the reason."""
 
 
 @dataclass(frozen=True)
 class TopicConnection:
-    """A source of messages of one topic with their type and encoding; a topic may have several channels."""
+    """A channel: a source of messages of one topic, with their type and encoding. A topic may have several channels."""
 
-    number: int  # identifies the channel in messages
+    number: int  # channel number that messages refer to
     topic: str
-    type: str  # name of the message type, of the schema
-    encoding: str  # encoding of messages: ros1, cdr, json, protobuf, …
+    type: str  # name of the message type
+    encoding: str  # message encoding: ros1, cdr, json, protobuf, …
     schema_encoding: str  # encoding of the definition: ros1msg, ros2msg, ros2idl, jsonschema, protobuf, …
     schema: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
 class BagMessage(NamedTuple):  # there are millions, and a dataclass takes three times as long to make
-    """A message as it was written."""
+    """A message as stored in the file."""
 
     channel: int
     log_ns: int
@@ -57,7 +57,7 @@ class BagMessage(NamedTuple):  # there are millions, and a dataclass takes three
 
 @dataclass(frozen=True)
 class Metadata:
-    """Texts by name that the file states of itself."""
+    """Metadata of the file: text values by name."""
 
     name: str
     values: Mapping[str, str]
@@ -65,29 +65,29 @@ class Metadata:
 
 @dataclass(frozen=True)
 class BagDamage:
-    """A sentence about the file with the reason why reading ended early, or with the part that was not read."""
+    """A sentence that says why reading ended early, or which part was not read."""
 
     text: str
 
 
 @dataclass
 class LostChunk:
-    """A chunk whose messages are left out, with what its header and its index state about them."""
+    """A chunk whose messages are lost, with the facts from its header and index."""
 
     problem: str  # completes the sentence "a chunk …"
-    first_ns: int = 0  # log times
+    first_ns: int = 0  # range of log times
     last_ns: int = 0
-    count: int = 0  # 0: the file does not state it
+    count: int = 0  # number of messages, or 0 if the file does not state it
 
     def damage(self, path: Path) -> BagDamage:
-        """Return the note about it."""
+        """Return the damage as a sentence."""
         interval = f" from {format_time(self.first_ns)} to {format_time(self.last_ns)}" if self.last_ns else ""
         count = f"its {self.count:,} messages" if self.count else "its messages, an unknown number,"
         return BagDamage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
 
 
 def format_time(time_ns: int) -> str:
-    """Return a time since 1970 as a date, UTC.
+    """Return a Unix time as a date in UTC.
 
     >>> format_time(1_700_000_000_000_000_000), format_time(2**64 - 1)
     ('2023-11-14T22:13:20.000', '18446744073709551615 ns')
@@ -99,12 +99,12 @@ def format_time(time_ns: int) -> str:
 
 Record: TypeAlias = TopicConnection | BagMessage | Metadata | BagDamage
 
-_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the second where a message of SQLite quotes damaged text
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # UnicodeDecodeError: an SQLite message may quote damaged text
 SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 def read_sqlite_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` if it is no bag."""
+    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` if it is not a bag."""
     with regular.failing(path), regular.opened(path) as file:
         magic = file.read(len(SQLITE_MAGIC))
     if magic != SQLITE_MAGIC:
@@ -131,7 +131,7 @@ def read_sqlite_records(path: Path) -> Iterator[Record]:
 
 @contextlib.contextmanager
 def _connect(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a file without changing it; what was not yet moved from its log (-wal) is read from a copy."""
+    """Open a database read-only. If it has a write-ahead log (-wal), open a copy of both."""
     log = regular.inside(path.parent, f"{path.name}-wal")
     with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
         if copies is None:
@@ -149,7 +149,7 @@ def _connect(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
-    """Raise `TacpipeError` if what holds topics or messages is no table: a view or a module runs queries of the file."""
+    """Raise `TacpipeError` if topics or messages are not tables: views and modules would run queries stored in the file."""
     definitions = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name in ("topics", "messages"):
         if not str(definitions.get(name, "")).upper().startswith("CREATE TABLE"):
@@ -195,7 +195,7 @@ def read_bag_records(path: Path) -> Iterator[Record]:
 
 
 def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool = False) -> Iterator[Record]:
-    """Yield the records of a file, or of the content of a chunk."""
+    """Yield the records of a file or of a chunk."""
     lost: LostChunk | None = None
     while file.tell() < size:
         header = _header_fields(_read_sized(file, size, MAX_HEADER_BYTES))
@@ -223,7 +223,7 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
             try:
                 yield from (
                     [] if problem else list(read_records)
-                )  # all or nothing: of a damaged one nothing can be trusted
+                )  # if a chunk is damaged, none of its records can be trusted
             except BrokenRecordError:
                 problem = f"of {len(inside):,} bytes is damaged"
             lost = LostChunk(problem) if problem else None
@@ -240,7 +240,7 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
 
 
 def _count_lost_messages(lost: LostChunk, index: bytes) -> None:
-    """Add the messages of one connection that the index of a chunk lists, 8 bytes of time and 4 of offset each."""
+    """Count the lost messages that a chunk index lists for one connection: 8 bytes of time and 4 of offset each."""
     times = [_time_ns(index[at : at + 8]) for at in range(0, len(index) - 11, 12)]
     lost.count += len(times)
     if times:
@@ -266,7 +266,7 @@ def _field_number(header: dict[str, bytes], name: str) -> int:
 
 
 def _header_fields(content: bytes) -> dict[str, bytes]:
-    """Return the fields of a record's header: each is its length, its name, "=" and its value."""
+    """Return the fields of a record header. Each field is its length, its name, "=" and its value."""
     fields: dict[str, bytes] = {}
     at = 0
     while at + 4 <= len(content):
@@ -280,7 +280,7 @@ def _header_fields(content: bytes) -> dict[str, bytes]:
 
 
 def _read_sized(file: BinaryIO, size: int, max_bytes: int | None = None) -> bytes:
-    """Return the bytes that follow a word with their length."""
+    """Return the bytes after a length word."""
     length = _read_length(file)
     if max_bytes is not None and length > max_bytes:
         raise BrokenRecordError(f"a record has a header of {length} bytes; the file is damaged from there on")
@@ -290,7 +290,7 @@ def _read_sized(file: BinaryIO, size: int, max_bytes: int | None = None) -> byte
 
 
 def _read_content(file: BinaryIO, size: int) -> tuple[bytes, bool]:
-    """Return the bytes that follow a word with their length, as far as the file has them, and whether they are all."""
+    """Return the bytes after a length word that the file contains, and whether they are complete."""
     length = _read_length(file)
     available = min(length, size - file.tell())
     if available > memory.MAX_BLOCK_BYTES:
@@ -316,7 +316,7 @@ def _read_length(file: BinaryIO) -> int:
 
 
 def _decompress(compression: bytes, content: bytes, size: int) -> tuple[bytes, str]:
-    """Return the unpacked content of a chunk, as far as it is intact, and a problem that completes "a chunk …"."""
+    """Return the intact part of a chunk's unpacked content, and a problem that completes "a chunk …"."""
     if size > memory.MAX_BLOCK_BYTES:
         return b"", f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
     inside = content

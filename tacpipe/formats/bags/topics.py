@@ -1,4 +1,4 @@
-"""Decode the messages of a topic in batches and collect their rows in a spill file, in the order of one clock.
+"""Decode the messages of a topic in batches and collect the rows in a spill file, ordered by one clock.
 
 JSON and protobuf messages of an MCAP file get one column per path, such as ``pose.position.x``.
 """
@@ -23,36 +23,38 @@ from tacpipe.io.spill import Piece, Spill
 from tacpipe.printable import plain
 
 LOG, HEADER, PUBLISH, FRAME = "t_log_ns", "t_header_ns", "t_publish_ns", "frame_id"
-MAX_STAMP_OFFSET_NS = 60 * 10**9  # largest distance of a header stamp from its log time, in the same clock
+MAX_STAMP_OFFSET_NS = (
+    60 * 10**9
+)  # maximum difference between a header stamp and its log time if both use the same clock
 ABOUT_TIME = {"unit": "ns", "quantity": "time"}
 
 
 @dataclass(frozen=True)
 class TopicStream:
-    """A stream of a topic: its rows in the order of their stamps, and the column of the stamps."""
+    """A stream of a topic: its rows in time order, and the name of the time column."""
 
     suffix: str
     content: Batched
     time: Time
-    note: str  # remark about the stamps, or empty if there is none
+    note: str  # remark about the timestamps, empty if there is none
 
 
 class TopicRows:
-    """The rows of one stream of a topic: ``spill`` has the rows, this object what holds for all of them."""
+    """Collects the rows of one stream in ``spill``, and the properties shared by all rows."""
 
     def __init__(self, spill: Spill) -> None:
         self._spill = spill
         self._pieces: list[Piece] = []
         self._schema: pa.Schema = pa.schema([])
         self._about: dict[str, Mapping[str, str]] = {}
-        self._absent: set[str] = set()  # columns that not every row has
+        self._absent: set[str] = set()  # columns that some rows lack
         self._headers_set = self._headers_unset = False
-        self._apart_ns = 0  # largest distance of header stamps from log times
+        self._apart_ns = 0  # maximum difference between header stamp and log time
         self._published_apart = False  # True if a publish time differs from its log time
-        self._frames: set[str] = set()  # names of frames, two at most
+        self._frames: set[str] = set()  # frame names, at most two
 
     def describe(self, about: Mapping[str, Mapping[str, str]]) -> int:
-        """Add field metadata by column, keep earlier metadata, and return the number of described columns."""
+        """Add field metadata by column without replacing existing metadata. Returns the number of described columns."""
         for name, values in about.items():
             self._about.setdefault(name, values)
         return len(self._about)
@@ -81,7 +83,7 @@ class TopicRows:
         self._pieces.append(self._spill.add(table, orders))
 
     def finish(self, suffix: str) -> TopicStream:
-        """Return the rows in the order of their clock, and the name of the clock's column."""
+        """Return the rows ordered by their clock, and the name of its column."""
         clock, note = self._clock()
         left_out = set() if self._published_apart else {PUBLISH}
         if clock == LOG and HEADER not in self._absent and not self._headers_set:
@@ -108,11 +110,11 @@ class TopicRows:
         return TopicStream(suffix, content, Time(clock, "ns"), note)
 
     def _clock(self) -> tuple[str, str]:
-        """Return the column with the time of the rows, and the reason where it is not the header stamp.
+        """Return the time column, and the reason if it is not the header stamp.
 
-        A header states when a value was measured, the log when it arrived. Headers count where all are set and in the clock
-        of the log: those of a simulation, of a device's own clock or of a clock that was set in between would tear streams
-        apart.
+        A header stamp is the time of measurement; the log time is the time of arrival. Header stamps are used only if
+        all are set and they share the log's clock. Stamps of a simulation, of a device clock, or of a clock that was
+        set during the recording would separate streams.
         """
         if HEADER not in self._schema.names or HEADER in self._absent:
             return LOG, ""
@@ -124,7 +126,7 @@ class TopicRows:
 
 
 def _column_type(kind: pa.DataType, absent: bool) -> pa.DataType:
-    """Return the stored type of a column; numbers that some rows lack become float64, since NaN marks them."""
+    """Return the stored type of a column. Numbers that some rows lack become float64, so that NaN can mark them."""
     if not absent or pa.types.is_string(kind) or pa.types.is_binary(kind) or pa.types.is_floating(kind):
         return kind
     return pa.float64()
@@ -146,34 +148,34 @@ def _without_nulls(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
     return column.fill_null(b"" if pa.types.is_binary(field.type) else float("nan"))
 
 
-BATCH_BYTES = 1 << 24  # undecoded messages of one topic in memory
+BATCH_BYTES = 1 << 24  # size of undecoded messages per topic in memory
 BATCH_MESSAGES = 1 << 16
 MAX_STREAM_COLUMNS = 1 << 14
 
 
 class TopicError(ValueError):
-    """Why a topic cannot be read."""
+    """The reason why a topic cannot be read."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Messages of one shape, decoded: which they are, and their columns."""
+    """Decoded messages of one shape: their row numbers and columns."""
 
-    suffix: str  # end of the stream's name; a message may have rows of several streams
+    suffix: str  # suffix of the stream name; a message may have rows for several streams
     rows: Int64s  # (row,), positions in the batch
     columns: Mapping[str, pa.Array]
-    about: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # field metadata, by column
+    about: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # field metadata by column
 
 
 class MessageDecoder(Protocol):
-    """A decoder that turns the messages of a topic into columns."""
+    """Decodes the messages of a topic to columns."""
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` if they cannot be decoded."""
+        """Yield the columns of messages. Raises `TopicError` if they cannot be decoded."""
 
 
 class TopicDecoder:
-    """Decode the messages of one topic into streams, whose rows go to ``spill``."""
+    """Decodes the messages of one topic to streams; their rows are written to ``spill``."""
 
     def __init__(self, decoder: MessageDecoder, spill: Spill) -> None:
         self._decoder, self._spill = decoder, spill
@@ -181,11 +183,11 @@ class TopicDecoder:
         self._log_ns: list[int] = []
         self._publish_ns: list[int] = []
         self._bytes = 0
-        self._streams: dict[str, TopicRows] = {}  # rows by suffix of the stream's name
+        self._streams: dict[str, TopicRows] = {}  # rows by stream suffix
         self.count = 0
 
     def add(self, message: bytes, log_ns: int, publish_ns: int) -> None:
-        """Add a message. Raises `TopicError` if a full batch cannot be decoded."""
+        """Add a message. Raises `TopicError` if a batch is full and cannot be decoded."""
         self._messages.append(message)
         self._log_ns.append(log_ns)
         self._publish_ns.append(publish_ns)
@@ -232,14 +234,14 @@ def _stamp_array(values: Sequence[int]) -> Int64s:
         raise TopicError("its log times are beyond the year 2262") from None
 
 
-MAX_COLUMNS = 4096  # values per message
-_STAMPS = ("header.stamp", "timestamp", "stamp")  # whole numbers under these paths are nanoseconds
+MAX_COLUMNS = 4096  # maximum number of values per message
+_STAMPS = ("header.stamp", "timestamp", "stamp")  # integers at these paths are nanoseconds
 
 
 def block_from_rows(rows: Sequence[Mapping[str, Any]], types: Mapping[str, pa.DataType]) -> Block:
-    """Return messages, each its values by path, as columns; ``types`` are those of paths that a schema declares.
+    """Return messages, given as values by path, as columns. ``types`` are the types of paths declared by a schema.
 
-    Raises `TopicError` if they have too many paths.
+    Raises `TopicError` if there are too many paths.
     """
     names = list(dict.fromkeys(name for row in rows for name in row))
     if len(names) > MAX_COLUMNS:
@@ -270,12 +272,12 @@ def _column_array(values: Sequence[Any], kind: pa.DataType | None) -> pa.Array:
 
 @dataclass(frozen=True)
 class Json:
-    """The messages of a topic in JSON; ``schema`` is its JSON schema, which states what is bytes in base64."""
+    """Decodes JSON messages. The JSON schema ``schema`` declares which values are base64."""
 
     schema: str
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` if one is not a JSON object."""
+        """Yield the columns of messages. Raises `TopicError` if one is not a JSON object."""
         encoded = self._encoded()
         rows: list[dict[str, Any]] = []
         for message in messages:
@@ -308,7 +310,7 @@ class Json:
 
 
 def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON. Raises `TopicError` if two of its entries have the same name."""
+    """Return a JSON object. Raises `TopicError` if it repeats a name."""
     value = dict(pairs)
     if len(value) < len(pairs):
         raise TopicError("a message has two entries of the same name")
@@ -316,7 +318,7 @@ def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def flatten_object(nested: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return nested objects and lists as one object of paths; a time (``sec`` and ``nsec``) is one value in nanoseconds.
+    """Return nested objects and lists as values by path; a time (``sec`` and ``nsec``) becomes one value in nanoseconds.
 
     >>> flatten_object({"stamp": {"sec": 1, "nsec": 5}, "a": {"x": 1.5}, "l": [1, 2], "n": None})
     {'stamp': 1000000005, 'a.x': 1.5, 'l.0': 1, 'l.1': 2, 'n': None}
@@ -345,22 +347,22 @@ def _decode_base64(value: Any) -> bytes:
 
 
 TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
-_TYPES = {  # column types by the ``cpp_type`` of a field's descriptor
+_TYPES = {  # column type by a field descriptor's ``cpp_type``
     **{1: pa.int32(), 2: pa.int64(), 3: pa.uint32(), 4: pa.uint64(), 5: pa.float64(), 6: pa.float32(), 7: pa.bool_()},
-    8: pa.int32(),  # enumerations
+    8: pa.int32(),  # enumeration
 }
 _MESSAGE, _TEXT, _BYTES = 10, 9, 12
 
 
 @dataclass(frozen=True)
 class Protobuf:
-    """The messages of a topic of a protobuf type; ``schema`` is a set of file descriptors."""
+    """Decodes protobuf messages; ``schema`` is a set of file descriptors."""
 
     name: str
     schema: bytes
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
-        """Yield the columns of messages; raises `TopicError` if they are not of the type."""
+        """Yield the columns of messages. Raises `TopicError` if they do not match the type."""
         from google.protobuf.message import DecodeError
 
         types: dict[str, pa.DataType] = {}

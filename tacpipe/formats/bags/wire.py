@@ -1,7 +1,7 @@
 """Locate the values of ROS messages in their bytes, for many messages of one shape at once.
 
-A message has no table of contents: where a value lies depends on the lengths of all strings and sequences before it.
-Messages with the same lengths have the same *shape*, so the first is walked and all are rows of one matrix.
+The offset of a value depends on the lengths of all strings and sequences before it. Messages with equal lengths have
+the same *shape*, so only the first is parsed, and all of them are rows of one matrix.
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ import numpy.typing as npt
 
 from tacpipe.printable import plain
 
-Path = tuple[str | int, ...]  # field names and positions: ("transforms", 0, "header", "stamp")
-Types = Mapping[str, Sequence[tuple[str, Any]]]  # fields of each message type, as rosbags' typestore describes them
+Path = tuple[str | int, ...]  # field names and array positions, such as ("transforms", 0, "header", "stamp")
+Types = Mapping[str, Sequence[tuple[str, Any]]]  # fields of each message type, as in rosbags' typestore
 Matrix = npt.NDArray[np.uint8]  # (message, byte)
 NUMBERS = {
     **{"bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
 }
-_CODES = {  # struct's own, whose "l" has four bytes where numpy's has eight
+_CODES = {  # codes of `struct`, whose "l" has four bytes; numpy's has eight
     name: ({"i8": "q", "u8": "Q"}.get(kind, np.dtype(kind).char), np.dtype(kind).itemsize)
     for name, kind in NUMBERS.items()
 }
 STAMPS = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 TEXT = "text"
-MAX_LEAVES = 1 << 16  # values per message
+MAX_LEAVES = 1 << 16  # maximum number of values per message
 # Messages of one size are decoded one by one once 8 shapes have matched fewer than 4 messages each on average.
 TRIED_SHAPES, FEW_MESSAGES = 8, 4
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags.interfaces.Nodetype
 
 
 class WireError(ValueError):
-    """Why a message cannot be decoded."""
+    """The reason why a message cannot be decoded."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """A value, or an array of numbers, and its place in the message."""
+    """A value or an array of numbers, and its position in the message."""
 
     path: Path
     kind: str  # a ROS type of `NUMBERS`, "text" or "stamp"
     offset: int  # bytes from the start
-    count: int | None  # length of an array, bytes of a text, None for a single number
-    enclosing: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
+    count: int | None  # array length, text length in bytes, or None for a single number
+    enclosing: tuple[tuple[int, str], ...]  # enclosing message types: path length and name
 
     @property
     def size(self) -> int:
@@ -60,12 +60,12 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Encoding:
-    """How messages are written: ROS 1, or CDR of one byte order."""
+    """Serialization of messages: ROS 1, or CDR with a byte order."""
 
     order: str = "<"  # byte order in numpy's notation
-    start: int = 0  # offset of the message, from which alignment counts
+    start: int = 0  # offset of the message, relative to which values are aligned
     aligned: bool = False
-    terminated: bool = False  # True if texts end with a zero byte
+    terminated: bool = False  # whether texts end with a zero byte
 
 
 ROS1 = Encoding()
@@ -81,21 +81,21 @@ def cdr_encoding(message: bytes) -> Encoding:
 
 @dataclass
 class MessageShape:
-    """The leaves of messages of one size whose length words agree."""
+    """The leaves of messages with the same size and the same length words."""
 
     encoding: Encoding
     size: int
     leaves: list[Leaf] = field(default_factory=list)
-    lengths: list[int] = field(default_factory=list)  # offsets of the 4-byte words that hold a length
-    counts: list[int] = field(default_factory=list)  # lengths of sequences: equal counts mean equal leaves
+    lengths: list[int] = field(default_factory=list)  # offsets of the 4-byte length words
+    counts: list[int] = field(default_factory=list)  # lengths of sequences; equal counts mean equal leaves
     first: bytes = b""
 
     def text(self, leaf: Leaf) -> str:
-        """Return a text of the first message."""
+        """Return a text in the first message."""
         return self.first[leaf.offset : leaf.offset + (leaf.count or 0)].decode(errors="replace")
 
     def value(self, leaf: Leaf, index: int | None) -> Any:
-        """Return a value of the first message: a text, a number, one of an array, a stamp in nanoseconds, or bytes."""
+        """Return a value in the first message: a text, a number, an array element, a stamp in nanoseconds, or bytes."""
         if leaf.kind == TEXT:
             return self.text(leaf)
         if leaf.kind == "stamp":
@@ -108,14 +108,14 @@ class MessageShape:
         return bool(number) if leaf.kind == "bool" else number
 
     def number(self, leaf: Leaf) -> int:
-        """Return a whole number of the first message."""
+        """Return an integer in the first message."""
         return int(self.numbers(leaf, np.frombuffer(self.first, np.uint8)[None])[0])
 
     def numbers(self, leaf: Leaf, matrix: Matrix) -> npt.NDArray[Any]:
-        """Return a number (message,), an array of numbers (message, position), or stamps (message,) in nanoseconds."""
+        """Return numbers (message,), arrays (message, position), or stamps in nanoseconds (message,)."""
         order = self.encoding.order
         if leaf.kind == "stamp":
-            # ROS 1 has unsigned seconds, an unset stamp of ROS 2 may be negative: both fit 32 bits until 2038
+            # ROS 1 seconds are unsigned, an unset ROS 2 stamp may be negative; both fit 32 bits until 2038
             seconds = _numbers_at(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
             return seconds * 10**9 + _numbers_at(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
         kind = np.dtype(f"{order}{NUMBERS[leaf.kind]}")
@@ -134,9 +134,9 @@ def _numbers_at(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) ->
 def group_by_shape(
     messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, earlier_shapes: list[MessageShape]
 ) -> Iterator[tuple[MessageShape, npt.NDArray[np.int64], Matrix]]:
-    """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
+    """Yield for each shape the shape, the indices (message,) and the bytes (message, byte) of its messages.
 
-    New shapes are added to ``earlier_shapes``. Raises `WireError` if a message is not of its type.
+    Adds new shapes to ``earlier_shapes``. Raises `WireError` if a message does not match its type.
     """
     sizes = np.fromiter(map(len, messages), np.int64, len(messages))
     different, first = np.unique(sizes, return_index=True)
@@ -147,7 +147,9 @@ def group_by_shape(
         candidates = [shape for shape in earlier_shapes if shape.size == size]
         tried = matched = 0
         while len(rows):
-            if tried >= TRIED_SHAPES and matched < FEW_MESSAGES * tried:  # texts of any length: hardly two are alike
+            if (
+                tried >= TRIED_SHAPES and matched < FEW_MESSAGES * tried
+            ):  # text lengths vary so much that few messages share a shape
                 for row, message in zip(rows.tolist(), matrix, strict=True):
                     yield walk_message(message.tobytes(), types, name, encoding), np.array([row]), message[None]
                 break
@@ -175,7 +177,7 @@ def _matching_rows(shape: MessageShape, matrix: Matrix) -> npt.NDArray[np.bool_]
 
 
 def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) -> MessageShape:
-    """Return the shape of a message. Raises `WireError` if its bytes do not fit its type."""
+    """Return the shape of a message. Raises `WireError` if its bytes do not match its type."""
     shape = MessageShape(encoding, len(message), first=message)
     try:
         end = _Walk(message, types, shape).message(name, (), (), encoding.start)
@@ -197,7 +199,7 @@ class _Walk:
     messages: int = 0  # messages walked, including those without fields
 
     def message(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
-        """Walk the fields of a message that begins at ``at`` and return its end."""
+        """Walk the fields of a message that starts at ``at`` and return its end."""
         if name in STAMPS:
             at = self._aligned(at, 4)
             self._add(Leaf(path, "stamp", at, None, enclosing))
@@ -214,7 +216,7 @@ class _Walk:
         return at
 
     def _padding(self, at: int) -> int:
-        """Pass the byte that CDR has for a message without fields, also where its definition has only constants."""
+        """Skip the byte that CDR writes for a message without fields, also if its definition has only constants."""
         end = at + self.shape.encoding.aligned  # ROS 1 writes nothing
         if end > len(self.content):
             raise struct.error

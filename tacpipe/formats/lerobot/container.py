@@ -1,7 +1,7 @@
-"""LeRobot datasets as containers of streams: an episode a recording, a feature a stream.
+"""LeRobot datasets as containers: one recording per episode, one stream per feature.
 
-The frames have one rate. Where ``timestamp`` agrees with ``frame_index / fps``, the stamps are that quotient, exact to the
-nanosecond; else they are the column's own float32 seconds. The metadata of ``t_ns`` state which.
+Frames have a constant rate. If ``timestamp`` agrees with ``frame_index / fps``, timestamps are that quotient, exact to
+the nanosecond. Otherwise they are the float32 seconds of the column. The metadata of ``t_ns`` record which.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from tacpipe.printable import plain
 from tacpipe.video.files import VideoScan, packet_stream, read_packets, scan
 from tacpipe.video.stream import cut_rows
 
-NATIVE = "tacpipe"  # the folder with the streams that a dataset was exported from, a folder a recording
+NATIVE = "tacpipe"  # folder with the original streams of an exported dataset, one folder per recording
 TOLERANCE_S = 1e-4  # LeRobot's own tolerance
 INDEX, FRAME, STAMP = "episode_index", "frame_index", "timestamp"
 COUNTING_FEATURES = (INDEX, FRAME, STAMP, "index", "task_index")  # features that count frames
-SHARED_STREAMS = ("next", NATIVE)  # features that begin so are one stream, as next.reward and next.done
-EXACT = f"{NATIVE}.t_ns"  # the feature with the stamps in ns, of datasets that tacpipe exported
+SHARED_STREAMS = ("next", NATIVE)  # features with these prefixes form one stream, such as next.reward and next.done
+EXACT = f"{NATIVE}.t_ns"  # feature with the timestamps in ns of datasets exported by tacpipe
 CLOCK = Time(column="t_ns", unit="ns", origin="start")
 FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
 
 
-@functools.lru_cache(maxsize=4)  # the episodes of a video are read one after another
+@functools.lru_cache(maxsize=4)  # episodes that share a video are read one after another
 def _scan_video(path: Path, changed_ns: int) -> VideoScan:
-    """Return the frames of a video, for as long as the file has this time of change."""
+    """Return the frames of a video; the result is cached until the file's modification time changes."""
     return scan(path)
 
 
@@ -57,7 +57,7 @@ class LeRobotContainer:
         self.path = path
 
     def episodes(self) -> Sequence[str]:
-        """Return the names of the episodes, by index."""
+        """Return the names of the episodes by index."""
         return list(self._episodes)
 
     def look(self, episode: str | None) -> EpisodeContents:
@@ -65,16 +65,16 @@ class LeRobotContainer:
         return self._contents(self._find_episode(episode), None, rows=False)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
-        """Return the streams of an episode, all or those of some features."""
+        """Return the streams of an episode, optionally only those of ``sources``."""
         return self._contents(self._find_episode(episode), sources, rows=True)
 
     @property
     def names_itself(self) -> bool:
-        """True if the episodes have the names of the recordings that they were exported from."""
+        """Whether the episodes are named after the recordings that they were exported from."""
         return all(episode.original is not None for episode in self._episodes.values())
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
-        """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
+        """Return the file, the native streams and the metadata that an episode is read from."""
         entry = self._find_episode(episode)
         about = self._about
         native = self._native(entry)
