@@ -1,1 +1,1 @@
-"""One published layout of recordings a file."""
+"""Readers of recordings in other formats, one module or package per format."""

@@ -1,8 +1,8 @@
-"""Slides of a BioTac over twenty materials, drawn by a KUKA LBR iiwa 14 (IROS 2020).
+"""Slides of a BioTac over twenty materials, moved by a KUKA LBR iiwa 14 (IROS 2020).
 
 Published as dexrob/BioTac_slide_20_50. A slide is a set of CSV files in the folder of its material: the finger
-(``mat3_7_bio.csv``), and, where they were kept, pose, velocity, wrench, joint angles, torques and speeds of the arm, each
-stamped by its own clock reading. All rows of the finger's file end in a comma, those of the arm's do not.
+(``mat3_7_bio.csv``) and, if they were recorded, pose, velocity, wrench, joint angles, torques and speeds of the arm,
+each with its own timestamps. Rows of the finger's file end with a comma; rows of the arm's files do not.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from tacpipe.plugins.stage import Files, RecordingOutput, stage
 if TYPE_CHECKING:
     import pyarrow as pa
 
-RATE_HZ = 100.0  # nominal rate of the finger; the means of published slides are within 0.03 Hz of it
+RATE_HZ = 100.0  # nominal rate of the finger; mean rates of published slides are within 0.03 Hz
 NAME = re.compile(r"mat(\d+)_(\d+)_(bio|cp|cv|cw|jp|jt|jv)\.csv")
-ARM = {  # end of the file's name: stream, columns
+ARM = {  # stream and columns by file name suffix
     "cp": ("pose", ("posx", "posy", "posz", "ox", "oy", "oz", "ow")),
     "cv": ("twist", ("x", "y", "z", "a", "b", "c")),
     "cw": ("wrench", ("fx", "fy", "fz", "tx", "ty", "tz")),
@@ -32,10 +32,10 @@ ARM = {  # end of the file's name: stream, columns
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
-    """Return the files of each slide below ``source`` by recording name, ``biotac-m03-t007`` for ``mat3_7_…``.
+    """Return the files of each slide below ``source`` by recording name, such as ``biotac-m03-t007`` for ``mat3_7_…``.
 
-    The finger's file makes a slide; files of an arm without one are passed over. Raises `TacpipeError` if ``source`` is
-    no folder, holds no slide, or holds one twice.
+    Each finger file is a slide; arm files without one are ignored. Raises `TacpipeError` if ``source`` is not a folder,
+    contains no slide, or contains one twice.
     """
     if not source.is_dir():
         raise TacpipeError(
@@ -49,7 +49,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
                 continue
             files = files_by_slide.setdefault(recording_name(int(match[1]), int(match[2])), {})
             same = next((path for file_name, path in files.items() if file_name.endswith(f"_{match[3]}.csv")), None)
-            if same is not None:  # mat3_7_bio.csv in two folders, or next to mat03_7_bio.csv
+            if same is not None:  # the same slide in two folders, or as mat3_7_bio.csv and mat03_7_bio.csv
                 raise UsageError(
                     f"{same} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
                 )
@@ -79,7 +79,7 @@ def recording_name(material: int, trial: int) -> str:
 def biotac_slide(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of a BioTac over materials.
 
-    Returns the stream biotac, and those of the arm that are there; angular velocity that is NaN stays so.
+    Returns the stream biotac and the recorded streams of the arm. NaN in angular velocity is kept.
     """
     from tacpipe.formats import published, xela
 
@@ -96,7 +96,7 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
             streams[stream] = _arm(path, stream, columns)
     begin = next(iter(streams.values()))["t_ns"]
     marked = published.published_attribute("biotac-slide", begin[0].as_py() if len(begin) else 0)
-    # all published slides of a material were recorded in a row; of others nobody states it
+    # published slides of a material were recorded in one session; of others this is unknown
     session = {"session": f"biotac-m{material:02d}"} if marked else {}
     return RecordingOutput(
         streams,
@@ -113,7 +113,7 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
 
 
 def _finger(path: Path) -> pa.Table:
-    """Return the stream of the finger: 44 columns of uint16 counts as they were written, spikes included."""
+    """Return the stream of the finger: 44 columns of uint16 counts as written, including spikes."""
     import pyarrow as pa
 
     from tacpipe.channels import schema
@@ -143,7 +143,7 @@ def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
 
 
 def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
-    """Return what was read under the names of its channels. Raises `TacpipeError` if stamps do not increase."""
+    """Return a table with the names of its channels. Raises `TacpipeError` if timestamps do not increase."""
     import numpy as np
     import pyarrow as pa
 

@@ -1,18 +1,19 @@
-"""Recognise and open containers: files with several streams and their own description, as a bag, an HDF5 or an XDF file.
+"""Recognize and open containers: files that contain several streams and their description, such as bags, HDF5 or XDF
+files.
 
-A container is read by a `tacpipe.formats.container.Container`, which a format implements: its episodes, what a
-look at it shows, and the streams of one episode read in one pass. Each stream comes as a `SourceStream`: its name inside the
-file (``source``), a name for the stream, where its stamps are (`Time`), and rows whose fields have type, quantity, unit
-and layout in their metadata: a table, or `Batched`, of which memory holds some at a time. What cannot be read is named with
-a reason in `Contents.skipped`, what is missing of a damaged file in `Contents.notes`, and what the file states of itself
-becomes `Contents.attributes`.
+A format implements `Container`: the episodes, a preview of one, and the streams of one episode read in one pass. Each
+stream is a `SourceStream`: its name in the file (``source``), a stream name, the origin of its timestamps (`Time`), and
+rows whose fields have type, quantity, unit and layout as metadata. Rows are a table, or `Batched` if they do not all
+fit in memory. Unreadable sources are listed with reasons in `EpisodeContents.skipped`, missing parts of damaged files
+in `EpisodeContents.notes`, and metadata of the file become `EpisodeContents.attributes`.
 
-The layout file of ``ingest table`` is applied to that: a stream of a layout names the container's with ``source``; rules of
-``columns`` and ``time`` replace what the file declares, and are left out where it is right. A new format is
+The layout file of ``ingest table`` is applied to these contents: a stream of the layout refers to one of the container
+with ``source``; rules in ``columns`` and ``time`` replace what the file declares and can be omitted if that is right. A
+new format is
 
 1. a module with ``opened(path) -> Container``, which imports its library inside functions;
 2. an entry in `tacpipe.formats.container.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
-3. a stage, made by `tacpipe.formats.table.contained.ContainerCommand`, with an entry point ``tacpipe.formats``.
+3. a stage, created by `tacpipe.formats.table.contained.ContainerCommand`, with an entry point ``tacpipe.formats``.
 """
 
 from __future__ import annotations
@@ -40,64 +41,66 @@ TimeUnit = Literal["s", "ms", "us", "ns", "iso8601"]
 
 @dataclass(frozen=True)
 class Time:
-    """The origin of the stamps of a stream: a column, a file next to the stream's own, or a rate."""
+    """The origin of a stream's timestamps: a column, a separate file, or a rate."""
 
     column: str = ""
     unit: TimeUnit = "s"
     rate_hz: Rate | None = None
-    origin: Literal["unix", "start"] = "unix"  # zero of numbers: 1970, or the start of the recording
-    zone: str = "UTC"  # time zone of ISO 8601 stamps that name none, as Europe/Berlin
-    start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start, the day of times of day
-    file: str = ""  # pattern of a file that holds the stamps of all rows, one after another
-    format: str = ""  # strptime format of text stamps, as %d.%m.%Y %H:%M:%S.%f; without %Y the time of day
+    origin: Literal["unix", "start"] = "unix"  # time zero of numbers: 1970, or the start of the recording
+    zone: str = "UTC"  # time zone of ISO 8601 timestamps without one, such as Europe/Berlin
+    start: str = (
+        ""  # ISO 8601, UTC: first timestamp of recordings that count from their start, or the date of times of day
+    )
+    file: str = ""  # pattern of a file with the timestamps of all rows
+    format: str = ""  # strptime format of text timestamps, such as %d.%m.%Y %H:%M:%S.%f; without %Y, times of day
 
     @property
     def is_text(self) -> bool:
-        """Return whether stamps are text."""
+        """Whether timestamps are text."""
         return bool(self.format) or self.unit == "iso8601"
 
     @property
     def is_declared(self) -> bool:
-        """True if a column, a file or a rate is named."""
+        """Whether a column, a file or a rate is given."""
         return bool(self.column or self.file) or self.rate_hz is not None
 
 
 @dataclass(frozen=True)
 class Batched:
-    """Rows that memory need not hold: ``read`` yields them as tables of the schema, from the first each time."""
+    """Rows read in batches: each call of ``read`` yields all rows from the start, as tables of the schema."""
 
     schema: pa.Schema
     rows: int
     read: Callable[[], Iterator[pa.Table]]
 
     def mapped(self, schema: pa.Schema, change: Callable[[pa.Table], pa.Table]) -> Batched:
-        """Return the same rows with each table changed to one of ``schema``."""
+        """Return the same rows with ``change`` applied to each table; its results have ``schema``."""
         return Batched(schema, self.rows, lambda: map(change, self.read()))
 
 
 @dataclass(frozen=True)
 class SourceStream:
-    """A stream inside a container.
+    """A stream in a container.
 
-    Columns of the rows are 1-D and of the types that a layout has (``tacpipe.formats.table.columns.TYPES``); those of one
-    array are a column each. Metadata of the fields are ``quantity``, ``unit``, ``component``, and what places a channel in
-    its sensor: ``taxel``, ``axis``, ``joint``, …. Metadata of the field with the stamps goes to ``t_ns``.
+    Columns are 1-D and have the types of a layout (``tacpipe.formats.table.columns.TYPES``); an array is split into
+    columns. Field metadata are ``quantity``, ``unit``, ``component``, and the channel's position in its sensor:
+    ``taxel``, ``axis``, ``joint``, …. Metadata of the time field are copied to ``t_ns``.
     """
 
-    source: str  # its name inside the file: a topic, a group, a dataset
-    name: str  # name of the stream, an identifier
+    source: str  # name in the file: a topic, a group, a dataset
+    name: str  # stream name, an identifier
     time: Time
-    content: pa.Table | Batched  # all rows, or the first few where it was looked at
-    rows: int | None = None  # how many there are, where a look shows it
+    content: pa.Table | Batched  # all rows, or the first few in a preview
+    rows: int | None = None  # number of rows, if a preview shows it
 
     @property
     def schema(self) -> pa.Schema:
-        """The columns."""
+        """The schema of the rows."""
         return self.content.schema
 
     @property
     def table(self) -> pa.Table:
-        """The rows as one table, in memory."""
+        """All rows as one table in memory."""
         import pyarrow as pa
 
         if not isinstance(self.content, Batched):
@@ -105,7 +108,7 @@ class SourceStream:
         return pa.concat_tables([self.schema.empty_table(), *self.content.read()])
 
     def blocks(self) -> Iterator[pa.Table]:
-        """Yield the rows, some at a time where memory need not hold all."""
+        """Yield all rows, in batches if the content is `Batched`."""
         if isinstance(self.content, Batched):
             yield from self.content.read()
         else:
@@ -117,61 +120,61 @@ class EpisodeContents:
     """The streams and attributes of one episode of a container."""
 
     streams: Sequence[SourceStream]
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes of the recording in the file
-    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons by source that cannot be read
-    notes: Sequence[str] = ()  # sentences about what is missing, as of a file that was cut off
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes of the recording stored in the file
+    skipped: Mapping[str, str] = field(default_factory=dict)  # reason for each unreadable source
+    notes: Sequence[str] = ()  # sentences about missing parts, for example of a truncated file
 
 
 @dataclass(frozen=True)
 class Share:
-    """The files and values that one episode of a container, and its key, depend on."""
+    """The files and values that an episode, and its key, depend on."""
 
-    files: Mapping[str, Path]  # files by their path within the container
-    values: Mapping[str, Any] = field(default_factory=dict)  # further JSON values that it depends on
+    files: Mapping[str, Path]  # files by path in the container
+    values: Mapping[str, Any] = field(default_factory=dict)  # further JSON values that the episode depends on
 
 
 @runtime_checkable
 class Sharing(Protocol):
-    """A container in which a changed file costs only the episodes that are read from it."""
+    """A container in which a changed file affects only the episodes that use it."""
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
-        """Return what these streams of an episode, or all, are read from; None: all files of the container."""
+        """Return the files that these streams of an episode are read from, or None if it is all files of the container."""
 
 
 @runtime_checkable
 class NamedContainer(Protocol):
-    """A container that may hold recordings which have had their names before, in a dataset that it was exported from."""
+    """A container that may preserve recording names from before an export."""
 
     @property
     def names_itself(self) -> bool:
-        """True if its episodes are named without the container's name before theirs."""
+        """Whether episode names are used without the container's name as prefix."""
 
 
 class Container(Protocol):
-    """An open container. Its methods raise `TacpipeError`, naming the file, for what is not of its format."""
+    """An open container. Its methods raise `TacpipeError` with the file's name if the file is invalid."""
 
     @property
     def path(self) -> Path:
-        """The file, or the folder where the format is one."""
+        """The path of the file or folder."""
 
     def episodes(self) -> Sequence[str]:
-        """Return the names of the recordings inside, or nothing if the whole is one recording."""
+        """Return the names of the recordings in the container, or an empty sequence if it is one recording."""
 
     def look(self, episode: str | None) -> EpisodeContents:
-        """Return what is there without reading all of it: tables have the right fields, and no or the first rows."""
+        """Return a preview: tables have all fields, and no rows or the first few."""
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
-        """Return the streams of these sources, or all, in one pass; a source that is not there is left out."""
+        """Return the streams of these sources, or all if None, in one pass. Missing sources are ignored."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A format of containers: files with an ending, folders with a mark, or both."""
+    """A kind of containers: files with certain suffixes, folders with certain files, or both."""
 
-    opener: str  # module:function, imported when a file is opened, as it may need an extra
-    endings: tuple[str, ...] = ()  # endings of files, in lower case
-    marks: tuple[str, ...] = ()  # a folder that holds one of these files is one container
-    marked: bytes = b""  # content of the first 4 KiB of such a file
+    opener: str  # ``module:function``, imported when a file is opened because it may need an extra
+    endings: tuple[str, ...] = ()  # file suffixes in lower case
+    marks: tuple[str, ...] = ()  # a folder with one of these files is a container
+    marked: bytes = b""  # bytes that occur in the first 4 KiB of such a file
 
 
 KINDS: Mapping[str, Kind] = {
@@ -207,7 +210,7 @@ def is_container(kind: str, path: Path) -> bool:
 
 
 def has_ending(kind: str, name: str) -> bool:
-    """Return whether a file's name ends as those of containers of this kind do."""
+    """Return whether a file name has a suffix of this kind."""
     return bool(KINDS[kind].endings) and name.lower().endswith(KINDS[kind].endings)
 
 
@@ -219,7 +222,7 @@ def _has_mark(path: Path, content: bytes) -> bool:
 
 
 def find_containers(kind: str, source: Path) -> list[Path]:
-    """Return the containers of this kind at or below ``source``, sorted; what lies within one is part of it."""
+    """Return the containers of this kind at or below ``source``, sorted. Containers inside a container are not listed."""
     paths = [source] if not source.is_dir() and is_container(kind, source) else []
     for place, folders, names in file_system.walk(source) if source.is_dir() else ():
         if is_container(kind, Path(place)):
@@ -231,7 +234,7 @@ def find_containers(kind: str, source: Path) -> list[Path]:
 
 
 def describe_kind(kind: str) -> str:
-    """Return how containers of this kind are recognised, for errors."""
+    """Return a phrase for errors that says how containers of this kind are recognized."""
     container_kind = KINDS[kind]
     files = (
         [f"files named {', '.join(f'*{ending}' for ending in container_kind.endings)}"]
@@ -251,7 +254,7 @@ def no_container_error(kind: str, source: Path) -> UsageError:
 
 
 def container_files(path: Path) -> dict[str, Path]:
-    """Return the files of a container: "" and its path, or of a folder each file by its path within."""
+    """Return the files of a container by path in its folder; a single file has the key ""."""
     if not path.is_dir():
         return {"": path}
     return {
@@ -262,7 +265,7 @@ def container_files(path: Path) -> dict[str, Path]:
 
 
 def container_names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
-    """Return a name for each container: that of its file without the ending, with folders above where two share one."""
+    """Return a unique name for each container: its file name without suffix, preceded by parent folders if needed."""
     stems = {path: _name_stem(path) for path in paths}
     shared = [stem.casefold() for stem in stems.values()]
     return {
@@ -281,7 +284,7 @@ def _name_stem(path: Path) -> str:
 
 
 def identifiers(sources: Sequence[str]) -> dict[str, str]:
-    """Return a stream's name for each source: an identifier, no two alike but for case.
+    """Return a unique stream name for each source: an identifier that is unique regardless of case.
 
     >>> identifiers(["/left/skin", "/joint_states", "left.skin", "3d"])
     {'/left/skin': 'left_skin', '/joint_states': 'joint_states', 'left.skin': 'left_skin_2', '3d': 'stream_3d'}
@@ -307,7 +310,7 @@ Part = TypeVar("Part")
 
 
 def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> dict[str, Part]:
-    """Return parts by their names. Raises `UsageError`, naming the file, where two of a ``kind`` have the same name.
+    """Return parts by name. Raises `UsageError` with the file's name if two parts of a ``kind`` share a name.
 
     >>> parts_by_name([("a", 1), ("b", 2)], Path("x.npz"), "column")
     {'a': 1, 'b': 2}
@@ -324,18 +327,18 @@ def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> d
 
 
 def json_value(text: str | bytes, path: Path) -> Any:
-    """Return a JSON value of a file. Raises `ValueError` or `RecursionError` if it is none, and as `by_name`."""
+    """Return the JSON value in a file. Raises `ValueError` or `RecursionError` if it is invalid."""
     return json.loads(text, object_pairs_hook=lambda pairs: parts_by_name(pairs, path, "entry"))
 
 
-EXAMPLES = 3  # paths named per group
-Reason = Callable[[str], str]  # maps a path within the source to the reason why it is not read, "" if it is
+EXAMPLES = 3  # number of example paths per group
+Reason = Callable[[str], str]  # maps a path in the source to the reason why it is not read, or ""
 
 
 def describe_unread(source: Path, read: Collection[Path], reason: Reason, output: Path | None = None) -> list[str]:
-    """Return one sentence per extension and reason for the files below ``source`` that are not in ``read``.
+    """Return one sentence per suffix and reason for the files below ``source`` that are not in ``read``.
 
-    Hidden files and folders are passed over, and so is the folder ``output``, to which the command writes.
+    Hidden files and the folder ``output``, to which the command writes, are ignored.
     """
     groups: dict[tuple[str, str], list[str]] = {}
     read_paths = {os.fspath(path) for path in read}
@@ -355,7 +358,7 @@ def describe_unread(source: Path, read: Collection[Path], reason: Reason, output
 
 
 def _visible(source: Path, output: Path | None) -> Iterator[str]:
-    """Yield the path of each file below a folder."""
+    """Yield the path of each visible file below a folder, except those in ``output``."""
     output_path = os.path.realpath(output) if output is not None else None
     for place, folders, names in file_system.walk(source) if source.is_dir() else ():
         folders[:] = [

@@ -1,9 +1,9 @@
 """Trials of two GelSight Mini on a Franka hand that holds, lifts and shakes an object: Incipient-Slip-Detection (BSD-2).
 
-Published as amitparag/Incipient-Slip-Detection. A trial is a folder ``OBJECT/exp_num_N`` with a video of each sensor,
-``camera_0.avi`` and ``camera_2.avi`` (MPEG-4, 25 frames per second, no clock), and an empty file ``slip.txt`` if the object
-slipped. A trial with a slip ends at the slip, so its length alone gives the label away: compare windows at equal times
-since the start.
+Published as amitparag/Incipient-Slip-Detection. A trial is a folder ``OBJECT/exp_num_N`` with one video per sensor,
+``camera_0.avi`` and ``camera_2.avi`` (MPEG-4, 25 frames per second, no clock), and an empty file ``slip.txt`` if the
+object slipped. A trial with a slip ends at the slip, so its length alone reveals the label: compare windows at equal
+times since the start.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def require_unit(path: Path, quaternions: Floats, name: str) -> None:
 
 
 def check_rows(trial: str, rows: Mapping[str, int], tactile: str, missing_allowed: int) -> None:
-    """Raise `TacpipeError` if a file has more rows than the tactile file, or lacks more than is known to happen."""
+    """Raise `TacpipeError` if a file has more rows than the tactile file, or more than ``missing_allowed`` fewer."""
     for name, count in rows.items():
         difference = count - rows[tactile]
         if difference > 0 or difference < -missing_allowed:
@@ -83,10 +83,10 @@ def check_rows(trial: str, rows: Mapping[str, int], tactile: str, missing_allowe
 
 
 class TrialMeta:
-    """The line of text that describes a trial, read cell by cell with what each must hold."""
+    """The one-row CSV file that describes a trial; each cell is checked when it is read."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file. Raises `TacpipeError` if it has not one row below its header."""
+        """Read the file. Raises `TacpipeError` unless it has one row below its header."""
         from tacpipe.formats.csv_table import read_record
 
         self.path = path
@@ -97,7 +97,7 @@ class TrialMeta:
         return self._read(name, str, "text")
 
     def number(self, name: str) -> float:
-        """Return a cell as a positive number. Raises `TacpipeError` if it is none."""
+        """Return a cell as a positive number. Raises `TacpipeError` if it is not one."""
 
         def positive(cell: str) -> float:
             value = float(cell)
@@ -108,11 +108,11 @@ class TrialMeta:
         return self._read(name, positive, "a positive number")
 
     def flag(self, name: str) -> bool:
-        """Return a cell that is 0 or 1. Raises `TacpipeError` if it is neither."""
+        """Return a cell that is 0 or 1 as a boolean. Raises `TacpipeError` for other values."""
         return self._read(name, {"0": False, "1": True, "0.0": False, "1.0": True}.__getitem__, "0 or 1")
 
     def utc_ns(self, name: str) -> int:
-        """Return a moment like ``2021-11-24 15:20:42.172409``, read as UTC, in nanoseconds since 1970."""
+        """Return a time such as ``2021-11-24 15:20:42.172409``, read as UTC, in nanoseconds since 1970."""
 
         def moment(cell: str) -> int:
             since = datetime.fromisoformat(cell).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
@@ -145,5 +145,5 @@ def tactile_streams(
 
 
 def authors_role(role: str) -> dict[str, Attribute]:
-    """Return the attribute of the authors' part that a folder is, or none where ``role`` is empty."""
+    """Return the attribute with the authors' role of a folder, or an empty dictionary if ``role`` is empty."""
     return {"authors_role": role} if role else {}

@@ -1,10 +1,10 @@
 """Trials of two XELA uSkin on a Franka arm that grasps, lifts and moves household objects (RSS 2022).
 
-Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV files with one row a callback and no
-clock: only the mean rate is known, so the stamps are made from it and state it. Robot and marker files may lack one row.
-The published columns ``ee_state_orientation_x`` to ``_w`` hold the quaternion as w, x, y, z: only in this order does the
-hand turn with the last link of the arm. The columns of the markers hold x, y, z, w as they are named: only in this order are
-the two markers rigid to each other, in 36 of 36 trials that show both.
+Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV files with one row per callback and no
+clock: only the mean rate is known, so timestamps are computed from it and marked as such. Robot and marker files may
+lack one row. The published columns ``ee_state_orientation_x`` to ``_w`` contain the quaternion as w, x, y, z: only in
+this order does the hand turn with the last link of the arm. The marker columns contain x, y, z, w as named: only in
+this order are the two markers rigid to each other, in 36 of 36 trials that show both.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
 
 
 def _in_order(joint_rad: Floats, quaternions: Floats) -> Floats:
-    """Return quaternions x, y, z, w (time, 4) of columns that may hold w, x, y, z, as the joints (time, 7) show."""
+    """Return quaternions x, y, z, w (time, 4), reordered if the joints (time, 7) show that the columns are w, x, y, z."""
     import numpy as np
 
     from tacpipe.signals.kinematics import PANDA, turns

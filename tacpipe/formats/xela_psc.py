@@ -1,7 +1,7 @@
 """Trials of two XELA uSkin on a Franka arm that moves a held object along a line, with slip labels (CoRL 2022).
 
-Published as imanlab/proactive-slip-control (MIT). A trial is a folder of CSV files with one row a callback; the stamps
-are the seconds in robot_state.csv. Trials begin and end in the grasp.
+Published as imanlab/proactive-slip-control (MIT). A trial is a folder of CSV files with one row per callback.
+Timestamps are the seconds in robot_state.csv. Trials start and end in the grasp.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ROBOT, MARKER, LABELS = "robot_state.csv", "marker.csv", "slip_label.csv"
 NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, LABELS, "meta_data.csv")
-ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R Rᵀ - 1 that is let through; the recordings stay below 1e-5
+ORTHONORMAL_TOLERANCE = 1e-3  # largest accepted entry of R Rᵀ - 1; recordings have less than 1e-5
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
@@ -87,7 +87,7 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
 
 
 def _poses(path: Path) -> Floats:
-    """Return position and quaternion (time, 7) of the 4x4 transforms in a file, which are stored column by column."""
+    """Return position and quaternion (time, 7) from the 4x4 transforms in a file, which are stored in column-major order."""
     import numpy as np
 
     from tacpipe.formats import xela
@@ -110,7 +110,7 @@ def _poses(path: Path) -> Floats:
 
 
 def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
-    """Return seconds as whole nanoseconds (time,). Raises `TacpipeError` if they run backwards."""
+    """Return seconds as integer nanoseconds (time,). Raises `TacpipeError` if they decrease."""
     import numpy as np
 
     from tacpipe.formats.csv_table import file_row

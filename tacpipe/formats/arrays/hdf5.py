@@ -1,7 +1,7 @@
 """HDF5 files as trees of arrays.
 
-Nothing is read that lies in another file: external links, external storage and virtual datasets are left out and named,
-as their content would be no part of a recording's key. Of a file that is cut short all is read whose bytes are there.
+External links, external storage and virtual datasets are skipped with a note: the content of other files would not be
+part of a recording's key. Truncated files are read up to the cut.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ BROKEN = (
     RuntimeError,
     ValueError,
     TypeError,
-)  # errors of h5py for damaged bytes
+)  # errors that h5py raises for damaged bytes
 ATTRIBUTE_BYTES = 1 << 27  # memory limit for reading an attribute
-MAX_COMPRESSION_RATIO = 10_000  # bytes of values that a byte of the file may hold
-FILTERS = {  # HDF5 numbers of the accepted filters; others may need libraries of the file's author
+MAX_COMPRESSION_RATIO = 10_000  # maximum number of bytes that one byte of the file may decompress to
+FILTERS = {  # HDF5 numbers of the accepted filters; others may need third-party plug-ins
     *(1, 2, 3, 4, 5, 6),  # built into HDF5: deflate, shuffle, fletcher32, szip, nbit, scale-offset
     *(307, 32000, 32001, 32004, 32008, 32013, 32015, 32026),  # bzip2, lzf, blosc, lz4, bitshuffle, zfp, zstd, blosc2
 }
@@ -39,22 +39,22 @@ _TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
 
 
 class Hdf5Tree:
-    """An opened HDF5 file; ``bytes_left`` of one that is cut short are there, None of a whole one."""
+    """An open HDF5 file. ``bytes_left`` is the number of bytes present in a truncated file, None for a complete file."""
 
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
         self.path, self._file, self._available = path, file, bytes_left
-        self._members: dict[str, tuple[list[ArrayDescription], list[str]]] = {}  # members by listed group
+        self._members: dict[str, tuple[list[ArrayDescription], list[str]]] = {}  # members of each listed group
         self._attributes_by_group: dict[str, dict[str, Any]] = {}  # attributes of groups
 
     @property
     def notes(self) -> list[str]:
-        """Return a sentence about what is missing."""
+        """Return a sentence about the missing part of a truncated file."""
         if self._available is None:
             return []
         return [f"{self.path} is cut short after {self._available:,} bytes, and the rest is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
-        """Return the arrays in a group and the paths of the groups in it."""
+        """Return the arrays and the paths of the groups in a group."""
         if group in self._members:
             return self._members[group]
         arrays, below = [], []
@@ -67,7 +67,7 @@ class Hdf5Tree:
                 except BROKEN:
                     if self._available is None:
                         raise
-                    member = path  # a path beyond the cut is listed and refused when it is opened
+                    member = path  # a path beyond the cut is listed, and opening it raises an error
                 if isinstance(member, ArrayDescription):
                     arrays.append(member)
                 elif member:
@@ -76,20 +76,20 @@ class Hdf5Tree:
         return self._members[group]
 
     def is_group(self, path: str) -> bool:
-        """Return whether there is a group of this path."""
+        """Return whether a group has this path."""
         with self._reading(path or "its root"):
             kind = self._file.get(path, getclass=True) if path else h5py.Group
             return kind is not None and issubclass(kind, h5py.Group)
 
     def attributes(self, group: str) -> Mapping[str, Any]:
-        """Return the attributes of a group, but those that cannot be read."""
+        """Return the readable attributes of a group."""
         with self._reading(group or "its root"):
             if group not in self._attributes_by_group:
                 self._attributes_by_group[group] = _read_attributes(self._file[group or "/"], self.path)
             return self._attributes_by_group[group]
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
-        """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` if they are damaged."""
+        """Return the rows of an array, text as ``str`` objects. Raises `TacpipeError` if they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
         limit_bytes = memory.MAX_BLOCK_BYTES + array.row_bytes * max(stop - start, 1) * 4
         place = f"{self.path}, {plain(array.path, 200)},"
@@ -106,14 +106,14 @@ class Hdf5Tree:
             return np.moveaxis(np.asarray(values), array.time_axis, 0) if array.shape else np.asarray(values)
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> None:
-        """Return None: all arrays lie in one file."""
+        """Return None, because all arrays are in one file."""
 
     def encoding_metadata(self, array: ArrayDescription) -> None:
-        """Return nothing, as the file states it."""
+        """Return None, because the file itself contains the encoding."""
 
     @contextlib.contextmanager
     def _reading(self, place: str) -> Iterator[None]:
-        """Raise what h5py raises in the block as a `TacpipeError` that names file and place."""
+        """Convert errors of h5py in the block to a `TacpipeError` with the file and the path in it."""
         try:
             yield
         except BROKEN as error:
@@ -129,27 +129,27 @@ class Hdf5Tree:
             ) from error
 
     def _names(self, group: h5py.Group) -> list[str]:
-        """Return the names in a group; of a file that is cut short as many as can be listed."""
+        """Return the names in a group; for a truncated file, those that can be listed."""
         if self._available is None:
             return list(group)
         names: list[bytes] = []
-        place = group.id  # kept: the links do not
+        place = group.id  # keeps the group open while its links are listed
         with contextlib.suppress(*BROKEN):
-            place.links.iterate(names.append)  # a callback that returns nothing continues
+            place.links.iterate(names.append)  # iteration continues while the callback returns None
         return [name.decode(errors="surrogateescape") for name in names]
 
     def identity(self, group: str) -> Any:
-        """Return what the paths of one group share: where it lies in the file."""
+        """Return the group's address in the file, which all paths of the group share."""
         try:
             about = h5py.h5o.get_info(self._file[group or "/"].id)
         except BROKEN:
-            return group  # the group lies beyond the end of a truncated file
+            return group  # the group is beyond the end of a truncated file
         return about.fileno, about.addr
 
 
 @contextlib.contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
-    """Open an HDF5 file for reading, also one that is cut short. Raises `TacpipeError` for what is not HDF5."""
+    """Open an HDF5 file, which may be truncated, for reading. Raises `TacpipeError` if it is not HDF5."""
     with regular.failing(path), regular.opened(path) as file:  # not a pipe, and what the system answers
         size = file.seek(0, io.SEEK_END)
     try:
@@ -174,7 +174,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
 
 @contextlib.contextmanager
 def _open_truncated(path: Path, available: int, size: int) -> Iterator[Hdf5Tree]:
-    """Open a file that has ``available`` of ``size`` bytes. Raises `TacpipeError` if that is not enough."""
+    """Open a file with ``available`` of ``size`` bytes. Raises `TacpipeError` if these are too few."""
     with regular.failing(path), regular.opened(path) as file:
         try:
             file_h5 = h5py.File(_PaddedFile(file, available, size), "r")
@@ -191,7 +191,7 @@ def _open_truncated(path: Path, available: int, size: int) -> Iterator[Hdf5Tree]
 
 
 class _PaddedFile(io.RawIOBase):
-    """A file that is cut short, with zeros to the size that it should have."""
+    """A truncated file, padded with zeros to its full size."""
 
     def __init__(self, file: io.BufferedReader, available: int, size: int) -> None:
         self._file, self._available, self._size, self._at = file, available, size, 0

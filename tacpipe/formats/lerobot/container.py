@@ -98,7 +98,7 @@ class LeRobotContainer:
         return container.parts_by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
 
     def _notes(self, episode: EpisodeDescription) -> list[str]:
-        """Return, with the first episode, whether there are as many as the dataset states."""
+        """Return, for the first episode only, a note if the dataset declares a different number of episodes."""
         declared_count = self._about.info.get("total_episodes")
         first = next(iter(self._episodes.values()))
         if not isinstance(declared_count, int) or declared_count == len(self._episodes) or episode is not first:
@@ -113,7 +113,7 @@ class LeRobotContainer:
         return self._episodes[name]
 
     def _native(self, episode: EpisodeDescription) -> dict[str, Path]:
-        """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
+        """Return the files of the original streams of an exported episode by stream; the key is "" for a single table."""
         folder, file = (regular.inside(self.path, f"{NATIVE}/{episode.name}{end}") for end in ("", ".parquet"))
         paths = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
         return {"": file} if file.is_file() and not paths else paths
@@ -141,7 +141,7 @@ class LeRobotContainer:
         return EpisodeContents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
 
     def _exported_stream(self, name: str, path: Path) -> SourceStream:
-        """Return a stream as it was before the export, to the bit; the rows of a long one are decoded as they are read."""
+        """Return a stream bit for bit as before the export. Rows of a long stream are decoded when they are read."""
         with _copied_again(path):
             stored = ParquetTable(regular.source(path))
             content = stored.read() if stored.num_rows <= SOME_ROWS else None
@@ -191,9 +191,10 @@ class LeRobotContainer:
     def _video_stream(
         self, episode: EpisodeDescription, key: str, name: str, t_ns: Int64s, clock: pa.Field
     ) -> SourceStream:
-        """Return the frames of an episode in its video, with the stamps ``t_ns`` (frame,) of its rows.
+        """Return the frames of an episode from its video, with the timestamps ``t_ns`` (frame,) of its rows.
 
-        Raises `TacpipeError` if the video cannot be read, ends before the episode, or cannot be cut at its ends.
+        Raises `TacpipeError` if the video is unreadable, shorter than the episode, or cannot be cut at the episode's
+        ends.
         """
         path = regular.inside(self.path, episode.videos[key])
         frames = _scan_video(path, path.stat().st_mtime_ns)
@@ -238,7 +239,7 @@ class LeRobotContainer:
             parquet.require_claims(path, [INDEX, FRAME, STAMP, *keys], share=share)
             columns = [INDEX, FRAME, STAMP, *keys]
             frames = file.read_row_groups([], columns=columns, use_threads=False)
-            for group in groups:  # others' rows of one go before the next is read
+            for group in groups:  # filtering each row group bounds the memory
                 rows = file.read_row_group(group, columns=columns, use_threads=False)
                 frames = pa.concat_tables([frames, rows.filter(pc.equal(rows.column(INDEX), episode.index))])
         if frames.num_rows != episode.length:
@@ -270,7 +271,7 @@ class LeRobotContainer:
     def _flat(
         self, episode: EpisodeDescription, feature: FeatureDescription, values: pa.ChunkedArray
     ) -> Sequence[pa.Array | pa.ChunkedArray]:
-        """Return the columns of a feature, which may be lists within lists."""
+        """Return the columns of a feature; nested lists are flattened."""
         kind = values.type
         inner = values.combine_chunks()
         while (
@@ -299,7 +300,7 @@ def open_lerobot(path: Path) -> LeRobotContainer:
 
 @contextlib.contextmanager
 def _copied_again(path: Path) -> Iterator[None]:
-    """State of a file that is damaged what to do."""
+    """Add to errors about damaged files what to do."""
     try:
         yield
     except TacpipeError as error:
@@ -311,7 +312,7 @@ def _is_selected(source: str, sources: Collection[str] | None) -> bool:
 
 
 def _stream_stem(source: str) -> str:
-    """Return what a stream is named after: its feature without the parts that all have.
+    """Return the stream name for a feature, without LeRobot's common prefixes.
 
     >>> _stream_stem("observation.state"), _stream_stem("observation.tactile.xela1"), _stream_stem("action")
     ('state', 'xela1', 'action')
@@ -320,7 +321,7 @@ def _stream_stem(source: str) -> str:
 
 
 def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
-    """Return the row groups that may hold an episode, by the statistics of its index."""
+    """Return the row groups that may contain an episode, according to the statistics of its index."""
     metadata = file.metadata
     column = [metadata.schema.column(statistics).path for statistics in range(metadata.num_columns)].index(INDEX)
     about = [metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)]
@@ -332,7 +333,7 @@ def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
 
 
 def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
-    """Return the stamps of frames (time,) in ns from the start of the episode, and what they are made from."""
+    """Return timestamps (time,) in ns since the start of the episode, and their source."""
     index = frames.column(FRAME).to_numpy().astype(np.int64)  # (time,)
     seconds = frames.column(STAMP).to_numpy().astype(np.float64)
     if not np.isfinite(seconds).all():
@@ -345,7 +346,7 @@ def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str
 
 
 def _exact_stamps(index: Int64s, fps: float) -> Int64s:
-    """Return ``index / fps`` in ns (frame,), rounded, in whole numbers: ``fps`` is exactly a quotient of two.
+    """Return ``index / fps`` in ns (frame,), rounded, computed with integers from the exact ratio of ``fps``.
 
     >>> _exact_stamps(np.array([1, 2, 3]), 30.0).tolist()
     [33333333, 66666667, 100000000]
@@ -355,5 +356,5 @@ def _exact_stamps(index: Int64s, fps: float) -> Int64s:
 
 
 def _picture_bytes(values: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return the bytes of pictures, which are kept with a path beside them."""
+    """Return the bytes of images, which are stored together with a path."""
     return pc.struct_field(values, "bytes") if pa.types.is_struct(values.type) else values

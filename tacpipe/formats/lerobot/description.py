@@ -21,9 +21,9 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 
 INFO = "meta/info.json"
-MAX_META_BYTES = 1 << 28  # largest file in meta
+MAX_META_BYTES = 1 << 28  # maximum size of a file in meta
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-DATA_PATHS = {  # default paths of the frames by version
+DATA_PATHS = {  # default path patterns of the frames by version
     "v2": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
@@ -34,9 +34,9 @@ LOCATION_PREFIXES = (
     "meta/",
     "dataset_",
 )  # prefixes of columns of meta/episodes that locate files
-NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with what an episode was before its export
-ABOUT = "meta/tacpipe.json"  # the name, unit and quantity of each value of a feature, of exported datasets
-_PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces stay as they are, and name no file
+NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with an episode's original name and attributes
+ABOUT = "meta/tacpipe.json"  # name, unit and quantity of each value of a feature, in exported datasets
+_PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces are literal
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class FeatureDescription:
     key: str
     dtype: str
     shape: tuple[int, ...]
-    names: tuple[str, ...] = ()  # names of its values, or empty if their number is not that of the values
+    names: tuple[str, ...] = ()  # names of its values; empty if their number does not match
     units: tuple[str, ...] = ()
     quantities: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:
-        """How many values a row has."""
+        """Number of values per row."""
         count = 1
         for size in self.shape:
             count *= size
@@ -61,20 +61,23 @@ class FeatureDescription:
 
 @dataclass(frozen=True)
 class EpisodeDescription:
-    """One episode: what it is called, the file with its frames, tasks, and what else is stated of it.
+    """One episode: its name, frame file, tasks and further metadata.
 
-    ``original`` are the attributes of the recording that it was exported from, or None if it was not.
+    ``original`` are the attributes of the recording that it was exported from, or None if it was not exported by
+    tacpipe.
     """
 
     name: str
     index: int
-    file: str  # path within the dataset
+    file: str  # path in the dataset
     length: int
     tasks: tuple[str, ...] = ()
-    videos: Mapping[str, str] = field(default_factory=dict)  # path within the dataset by feature
+    videos: Mapping[str, str] = field(default_factory=dict)  # path in the dataset by feature
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     original: Mapping[str, Attribute] | None = None
-    video_starts_s: Mapping[str, float] = field(default_factory=dict)  # start within the video by feature; else 0
+    video_starts_s: Mapping[str, float] = field(
+        default_factory=dict
+    )  # start time in the video by feature, 0 if missing
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class LeRobotDescription:
     info: Mapping[str, Any]
 
     def episodes(self) -> list[EpisodeDescription]:
-        """Return all episodes, by index. Raises `TacpipeError`, naming the file, for what cannot be read."""
+        """Return all episodes by index. Raises `TacpipeError` with the file's name if one cannot be read."""
         episodes = self._episodes_from_parquet() if self.version == "v3.0" else self._episodes_from_lines()
         return sorted(episodes, key=lambda episode: episode.index)
 
@@ -173,7 +176,7 @@ class LeRobotDescription:
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
     def _place(self, key: str, usual: str, values: Mapping[str, object]) -> str:
-        """Return a path within the dataset, of a pattern in info.json."""
+        """Return a path in the dataset from a pattern in info.json."""
         pattern = str(self.info.get(key) or usual)
         try:
             path = _PLACE.sub(lambda match: _format_number(values[match[1]], match[2]), pattern)
@@ -186,7 +189,7 @@ class LeRobotDescription:
 
 
 def read_description(root: Path) -> LeRobotDescription:
-    """Return what a dataset states of itself. Raises `TacpipeError`, naming file and entry, for what is not as it should."""
+    """Return the description of a dataset. Raises `TacpipeError` with file and entry if it is invalid."""
     path = root / INFO
     info = _read_json(root, INFO)
     version, fps = info.get("codebase_version"), info.get("fps")
@@ -210,7 +213,7 @@ def read_description(root: Path) -> LeRobotDescription:
 
 @contextlib.contextmanager
 def parquet_errors(path: Path) -> Iterator[None]:
-    """Raise what pyarrow and the system raise while a Parquet file is read as a `TacpipeError` that names it."""
+    """Convert errors of pyarrow and the system in the block to a `TacpipeError` with the file's name."""
     try:
         yield
     except FileNotFoundError as error:
@@ -245,14 +248,14 @@ def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescr
 
 
 def _leaves(names: Any) -> list[str]:
-    """Return names however they are nested.
+    """Return the names in an arbitrarily nested structure.
 
     >>> _leaves({"motors": ["a", "b"]}), _leaves([["x"], ["y"]]), _leaves(None)
     (['a', 'b'], ['x', 'y'], [])
     """
     leaves: list[str] = []
     pending = [names]
-    while pending:  # however deep they are nested
+    while pending:  # a loop, because deep nesting would exceed the recursion limit
         value = pending.pop()
         if isinstance(value, dict | list):
             pending += reversed(list(value.values()) if isinstance(value, dict) else value)
@@ -299,7 +302,7 @@ def _read_json(root: Path, name: str) -> dict[str, Any]:
 
 
 def _read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a file of JSON lines."""
+    """Yield the objects in a JSON Lines file."""
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
     for number, line in enumerate(content.splitlines(), 1):
