@@ -1,5 +1,4 @@
-"""Recognize and open containers: files that contain several streams and their description, such as bags, HDF5 or XDF
-files.
+"""Recognize and open containers: files with several streams and their description, such as bags, HDF5 or XDF files.
 
 A format implements `Container`: the episodes, a preview of one, and the streams of one episode read in one pass. Each
 stream is a `SourceStream`: its name in the file (``source``), a stream name, the origin of its timestamps (`Time`), and
@@ -234,7 +233,7 @@ def find_containers(kind: str, source: Path) -> list[Path]:
 
 
 def describe_kind(kind: str) -> str:
-    """Return a phrase for errors that says how containers of this kind are recognized."""
+    """Return a phrase for error messages about how containers of this kind are recognized."""
     container_kind = KINDS[kind]
     files = (
         [f"files named {', '.join(f'*{ending}' for ending in container_kind.endings)}"]

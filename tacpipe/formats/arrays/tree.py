@@ -227,7 +227,7 @@ def picture_encoding(content: bytes) -> str:
 
 
 def is_encoded(tree: Tree, array: ArrayDescription, row: int) -> bool:
-    """Return whether a row is an encoded image, judged by its first bytes."""
+    """Return whether a row is an encoded image, by its first bytes."""
     return bool(picture_encoding(_rows_as_bytes(tree.read(array, row, row + 1))[0]))
 
 

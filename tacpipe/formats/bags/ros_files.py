@@ -65,7 +65,7 @@ class Metadata:
 
 @dataclass(frozen=True)
 class BagDamage:
-    """A sentence that says why reading ended early, or which part was not read."""
+    """The reason why reading ended early, or the part that was not read, as a sentence."""
 
     text: str
 
