@@ -1,7 +1,7 @@
-"""Find and name the trials of published sets, and recognise the recordings of a set. Imports nothing heavy.
+"""Find and name the trials of published sets, and recognize their recordings. Imports no heavy libraries.
 
-A recording is recognised by the month in which it was recorded. The figures of a set's paper, and facts about its
-measurement, hold only for its recordings, not for a lab's own in the same layout.
+A recording is recognized by the month in which it was recorded. The figures of a paper, and facts about the
+measurement, hold only for the published recordings, not for a lab's own recordings in the same format.
 """
 
 from __future__ import annotations
@@ -32,19 +32,18 @@ class Params(StreamSelection):
 
 
 def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
-    """Return the trials below ``source``: recording name to file name to path, with only the files that are there.
+    """Return the files that exist for each trial below ``source``: path by file name, by recording name.
 
-    A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
-    recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
-    Raises `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` if two trials share a name
-    even so.
+    A trial is a folder named ``data_sample_…`` or with a file in ``names``; ``source`` itself may be one. The recording
+    has the folder's name without the prefix, preceded by parent folders if that name is not unique. Raises
+    `TacpipeError` if ``source`` is not a folder or contains no trial, `UsageError` if two trials still share a name.
     """
     if not source.is_dir():
         raise TacpipeError(
             f"{source} is not a folder; give the folder that holds the trials, each a folder of CSV files."
         )
     expected_names = set(names)
-    holds: dict[Path, set[str]] = {}  # expected files that each trial has
+    holds: dict[Path, set[str]] = {}  # expected files in each trial
     for place, _, files in walk(source):
         present_names = expected_names.intersection(files)
         if present_names or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
@@ -72,7 +71,7 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
 
 
 def require(files: Files, names: Sequence[str]) -> str:
-    """Return the name of the trial's folder, as `text`. Raises `TacpipeError` if it lacks one of the files ``names``."""
+    """Return the name of the trial's folder. Raises `TacpipeError` if one of the files ``names`` is missing."""
     folder = next((path.parent for path in files.values()), None)
     missing = [name for name in names if name not in files]
     if missing:
@@ -83,16 +82,16 @@ def require(files: Files, names: Sequence[str]) -> str:
 
 
 def text(name: str) -> str:
-    """Return a name of the file system as text: bytes in it that are not a UTF-8 become U+FFFD."""
+    """Return a file name as text, with bytes that are not UTF-8 replaced by U+FFFD."""
     return os.fsencode(name).decode(errors="replace")
 
 
 def valid(name: str) -> str:
-    """Return a folder's name as that of a recording (`paths.valid_name`), without the prefix of trials."""
+    """Return a folder's name as a recording name (`paths.valid_name`), without the prefix of trials."""
     return paths.valid_name(name.removeprefix(PREFIX) or name) or "trial"
 
 
-MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is known by its layout
+MONTHS = {  # first and last month (UTC) of recording by format; a format without timestamps is recognized by its layout
     "biotac-slide": ("2020-02", "2020-02"),
     "vision2tactile": ("2019-05", "2019-07"),
     "xela-flat": ("2021-11", "2021-11"),
@@ -100,9 +99,10 @@ MONTHS = {  # first and last month (UTC) in which a set was recorded, by format;
 
 
 def published_attribute(name: str, t_ns: int | None = None) -> dict[str, Attribute]:
-    """Return the attribute that names the published set of a recording, given its format and its first time stamp (UTC).
+    """Return the attribute with the published set of a recording, from its format and its first timestamp (UTC).
 
-    Empty for a recording of another time; one of a format without stamps is of the set.
+    Returns an empty dictionary for recordings of another time. A recording in a format without timestamps belongs to
+    the set.
 
     >>> [published_attribute("vision2tactile", second * 10**9) for second in (1561629162, 1861629162)]
     [{'published': 'vision2tactile'}, {}]

@@ -1,13 +1,12 @@
-"""Slides of an iCub's forearm, RoboSkin, over the twenty materials that the BioTac slides have (IROS 2020).
+"""Slides of an iCub's forearm, RoboSkin, over the same twenty materials as the BioTac slides (IROS 2020).
 
-Published within dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, a file a fold, with a
-file of labels each. Their axes went through a wrong reshape before; which arrangement a file
-has is derived from its values. The rate is not published.
+Published in dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, one file per fold with a
+file of labels each. The published axes result from a wrong reshape; the arrangement of a file is detected from its
+values. The rate is not published.
 
-Time is the axis along which neighbours resemble each other most. Each slide was written as (taxel, time, triangle) and then
-read as (triangle, taxel, time) without moving its axes: ``X[r, c, j] = U[(T r + j) mod 6, c, floor((T r + j) / 6)]`` for
-slides of T frames and 6 triangles, where U is the slide as it was measured. Values change places only, so the way back is
-exact.
+Time is the axis with the highest autocorrelation. Each slide was written as (taxel, time, triangle) and then read as
+(triangle, taxel, time) without moving its axes: ``X[r, c, j] = U[(T r + j) mod 6, c, floor((T r + j) / 6)]`` for slides
+of T frames and 6 triangles, where U is the measured slide. This is a permutation, so it can be undone exactly.
 """
 
 from __future__ import annotations
@@ -36,15 +35,17 @@ if TYPE_CHECKING:
 
 BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
-MAX_READING = 255.0  # readings stem from eight bits, compensated for temperature
-ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
+MAX_READING = 255.0  # readings have eight bits, with temperature compensation
+ALONG_TIME = (
+    0.85  # lag-1 autocorrelation: published slides have 0.92 or more along time and 0.82 or less along other axes
+)
 UNREADABLE = (
     *(ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, OverflowError),
     tokenize.TokenError,
 )
 MADE = "from nominal rate"
-MAX_LABEL = 10_000  # materials
-MAX_HEADER_BYTES = 10_000  # bytes in front of an array, as numpy allows
+MAX_LABEL = 10_000  # maximum number of materials
+MAX_HEADER_BYTES = 10_000  # maximum header size, as in numpy
 KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # numeric dtype with its size in bytes
 
 
@@ -58,12 +59,12 @@ class Params(StreamSelection):
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
-    """Return the block and its labels, each with a slide's place in it, by recording name.
+    """Return the block and its labels, each with the slide's index in it, by recording name.
 
-    A block is ``icub_fold_0.npy`` (or ``icub_val_0.npy``, as it is published) or ``icub_test.npy``, its labels
-    ``labels_fold_0.npy`` and so on in the same folder. Folders below one that holds blocks are not searched. Raises
-    `TacpipeError` if ``source`` is not a folder, holds no block, or one twice, or where labels are missing or the block
-    is no array of slides.
+    A block is ``icub_fold_0.npy`` (published as ``icub_val_0.npy``) or ``icub_test.npy``, and its labels are
+    ``labels_fold_0.npy`` and so on in the same folder. Folders below one with blocks are not searched. Raises
+    `TacpipeError` if ``source`` is not a folder, contains no block or one twice, if labels are missing, or if a block
+    is not an array of slides.
     """
     if not source.is_dir():
         raise TacpipeError(f"{source} is not a folder; give the folder that holds icub_fold_0.npy and so on.")
@@ -91,7 +92,8 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def roboskin(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of an iCub RoboSkin.
 
-    Returns the stream roboskin: 60 columns, triangle by triangle, one row a frame; stamps follow from the mean rate.
+    Returns the stream roboskin: 60 columns, triangle by triangle, one row per frame; timestamps follow from the mean
+    rate.
     """
     import numpy as np
 
@@ -123,19 +125,19 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
 
 
 def _find_blocks(source: Path) -> list[tuple[str, Path]]:
-    """Return the blocks below a folder: name within the recordings' names, path."""
+    """Return the blocks below a folder as pairs of name and path."""
     blocks = []
     for place, below, names in walk(source):
         for name in sorted(names):
             match = BLOCK.fullmatch(name)
             if match is not None:
                 blocks.append((match[2] or f"fold{int(match[1])}", Path(place) / name))
-                below.clear()  # the published folder holds others with arrays made of these
+                below.clear()  # subfolders of the published folder contain arrays derived from these
     return blocks
 
 
 def _count_slides(path: Path) -> int:
-    """Return how many slides a block has, from the head of the file alone: numpy takes longer to load than a hit."""
+    """Return the number of slides in a block from its header only; loading numpy would take longer than a cache hit."""
     try:
         with regular.failing(path), regular.opened(path) as file:
             if file.read(6) != b"\x93NUMPY":
@@ -173,17 +175,17 @@ def _slide_number(name: str) -> int:
 
 
 def _role_attribute(block: Path) -> dict[str, Attribute]:
-    """Return the attribute of the authors' part that a block is."""
+    """Return the attribute with the authors' role of a block."""
     match = BLOCK.fullmatch(block.name)
     assert match is not None
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
 def _read_slide(path: Path, place: int) -> Float32s:
-    """Return a slide as it was measured (triangle, taxel, time), float32; its values are checked.
+    """Return a measured slide (triangle, taxel, time) as float32, with its values checked.
 
-    Where a slide alone does not state which of its axes is time, because next to nothing was touched, its block does.
-    Raises `TacpipeError` for values that are not readings, and where time cannot be found.
+    If a slide has too little contact to reveal its time axis, the axis of its block is used. Raises `TacpipeError` for
+    invalid readings, or if the time axis cannot be found.
     """
     import numpy as np
 
@@ -217,7 +219,7 @@ def _read_slide(path: Path, place: int) -> Float32s:
 
 
 def _read_label(block: Path, path: Path, place: int) -> int:
-    """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one whole number a slide."""
+    """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one integer per slide."""
     import numpy as np
 
     labels, slides = np.atleast_1d(_cached_array(path)).ravel(), len(_cached_array(block))
@@ -233,17 +235,17 @@ def _read_label(block: Path, path: Path, place: int) -> int:
 
 
 def _cached_array(path: Path) -> AnyArray:
-    """Return an array. Raises `TacpipeError` if the file is none; a pickle is never opened."""
+    """Return an array. Raises `TacpipeError` if the file is not an array; pickles are never loaded."""
     with regular.failing(path):
         stat = path.stat()
     return _load_array(path, stat.st_size, stat.st_mtime_ns)
 
 
-@functools.lru_cache(maxsize=2)  # a block and its labels: the slides of a block are read one after another
+@functools.lru_cache(maxsize=2)  # a block and its labels, because the slides of a block are read one after another
 def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
-    """Return the array of a file, for as long as the file has this size and time of change.
+    """Return the array in a file; the result is cached until size or modification time change.
 
-    Not as a map of memory: a disk that fails ends the process there, with SIGBUS.
+    The file is not memory-mapped, because a disk error would then end the process with SIGBUS.
     """
     import numpy as np
 
@@ -253,7 +255,7 @@ def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
         wide = np.lib.format.read_magic(file) != (1, 0)
         read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
         shape, _, kind = read_head(file)
-        if math.prod(shape) * kind.itemsize > len(content):  # checked first, since np.load allocates the array
+        if math.prod(shape) * kind.itemsize > len(content):  # checked before np.load, which allocates the array
             raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
         array: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
@@ -267,13 +269,11 @@ def _unreadable(path: Path, error: BaseException) -> TacpipeError:
     return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")
 
 
-MIN_AUTOCORRELATION = 0.5  # lag-1 autocorrelation that time must have
+MIN_AUTOCORRELATION = 0.5  # minimum lag-1 autocorrelation along the time axis
 
 
 def lag_one(values: AnyArray, axis: int) -> float:
-    """Return the lag-1 autocorrelation of ``values`` along ``axis``: the correlation of all pairs of neighbours along it.
-
-    NaN if there are no neighbours or they do not vary.
+    """Return the lag-1 autocorrelation of ``values`` along ``axis``, or NaN if it is not defined.
 
     >>> import numpy as np
     >>> round(lag_one(np.array([[0.0, 1.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]]), axis=1), 1)
@@ -291,9 +291,9 @@ def lag_one(values: AnyArray, axis: int) -> float:
 
 
 def is_time(values: AnyArray, axis: int, lowest: float = MIN_AUTOCORRELATION) -> bool:
-    """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``lowest`` or more, and the largest.
+    """Return whether ``axis`` can be time: its lag-1 autocorrelation is the highest of all axes and at least ``lowest``.
 
-    False if nothing varies along it: such an array states nothing about its axes.
+    Returns False if nothing varies along it.
     """
     import numpy as np
 
@@ -306,7 +306,7 @@ def is_time(values: AnyArray, axis: int, lowest: float = MIN_AUTOCORRELATION) ->
 
 
 def scramble(slides: AnyArray) -> AnyArray:
-    """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, of the same shape.
+    """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, with the same shape.
 
     >>> import numpy as np
     >>> measured = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
@@ -322,7 +322,7 @@ def scramble(slides: AnyArray) -> AnyArray:
 
 
 def unscramble(published: AnyArray) -> AnyArray:
-    """Return slides as they were measured, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
+    """Return measured slides (…, triangle, taxel, time) from the published arrangement; the inverse of `scramble`.
 
     >>> import numpy as np
     >>> unscramble(np.array([[[0, 10, 1, 11]], [[2, 12, 3, 13]]])).tolist()
@@ -331,6 +331,6 @@ def unscramble(published: AnyArray) -> AnyArray:
     import numpy as np
 
     triangles, taxels, frames = published.shape[-3:]
-    rows = np.swapaxes(published, -3, -2)  # (…, taxel, row, place in the row)
+    rows = np.swapaxes(published, -3, -2)  # (…, taxel, row, column)
     in_turn = rows.reshape(*published.shape[:-3], taxels, frames, triangles)
     return np.ascontiguousarray(np.moveaxis(in_turn, -1, -3))

@@ -1,8 +1,8 @@
-"""Grasps of a Shadow hand, measured by two BioTac SP and seen by a camera before: yayaneath/vision2tactile (RA-L 2020).
+"""Grasps of a Shadow hand, measured by two BioTac SP after a camera saw the object: yayaneath/vision2tactile (RA-L 2020).
 
-A grasp is a folder named after its unix time, in the folder of its object: the object's cloud of points
-(``cloud-object.pcd``), the two points that the fingers were sent to (``best-grasp.txt``), and one reading of both fingers
-after they had closed (``tactile.tac``).
+A grasp is a folder named after its Unix time, in the folder of its object. It contains the object's point cloud
+(``cloud-object.pcd``), the two target points of the fingers (``best-grasp.txt``), and one reading of both fingers after
+closing (``tactile.tac``).
 """
 
 from __future__ import annotations
@@ -31,16 +31,19 @@ if TYPE_CHECKING:
     from tacpipe.clouds.grasp import Grasp
 
 CLOUD, GRASP, READING = NAMES = ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
-TWIN = "duplicate_of="  # begins the name of the file of an earlier grasp with the same reading
-UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 on
-VALUES = 58  # values of a reading: 29 of the middle finger, then as many of the thumb
-MAX_COUNT = 4095  # counts; the sensor's converter has twelve bits
-POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the wrist's rotation, row by row
+TWIN = "duplicate_of="  # prefix of the name of an earlier grasp's file with the same reading
+UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 onwards
+VALUES = 58  # values per reading: 29 of the middle finger, then 29 of the thumb
+MAX_COUNT = 4095  # counts of a 12-bit converter
+POINTS, WITH_WRIST = (
+    6,
+    15,
+)  # numbers per grasp: two points, optionally followed by the wrist's rotation matrix, row by row
 
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """Criteria for a grasp of the cloud."""
+    """Requirements for a grasp and its cloud."""
 
     # largest distance of a grasp point from the nearest point of the cloud
     beside_mm: Annotated[NonNegativeFloat, Unit("mm")] = 20.0
@@ -49,9 +52,10 @@ class Params(StreamSelection):
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each grasp below ``source`` by recording name, ``bleach-1561629162`` for ``bleach/1561629162/``.
 
-    Files are named as they lie, ``bleach/1561629162/tactile.tac``, so that object and time are part of a key. Where an
-    earlier grasp has the same reading, byte by byte, its file is there too, as ``duplicate_of=`` and that recording's name:
-    no other recording bears on a key. Raises `TacpipeError` if ``source`` is not a folder, holds no grasp, or one twice.
+    Files keep their relative names, ``bleach/1561629162/tactile.tac``, so that object and time are part of a key. If an
+    earlier grasp has an identical reading, its file is added under ``duplicate_of=`` and its recording name, because a
+    key may not depend on other recordings. Raises `TacpipeError` if ``source`` is not a folder, contains no grasp, or
+    contains one twice.
     """
     if not source.is_dir():
         raise TacpipeError(
@@ -82,7 +86,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     """Read published grasps with a point cloud and BioTac SPs.
 
-    Returns the streams cloud, grasp and reading; a grasp with the reading of an earlier one is marked.
+    Returns the streams cloud, grasp and reading; a grasp with the same reading as an earlier one is marked.
     """
     import numpy as np
 
@@ -120,10 +124,10 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
 
 
 def session(label: str, time_s: int) -> str:
-    """Return the session of a grasp: all of one object on one day (UTC).
+    """Return the session of a grasp: all grasps of one object on one day (UTC).
 
-    Between days lie 18 hours or more of the published grasps, within one less than two: a grasp's own time states its
-    session, whichever others are there.
+    Published grasps of different days are at least 18 hours apart, those of one day less than two hours. So a grasp's
+    own time determines its session.
 
     >>> session("bleach", 1561629162)
     'bleach-2019-06-27'
@@ -132,8 +136,8 @@ def session(label: str, time_s: int) -> str:
 
 
 def _add_twins(files_by_grasp: dict[str, dict[str, Path]]) -> None:
-    """Add to each grasp the file of the earliest one that has the same reading, if that is another one."""
-    same: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # digest: time, recording, file
+    """Add to each grasp the file of the earliest other grasp with the same reading."""
+    same: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # (time, recording, file) by digest
     for recording, files in files_by_grasp.items():
         for name, path in files.items():
             if name.endswith(READING):
@@ -145,7 +149,7 @@ def _add_twins(files_by_grasp: dict[str, dict[str, Path]]) -> None:
 
 
 def _read_lines(path: Path) -> list[str]:
-    """Return the lines of a small file of text. Raises `TacpipeError` if it is empty, or none."""
+    """Return the lines of a small text file. Raises `TacpipeError` if it is empty or not text."""
     try:
         lines = regular.source(path).decode("ascii").splitlines()
     except UnicodeDecodeError as error:
@@ -158,7 +162,7 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def _read_grasp(path: Path) -> Grasp:
-    """Return the grasp of a file: six numbers in one line, metres, or these and nine of the wrist's rotation."""
+    """Return the grasp in a file: six numbers in metres on one line, or fifteen with the wrist's rotation."""
     import numpy as np
 
     from tacpipe.clouds.grasp import Grasp
@@ -183,7 +187,10 @@ def _read_grasp(path: Path) -> Grasp:
 
 
 def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) -> None:
-    """Raise `TacpipeError` if a grasp point lies far from the cloud: then they are of two frames, or two grasps."""
+    """Raise `TacpipeError` if a grasp point is far from the cloud.
+
+    Cloud and grasp then belong to different frames or grasps.
+    """
     import numpy as np
 
     for name, point_m in (("first", grasp.g1_m), ("second", grasp.g2_m)):
@@ -197,7 +204,7 @@ def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) ->
 
 
 def _read_counts(path: Path) -> list[int]:
-    """Return the 58 counts of a reading's one line, which begins with a comma. Raises `TacpipeError` for another line."""
+    """Return the 58 counts in a reading's line, which starts with a comma. Raises `TacpipeError` for other lines."""
     lines = _read_lines(path)
     if len(lines) != 1:
         raise TacpipeError(

@@ -1,7 +1,7 @@
-"""Read the chunks of an XDF file (Extensible Data Format, version 1.0) and the samples in them.
+"""Read the chunks of an XDF file (Extensible Data Format, version 1.0) and their samples.
 
-Source: https://github.com/sccn/xdf/wiki/Specifications. After ``XDF:`` come chunks: their length, a tag of two bytes, and a
-content. A boundary chunk is written every few seconds, so that a reader finds its way again after bytes that are wrong.
+Source: https://github.com/sccn/xdf/wiki/Specifications. The magic ``XDF:`` is followed by chunks: length, a tag of two
+bytes, content. A boundary chunk every few seconds lets a reader resynchronize after damaged bytes.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ MAGIC = b"XDF:"
 FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
 OF_A_STREAM = (STREAM_HEADER, SAMPLES, CLOCK_OFFSET, STREAM_FOOTER)
 MARK = bytes.fromhex("43 A5 46 DC CB F5 41 0F B3 0E D5 46 73 83 CB E4")  # content of a boundary chunk
-SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # struct formats of a length by the byte before it
+SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # struct format of a length by the byte before it
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk: ``content`` is what follows the tag, and the number of the stream where it has one."""
+    """A chunk. ``content`` follows the tag and the stream number, if there is one."""
 
     at: int  # offset in the file
     tag: int
     stream: int | None
     content: bytes
-    is_complete: bool = True  # False: the file ends within it
+    is_complete: bool = True  # False if the file ends in the chunk
 
 
 @dataclass(frozen=True)
 class DamagedChunk:
-    """Bytes that are no chunk."""
+    """Bytes that are not a chunk."""
 
     at: int
     bytes: int
 
 
 def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
-    """Yield the chunks of a file in their order, and what is none.
+    """Yield the chunks and the damaged parts of a file in order.
 
-    Raises `TacpipeError` for what does not begin as an XDF file does.
+    Raises `TacpipeError` if the file does not start like an XDF file.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise TacpipeError(f"it begins with {data[:4]!r}, and an XDF file with {MAGIC!r}")
@@ -61,7 +61,7 @@ def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
                 yield chunk
             continue
         next_mark = data.find(MARK, at)
-        if parsed is not None and next_mark < 0:  # the file was cut off
+        if parsed is not None and next_mark < 0:  # the file is truncated
             yield parsed[0]
             return
         stop = len(data) if next_mark < 0 else next_mark + len(MARK)
@@ -70,7 +70,7 @@ def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
 
 
 def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
-    """Return the chunk at a place and where the next one begins, or None if there is none."""
+    """Return the chunk at an offset and its end, or None if there is no valid chunk."""
     length = read_length(data, at)
     if length is None:
         return None
@@ -100,7 +100,7 @@ def read_length(data: Content, at: int) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class ChunkSamples:
-    """The samples of one chunk: stamps in seconds as they are written, or NaN if none is; and how many are missing."""
+    """The samples of a chunk with their timestamps in seconds (NaN if not written), and the number of missing samples."""
 
     stamps: Floats  # (sample,)
     values: AnyArray  # (sample, channel)
@@ -108,14 +108,14 @@ class ChunkSamples:
 
 
 def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> ChunkSamples | None:
-    """Return the samples of a chunk of numbers, as many as are whole, or None if even their count is not there."""
+    """Return the complete samples of a numeric chunk, or None if even their count is missing."""
     count = read_length(content, 0)
     if count is None:
         return None
     declared, begin = count
     body = content[begin:]
     wide = kind.newbyteorder("<")
-    for stamped in (declared, 1 if declared else 0, 0):  # all have a stamp, the first alone, none
+    for stamped in (declared, 1 if declared else 0, 0):  # all samples have a timestamp, only the first, or none
         samples = _parse_regular(body, wide, channels, declared, stamped)
         if samples is not None:
             return samples
@@ -125,7 +125,7 @@ def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> 
 def _parse_regular(
     body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int
 ) -> ChunkSamples | None:
-    """Return samples of which the first ``stamped`` have a stamp and the others none, or None if it is not so."""
+    """Return samples of which exactly the first ``stamped`` have a timestamp, or None if the bytes do not fit this."""
     full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
     bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
     if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:
@@ -139,7 +139,7 @@ def _parse_regular(
 
 
 def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> ChunkSamples:
-    """Return samples one by one, up to the first that is not whole."""
+    """Parse samples one by one, up to the first incomplete one."""
     stamps, values, at, size = [], [], 0, channels * kind.itemsize
     for _ in range(count):
         stamp = _read_stamp(body, at)
@@ -153,7 +153,7 @@ def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, cou
 
 
 def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
-    """Return the samples of a chunk of texts, as many as are whole, or None if even their count is not there."""
+    """Return the complete samples of a text chunk, or None if even their count is missing."""
     count = read_length(content, 0)
     if count is None:
         return None
@@ -184,7 +184,7 @@ def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | 
 
 
 def _read_stamp(content: bytes, at: int) -> tuple[float, int] | None:
-    """Return a sample's stamp (NaN if it has none) and where its values begin, or None if there is none."""
+    """Return a sample's timestamp (NaN if not written) and the offset of its values, or None if it is incomplete."""
     if at >= len(content) or content[at] not in (0, 8) or at + 1 + content[at] > len(content):
         return None
     if not content[at]:
@@ -193,7 +193,7 @@ def _read_stamp(content: bytes, at: int) -> tuple[float, int] | None:
 
 
 def fill_stamps(stamps: Floats, last: float, period_s: float) -> Floats:
-    """Return stamps (sample,) with those filled in that are not written: a period after the one before.
+    """Return timestamps (sample,) with missing ones set to one period after the previous.
 
     >>> fill_stamps(np.array([np.nan, 5.0, np.nan]), 1.0, 0.5).tolist()
     [1.5, 5.0, 5.5]

@@ -1,8 +1,8 @@
-"""Read an XDF file as a container: each stream of LSL with stamps on the recorder's clock, and its clock offsets.
+"""Read an XDF file as a container: LSL streams with timestamps on the recorder's clock, and their clock offsets.
 
-``lsl_ns`` is when a sample was taken, on the clock of the computer that recorded: the stamp as it was sent, moved by our own
-fit of the offsets that were measured meanwhile. The stamp as it was sent stays in ``t_device_ns``. Both count from when a
-computer started, as LSL's clock does.
+``lsl_ns`` is the time of a sample on the clock of the recording computer: the sender's timestamp, corrected by our fit
+of the offsets measured during the recording. ``t_device_ns`` is the sender's timestamp. Like LSL's clock, both count
+from the start of a computer.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from tacpipe.signals import clock_offsets, clocks
 
 STAMP = "lsl_ns"
 RAW = "t_device_ns"
-OFFSETS = " clock offsets"  # end of the name of a stream's offsets
+OFFSETS = " clock offsets"  # suffix of the name of a stream's offsets
 UNDESCRIBED = "the file does not describe it"
 CLOCK = "LSL's, of the computer that recorded"
-SPILL_ROWS = 1 << 16  # samples of a stream in memory before they go to the spill
-PASSED_BYTES = 1 << 26  # bytes read before their pages are released
-COMPRESSED_BYTES = 1 << 20  # bytes decompressed at once
+SPILL_ROWS = 1 << 16  # samples per stream in memory before they are written to the spill file
+PASSED_BYTES = 1 << 26  # number of bytes read before their pages are released
+COMPRESSED_BYTES = 1 << 20  # number of bytes decompressed at once
 
 
 @dataclass
@@ -49,17 +49,17 @@ class _StreamReading:
     about: lsl.LslDescription
     spill: Spill
     stamps: list[Floats] = field(default_factory=list)
-    values: list[AnyArray] = field(default_factory=list)  # (sample, channel), of samples that are not put aside
+    values: list[AnyArray] = field(default_factory=list)  # (sample, channel), samples not yet written to the spill file
     pieces: list[Piece] = field(default_factory=list)
-    waiting: int = 0  # samples of ``values``
-    offsets: list[tuple[float, float]] = field(default_factory=list)  # reading of the sender's clock, and what to add
-    rows_before: list[int] = field(default_factory=list)  # (offset,), samples that stand before it in the file
+    waiting: int = 0  # number of samples in ``values``
+    offsets: list[tuple[float, float]] = field(default_factory=list)  # clock reading, offset to add
+    rows_before: list[int] = field(default_factory=list)  # (offset,), number of samples before it in the file
     rows: int = 0
-    missing: int = 0  # samples of chunks that are not whole
-    declared: int | None = None  # samples that the footer counts
+    missing: int = 0  # number of samples in incomplete chunks
+    declared: int | None = None  # number of samples according to the footer
 
     def add_samples(self, content: bytes) -> None:
-        """Take the samples of a chunk."""
+        """Add the samples of a chunk."""
         channels = len(self.about.channels)
         samples = (
             xdf_chunks.parse_texts(content, channels)
@@ -96,7 +96,7 @@ class _StreamReading:
         ]
 
     def channels(self) -> Iterator[list[pa.ChunkedArray]]:
-        """Yield the values of the channels, some samples at a time."""
+        """Yield the values of the channels in batches of samples."""
         for piece in self.pieces:
             yield self.spill.read(piece).columns
         if self.waiting:
@@ -114,13 +114,13 @@ class _FileReading:
     spill: Spill = field(default_factory=Spill)
     streams: dict[int, _StreamReading] = field(default_factory=dict)
     headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
-    unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
+    unknown: dict[int, str] = field(default_factory=dict)  # reason by stream whose description cannot be read
     header: bytes = b""
     damage: list[DamagedChunk] = field(default_factory=list)
     cut_at: int | None = None  # offset of the incomplete chunk at the end of a truncated file
 
     def notes(self, path: Path) -> list[str]:
-        """Return what is missing, in words."""
+        """Return sentences about missing data."""
         sentences = []
         if self.damage:
             size, first = sum(damage.bytes for damage in self.damage), self.damage[0].at
@@ -142,22 +142,22 @@ class _FileReading:
 
 @dataclass(frozen=True)
 class XdfFile:
-    """An XDF file; `kinds.opened` gives one."""
+    """An XDF file as a container."""
 
     path: Path
 
     def episodes(self) -> Sequence[str]:
-        """Return nothing: a file is one recording."""
+        """Return an empty sequence, because a file is one recording."""
         return ()
 
     def look(self, episode: str | None) -> EpisodeContents:
-        """Return all that is in the file: it has no index, so a look reads it."""
+        """Return the full contents; without an index, a preview must read the whole file."""
         return self.read(None, episode)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
-        """Return the streams, and for each whose clock was compared with the recorder's its offsets as another one.
+        """Return the streams, and the clock offsets of each stream that was compared with the recorder's clock.
 
-        Raises `TacpipeError` for a file that is not XDF.
+        Raises `TacpipeError` if the file is not XDF.
         """
         read = self._read()
         sources_by_number = _stream_sources(read.streams)
@@ -194,13 +194,13 @@ class XdfFile:
         read = _FileReading()
         try:
             content = _open_content(self.path)
-            passed = 0  # bytes
+            passed = 0  # bytes since pages were last released
             for chunk in xdf_chunks.read_chunks(content):
                 _add_chunk(read, chunk, self.path)
                 if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
                     content.madvise(
                         mmap.MADV_DONTNEED, passed, PASSED_BYTES
-                    )  # else the whole file stays mapped in memory
+                    )  # without this, the whole file stays mapped in memory
                     passed += PASSED_BYTES
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
@@ -212,7 +212,7 @@ class XdfFile:
 
 
 def _open_content(path: Path) -> xdf_chunks.Content:
-    """Return the bytes of a file, decompressed; of a compressed one that was cut off those that are there."""
+    """Return the decompressed bytes of a file, up to the cut if a compressed file is truncated."""
     with regular.failing(path), regular.opened(path) as file, tempfile.TemporaryFile() as unpacked:
         head = file.read(2)
         if head == b"\x1f\x8b":
@@ -226,7 +226,7 @@ def _open_content(path: Path) -> xdf_chunks.Content:
 
 
 def _gzip_blocks(file: BinaryIO) -> Iterator[bytes]:
-    """Yield what a file of gzip holds, of which several may follow one another, up to where it was cut off."""
+    """Yield the content of a file of one or more gzip members, up to the cut if it is truncated."""
     stream = zlib.decompressobj(wbits=31)
     while data := file.read(COMPRESSED_BYTES):
         while data:
@@ -239,7 +239,7 @@ def _gzip_blocks(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> None:
-    """Take a chunk into what was read."""
+    """Add a chunk to the contents read so far."""
     if isinstance(chunk, DamagedChunk):
         read.damage.append(chunk)
         return
@@ -264,7 +264,7 @@ def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> N
 
 
 def _describe(read: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
-    """Take the description of a stream. Raises `UsageError` for a second one that differs."""
+    """Store the description of a stream. Raises `UsageError` for a second, different description."""
     before = read.headers.get(stream)
     if before is None:
         read.headers[stream] = chunk.content
@@ -288,7 +288,7 @@ def _sample_count(footer: bytes) -> int | None:
 
 
 def _stream_sources(streams: Mapping[int, _StreamReading]) -> dict[int, str]:
-    """Return how each stream is named: by its name, with its number where two share one."""
+    """Return the source name of each stream: its name, with its number if the name is not unique."""
     names = {number: stream.about.name or stream.about.kind or f"stream {number}" for number, stream in streams.items()}
     name_list = list(names.values())
     return {number: name if name_list.count(name) == 1 else f"{name} {number}" for number, name in names.items()}
@@ -303,7 +303,7 @@ def _file_attributes(header: bytes) -> dict[str, Attribute]:
 
 
 def _describe_losses(stream: _StreamReading) -> list[str]:
-    """Return what of a stream is not there, in words."""
+    """Return sentences about the missing samples of a stream."""
     losses = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
     if stream.declared is not None and stream.declared != stream.rows:
         losses.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared:,}.")
@@ -311,9 +311,9 @@ def _describe_losses(stream: _StreamReading) -> list[str]:
 
 
 def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute], list[str]] | str:
-    """Return when samples were taken on the recorder's clock (sample,), facts about the clocks, and what is odd.
+    """Return sample times on the recorder's clock (sample,), attributes of the clock fit, and remarks.
 
-    Instead a reason where that cannot be known.
+    Returns a reason instead if the times cannot be determined.
     """
     raw_s = np.concatenate(stream.stamps)
     if not (np.abs(raw_s) < lsl.MAX_TIME_S).all():
@@ -347,7 +347,7 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
 
 
 def _valid_offsets(stream: _StreamReading) -> Int64s:
-    """Return the clock offsets (measurement, reading and offset in ns) that are numbers."""
+    """Return the finite clock offsets in ns, shape (measurement, reading and offset)."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
     return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_is_valid(offsets_s)].T])
 
@@ -357,9 +357,9 @@ def _is_valid(offsets_s: Floats) -> AnyArray:
 
 
 def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: int) -> int:
-    """Return the first sample after the sender's clock was reset: the measurement ``first`` is the first one after it.
+    """Return the first sample after the sender's clock was reset. ``first`` is the first measurement after the reset.
 
-    It stands between that measurement and the one before, or, as samples are written late, the one behind.
+    The sample is between that measurement and the previous one or, because samples are written late, just after it.
     """
     sound = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
     rows = [*(stream.rows_before[place] for place in sound.tolist()), len(raw_ns)]
@@ -370,12 +370,12 @@ def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: i
     jump = int(np.abs(steps - np.median(steps)).argmax())
     expected = measured[first, 0] - measured[first - 1, 0]
     if abs(int(steps[jump])) < abs(int(expected)) / 2 and (steps >= 0).all():
-        return min(rows[first], len(raw_ns))  # no sample shows it: none was sent meanwhile
+        return min(rows[first], len(raw_ns))  # no sample shows the reset, because none was sent in between
     return max(low - 1, 0) + jump + 1
 
 
 def _content_of(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
-    """Return the samples with their stamps: a table of few, else as they were put aside. The stamps are in memory."""
+    """Return the samples with their timestamps: a table if there are few, else batches from the spill file."""
     schema = pa.schema([_time_field(STAMP), _time_field(RAW), *stream.fields])
     raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
 
@@ -395,7 +395,7 @@ def _time_field(name: str) -> pa.Field:
 
 
 def _offsets_table(stream: _StreamReading) -> pa.Table:
-    """Return the clock offsets as they were measured: when on both clocks, and what was to be added."""
+    """Return the measured clock offsets: the times on both clocks and the offset to add."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
     offsets_s = offsets_s[_is_valid(offsets_s)]
     sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)

@@ -1,4 +1,4 @@
-"""Read the parts that the published XELA trials share: uSkin counts, markers, and one line about the trial."""
+"""Read the files that the published XELA trials share: uSkin counts, markers, and the line about the trial."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ T = TypeVar("T")
 SENSORS = {"xela1": "xela_sensor1.csv", "xela2": "xela_sensor2.csv"}
 META = "meta_data.csv"
 UNSEEN = 10.0  # value of all seven columns of a marker that the camera did not see
-UNIT_TOLERANCE = 1e-3  # tolerance of a quaternion's length; the recordings stay below 1e-6
+UNIT_TOLERANCE = 1e-3  # tolerance of a quaternion's norm; recordings have less than 1e-6
 
 
 def read_uskin(path: Path) -> list[Counts]:
-    """Return the 48 columns of one uSkin, each (time,), uint16 counts, taxel by taxel."""
+    """Return the 48 columns of a uSkin, each (time,), uint16 counts, ordered by taxel."""
     import pyarrow as pa
 
     from tacpipe.formats.csv_table import read_csv
@@ -45,9 +45,9 @@ def read_floats(path: Path, names: Sequence[str]) -> Floats:
 
 
 def read_marker(path: Path, name: str) -> tuple[Floats, float]:
-    """Return the pose of a marker (time, 7), or NaN if the camera did not see it, and the fraction of such rows.
+    """Return the pose of a marker (time, 7), with NaN in rows in which the camera did not see it, and their fraction.
 
-    Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
+    Raises `TacpipeError` with file and row if a quaternion is not of unit length.
     """
     columns = [f"{name}_position_{axis}" for axis in schema.AXES]
     pose = read_floats(path, columns + [f"{name}_quaternion_{part}" for part in schema.COMPONENTS])
@@ -58,7 +58,7 @@ def read_marker(path: Path, name: str) -> tuple[Floats, float]:
 
 
 def require_unit(path: Path, quaternions: Floats, name: str) -> None:
-    """Raise `TacpipeError`, naming file and row, where a quaternion (time, 4) has not length 1; NaN is let through."""
+    """Raise `TacpipeError` with file and row if a quaternion (time, 4) is not of unit length; NaN is accepted."""
     from tacpipe.formats.csv_table import file_row
 
     length = np.linalg.norm(quaternions, axis=1)

@@ -1,4 +1,4 @@
-"""Choose and convert the columns of a file by the rules of a stream."""
+"""Select and convert the columns of a file by the rules of a stream."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ TYPES = {
         "binary": pa.binary(),
     },
 }
-Declared = Mapping[str, pa.Field]  # field with type and metadata by the name of a column
+Declared = Mapping[str, pa.Field]  # field with type and metadata by column name
 NO_DECLARATION: Declared = {}
 
 
 @dataclass(frozen=True)
 class ChosenColumn:
-    """A column that is read: its name in the file, what it becomes, and the rule that states it."""
+    """A selected column: its name in the file, its field, and the matching rule."""
 
     name: str
     field: pa.Field
@@ -42,12 +42,12 @@ class ChosenColumn:
 
     @property
     def read_as(self) -> pa.DataType:
-        """The type that the cells are parsed as: of floats always 64 bits, since they may be scaled."""
+        """The type for parsing cells: 64 bits for floats, because they may be scaled."""
         return pa.float64() if pa.types.is_floating(self.field.type) else self.field.type
 
 
 class CellError(ValueError):
-    """A value that is not allowed: the index of its row, and what is wrong with it."""
+    """An invalid value: the index of its row, and the reason."""
 
     def __init__(self, row: int, text: str) -> None:
         super().__init__(text)
@@ -57,11 +57,11 @@ class CellError(ValueError):
 def choose_columns(
     stream: StreamLayout, names: Sequence[str], path: Path, declared: Declared = NO_DECLARATION
 ) -> list[ChosenColumn]:
-    """Return the columns to read among those that ``path`` has, in the file's order.
+    """Return the columns to read among those in ``path``, in the file's order.
 
-    ``declared`` are the columns that the file itself describes: where no rule matches they are read so, and a rule replaces
-    only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
-    two columns of one name.
+    ``declared`` are the fields that the file describes. They apply to columns without a matching rule; a rule replaces
+    only the properties that it sets. Raises `TacpipeError` for a column without a description, a rule without a match,
+    and duplicate names.
     """
     chosen_columns: list[ChosenColumn] = []
     used = set()
@@ -97,9 +97,9 @@ def choose_columns(
 
 
 def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: StreamLayout) -> list[ChosenColumn]:
-    """Return columns that are cells of an array with the metadata of their place in its shape, and named by it.
+    """Return columns that are cells of an array, with names and metadata for their positions in its shape.
 
-    Raises `TacpipeError` if a rule matches another number of columns than its shape has cells.
+    Raises `TacpipeError` if a rule does not match as many columns as its shape has cells.
     """
     by_rule: dict[ColumnRule, list[ChosenColumn]] = {}
     for column in columns_read:
@@ -120,9 +120,9 @@ def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: Strea
 
 
 def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
-    """Return the field of the cell with this number in the array of a rule's shape.
+    """Return the field of a cell by its index in the array of a rule's shape.
 
-    A tactile cell has a taxel and an axis, another one an index and a component; both count from 1.
+    A tactile cell has a taxel and an axis, another cell an index and a component; both count from 1.
     """
     rule = column.rule
     index = list(np.unravel_index(cell, rule.shape))
@@ -161,13 +161,13 @@ def _column_field(rule: ColumnRule, name: str, values: dict[str, str], declared:
 def convert_column(
     column: pa.ChunkedArray, target: ChosenColumn, nan_allowed: bool, inf_allowed: bool = False
 ) -> pa.Array | pa.ChunkedArray:
-    """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
+    """Return a parsed column in its declared type, scaled. Missing values become NaN in floats and empty text.
 
-    Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
-    ``nan_allowed``, since such a cell may be a sensor that failed.
+    Raises `CellError` for values that are missing in other types, infinite or out of range, and for NaN unless
+    ``nan_allowed``, because NaN may mean a failed sensor.
     """
     kind = target.field.type
-    if column.type == kind and pa.types.is_binary(kind):  # stays chunked: an array of bytes has 2 GiB at most
+    if column.type == kind and pa.types.is_binary(kind):  # stays chunked, because an array of bytes is limited to 2 GiB
         return column
     if column.type == kind == pa.float64() and target.rule.scale == 1.0 and _is_finite(column):
         return column
@@ -195,7 +195,7 @@ def convert_column(
 
 
 def _is_finite(column: pa.ChunkedArray) -> bool:
-    """Return whether a column of floats holds numbers alone, as nearly all do: such a one is never copied."""
+    """Return whether all floats of a column are finite, which avoids a copy in the common case."""
     chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     return not column.null_count and all(np.isfinite(chunk.to_numpy()).all() for chunk in chunks)
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from tacpipe.formats.container import Share
     from tacpipe.formats.table import recordings
 
-EPISODE = "recording"  # key of a source's values: the name of the recording within its files
+EPISODE = "recording"  # key of a source's values for the recording's name in its files
 LABELS = "labels"
-CONTAINER_VALUES = "stated"  # key of a source's values: what a shared container states of the recording
+CONTAINER_VALUES = "stated"  # key of a source's values for metadata of a shared container
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ContainerCommand:
     kind: layouts.Format
 
     def parsed(self, params: Params) -> layouts.Layout:
-        """Return the layout, one that leaves everything to the files where none is given."""
+        """Return the parsed layout, or an empty one if none was given."""
         return layouts.layout_from_tables(json.loads(params.layout or "{}"), "The layout", self.kind)
 
     def discover(self, params: Params, source: Path) -> dict[str, Source]:
@@ -63,18 +63,18 @@ class ContainerCommand:
         return discover_sources(layout, source, self._find_recordings(layout, source), self.kind)
 
     def preview(self, params: Params, source: Path) -> str:
-        """Return what would be read, in words."""
+        """Return a description of what would be read."""
         layout = self.parsed(params)
         return preview_text(layout, source, self._find_recordings(layout, source), self.kind)
 
     def guess(self, source: Path) -> str:
-        """Return the text of the layout that states what the first file itself declares."""
+        """Return the text of a layout with everything that the first file declares."""
         from tacpipe.formats.table.preview import declared_layout
 
         return declared_layout(self.kind, source)
 
     def why_unread(self, params: Params, source: Path) -> Callable[[str], str]:
-        """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
+        """Return a function from a file's path below ``source`` to the reason why it is not read."""
         return why_unread(self.parsed(params), source, self.kind)
 
     def read(self, params: Params, files: Files, values: Values) -> RecordingOutput:
@@ -95,9 +95,9 @@ def discover_sources(
     recordings: Sequence[recordings.RecordingFiles],
     kind: layouts.Format | None = None,
 ) -> dict[str, Source]:
-    """Return recordings as a stage's ``discover`` does: their files, labels, and which one of a file each is.
+    """Return the files, labels and episode of each recording, as a stage's ``discover`` does.
 
-    ``kind`` is the format of containers of which a layout without streams reads all.
+    ``kind`` is the container format if the layout has no streams.
     """
     from tacpipe.formats.table import labels
 
@@ -119,7 +119,7 @@ def discover_sources(
 
 
 class _ContainerShares:
-    """The files of each recording, and the values that containers state of it; each container is opened once."""
+    """The files and container metadata of each recording; opens each container once."""
 
     def __init__(self, layout: layouts.Layout, kind: layouts.Format | None) -> None:
         self._layout, self._kind = layout, kind
@@ -142,7 +142,7 @@ class _ContainerShares:
         return files, values
 
     def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
-        """Return what streams of a container are read from; None: all of its files."""
+        """Return the files that streams of a container are read from, or None for all of its files."""
         from tacpipe.formats.container import Sharing, open_container
 
         streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
@@ -158,7 +158,7 @@ class _ContainerShares:
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
-            return None  # reading it shows what is wrong, of this recording alone
+            return None  # reading reports the error for this recording only
 
 
 def preview_text(
@@ -167,7 +167,7 @@ def preview_text(
     listed_sources: Sequence[recordings.RecordingFiles],
     kind: layouts.Format | None = None,
 ) -> str:
-    """Return what would be read of a source, and what would not, in words."""
+    """Return a description of what would be read from a source, and what would not."""
     from tacpipe.formats.container import describe_unread
     from tacpipe.formats.table import preview
 
@@ -177,9 +177,9 @@ def preview_text(
 
 
 def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None = None) -> Callable[[str], str]:
-    """Return a function from the path of a file below ``source`` to the reason why the layout reads nothing from it.
+    """Return a function from a file's path below ``source`` to the reason why the layout does not read it.
 
-    The reason is "" for a file of labels, and for a file within a container.
+    The reason is "" for label files and for files in a container.
     """
     from tacpipe.formats.container import KINDS, find_containers
 
@@ -199,9 +199,9 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
 def read_recording(
     layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values, shared: Shared | None = None
 ) -> RecordingOutput:
-    """Return one recording of ``files``, as `discover_sources` returned it; all of a container without a layout.
+    """Return one recording of ``files`` from `discover_sources`; without a layout, everything in the container.
 
-    With ``shared`` a table of many recordings is cut into these once.
+    With ``shared``, a table of several recordings is split only once.
     """
     from tacpipe.formats.table import recordings
     from tacpipe.formats.table.recordings import CONTAINER
@@ -217,7 +217,7 @@ def read_recording(
 
 
 def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
-    """Return all files of a recording by name: of a path that is a folder each file in it, by ``name/path within``."""
+    """Return all files of a recording by name; the files of a folder are named ``name/relative path``."""
     from tacpipe.formats.container import container_files
 
     return {

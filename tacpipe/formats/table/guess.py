@@ -1,7 +1,7 @@
-"""Guess a first layout for a folder of files that has none.
+"""Guess a first layout for a folder of files.
 
-Entries that no file states, above all the quantity of a column, are written as ``"?"``. A layout with such an entry is
-refused until a person replaces it.
+Entries that files do not contain, above all the quantity of a column, are written as ``"?"``. A layout is rejected
+until a person has replaced them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tacpipe.io import files as file_system
 from tacpipe.printable import shown
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS, scan, scan_images
 
-VOCABULARY = (  # help for the person who replaces a "?"
+VOCABULARY = (  # help for replacing a "?"
     "quantity: what a column measures, as tactile, position, orientation (a quaternion), joint_position, force, torque,",
     "  static_pressure, vibration, temperature, proximity; `tacpipe train TASK --requirements` lists what a task reads",
     "unit: as count, m, mm, 1 (of a quaternion), rad, N, kPa, V; of time s, ms, us, ns",
@@ -45,15 +45,15 @@ class _FileGroup:
     pattern: str
     paths: tuple[Path, ...]
     first: FileSample  # sample of the first file
-    stamps: str = ""  # pattern of the files that hold the stamps
-    clock: FileSample | None = None  # sample of the first file of stamps
-    skipped: tuple[str, ...] = ()  # arrays of the file that belong to other streams
+    stamps: str = ""  # pattern of the files with the timestamps
+    clock: FileSample | None = None  # sample of the first file with timestamps
+    skipped: tuple[str, ...] = ()  # arrays that belong to other streams
     camera: tuple[str, ...] = ()  # entries of a stream of frames
     members: tuple[Path, ...] = ()  # images in the folders ``paths``
 
 
 def guess_layout(folder: Path) -> str:
-    """Return the text of a layout for the files below ``folder``. Raises `UsageError` if no file can be a stream."""
+    """Return the text of a layout for the files below ``folder``. Raises `UsageError` if none of them can be a stream."""
     all_paths = [
         Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names
     ]
@@ -91,7 +91,7 @@ def guess_layout(folder: Path) -> str:
 
 
 def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], list[_FileGroup], dict[str, str]]:
-    """Return the groups of files that are streams, the groups that hold labels, and by path why others cannot be read."""
+    """Return the groups of files that are streams, the groups with labels, and the reason for each unreadable path."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
         by_template.setdefault(_template(path), []).append(path)
@@ -123,7 +123,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
 def _camera_groups(
     folder: Path, videos: Sequence[Path], images: Sequence[Path], used: set[str], damaged: dict[str, str]
 ) -> list[_FileGroup]:
-    """Return the streams of video files and of folders of images; why others cannot be read is added to ``damaged``."""
+    """Return the streams of video files and image folders. Adds the reason for each unreadable path to ``damaged``."""
     by_template: dict[tuple[str, bool], list[Path]] = {}
     folders = dict.fromkeys(path.parent for path in images)
     for path in sorted([*videos, *folders]):
@@ -148,13 +148,13 @@ def _camera_groups(
 
 
 def _video_entries(path: Path) -> tuple[tuple[str, ...], int]:
-    """Return the entries of a video file, and the number of its frames."""
+    """Return the layout entries and the number of frames of a video file."""
     frames = scan(path)
     return (f"# {frames.video_format.describe()}; without an entry time, stamps are those of the file",), len(frames)
 
 
 def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
-    """Return the entries of a folder of images, and their number; names with a large number state the time."""
+    """Return the layout entries and the number of images of a folder. Large numbers in names are timestamps."""
     paths = reading.image_paths(folder)
     numbers = [reading.last_number(path) for path in paths]
     values = tuple(float(number) if "." in number else int(number) for number in numbers if number is not None)
@@ -182,7 +182,7 @@ def _by_length(group: _FileGroup) -> list[_FileGroup]:
 
 
 def _with_stamps(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:
-    """Return the streams and the groups of stamp files; a stream without stamps gets the stamp file of its length."""
+    """Return the streams and the groups of timestamp files. A stream without timestamps gets the file of equal length."""
     clocks = [group for group in groups if len(group.first.names) == 1 and _is_clock(group)]
     used: list[_FileGroup] = []
     streams: list[_FileGroup] = []
@@ -205,7 +205,7 @@ def _with_stamps(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_
 
 
 def _is_clock(group: _FileGroup) -> bool:
-    """Return whether a file of one column has a name of stamps, and values that rise or are text."""
+    """Return whether a one-column file is named like timestamps and its values increase or are text."""
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
     (values,) = group.first.values.values()
@@ -213,7 +213,7 @@ def _is_clock(group: _FileGroup) -> bool:
 
 
 def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
-    """Return a name for the stream of these files that is not in ``used``, and add it there."""
+    """Return an unused name for the stream of these files and add it to ``used``."""
     stem = re.sub(r"\{\w+\}", "", pattern.generalize([Path(path.name) for path in paths])).partition(".")[0].lower()
     name = re.sub(r"[^a-z0-9]+", "_", stem).replace("trial", "").strip("_")
     name = name if name.isidentifier() else "table"
@@ -223,7 +223,7 @@ def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
 
 
 def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_FileGroup]) -> dict[str, list[Path]]:
-    """Return YAML and JSON files of labels by pattern: one file per recording, or one file for all recordings."""
+    """Return YAML and JSON label files by pattern: one file per recording, or one for all recordings."""
     by_template: dict[str, list[Path]] = {}
     for path in paths:
         by_template.setdefault(_template(path), []).append(path)
@@ -245,7 +245,7 @@ def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_FileGro
 
 
 def _is_table_of_labels(path: Path) -> bool:
-    """Return whether a YAML or JSON file holds labels by the name of their recording."""
+    """Return whether a YAML or JSON file contains labels by recording name."""
     try:
         return bool(read_label_table(path).rows)
     except TacpipeError:
@@ -253,7 +253,7 @@ def _is_table_of_labels(path: Path) -> bool:
 
 
 def _by_file_name(paths: Sequence[Path]) -> list[list[Path]]:
-    """Return the files of each stream: split by name where several folders hold the same names, else all files."""
+    """Return the files of each stream: split by name if several folders contain the same names, otherwise all files."""
     by_folder: dict[Path, set[str]] = {}
     for path in paths:
         by_folder.setdefault(path.parent, set()).add(path.name)
@@ -264,12 +264,12 @@ def _by_file_name(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _template(path: Path) -> str:
-    """Return the depth of a path and its file name without numbers, which all files of one stream share."""
+    """Return a path's depth and its file name without numbers, which are equal for all files of a stream."""
     return "/".join(["{}"] * (len(path.parts) - 1) + [re.sub(r"\d+", "{}", path.name)])
 
 
 def _is_labels(sample: FileSample) -> bool:
-    """Return whether a table holds labels: it is short, has text, and has no column of stamps."""
+    """Return whether a table contains labels: it is short, has text, and has no time column."""
     if sample.text is None:
         return False
     texts = any(isinstance(value, str) for values in sample.values.values() for value in values)
@@ -323,7 +323,7 @@ def _stream_text(group: _FileGroup) -> str:
 
 
 def _text_entries(sample: FileSample, path: Path) -> list[str]:
-    """Return the entries for the encoding, separator and header of a text file that differ from the defaults."""
+    """Return the entries for encoding, separator and header of a text file that differ from the defaults."""
     text = sample.text
     assert text is not None
     usual = "\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ","

@@ -1,7 +1,6 @@
-"""The layout file: which files make a recording, what their columns hold, where time and labels come from.
+"""The layout file: which files belong to a recording, the meaning of columns, and the source of time and labels.
 
-``docs/reference/layout.md`` describes each entry. A layout is checked as a whole when it is read, before any data file
-is opened.
+``docs/reference/layout.md`` describes each entry. A layout is validated completely before any data file is opened.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
 from tacpipe.printable import excerpt, plain
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS
 
-MAX_LAYOUT_BYTES = 1 << 20  # largest layout file
+MAX_LAYOUT_BYTES = 1 << 20  # maximum size of a layout file
 Format = Literal[
     "csv",
     "parquet",
@@ -70,39 +69,39 @@ EXTENSIONS: Mapping[str, Format] = {
 }
 CAMERA = ("video", "images")  # formats of streams of frames: a video file, and a folder of images
 CAMERA_EXTENSIONS = (*DEMUXERS, *IMAGE_CODECS)
-IMAGE_NAME = "name"  # the column of the stamps where an image's file name holds them
-TREES = (".json", ".yaml", ".yml")  # files that hold labels by name
+IMAGE_NAME = "name"  # time column of images whose file names contain the timestamps
+TREES = (".json", ".yaml", ".yml")  # files with labels by name
 TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
-STAMPS = ".stamps"  # suffix of a stream's name that marks the file of its stamps
+STAMPS = ".stamps"  # suffix of a stream's name for its file of timestamps
 GZIP = ".gz"
-FILE = "file"  # the placeholder of a container's name, where containers are found by their format
-UNKNOWN = "?"  # marks an entry that a guessed layout leaves to a person
-MAX_NAMED = 4  # unknown entries named in one error
+FILE = "file"  # placeholder for a container's name if containers are found by format
+UNKNOWN = "?"  # marks an entry of a guessed layout that a person must fill in
+MAX_NAMED = 4  # maximum number of unknown entries named in an error
 
 
-DECLARED = Time()  # neither a column nor a rate: the container declares it
+DECLARED = Time()  # no column or rate: the container declares the time
 
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """A rule for the columns whose names match a pattern; placeholders become field metadata, as taxel and axis."""
+    """A rule for columns whose names match a pattern. Placeholders such as taxel and axis become field metadata."""
 
     match: str
-    name: str = ""  # pattern; empty: as in the file
+    name: str = ""  # pattern of the new name; empty to keep the name
     quantity: str = ""
     unit: str = ""
-    type: Kind | None = None  # None: as a container declares it, else float64
-    scale: float = 1.0  # a value is what the file holds times this
+    type: Kind | None = None  # None for the declared type, or float64 if there is none
+    scale: float = 1.0  # factor applied to values of the file
     component: str = ""
-    shape: tuple[PositiveInt, ...] = ()  # shape of the array whose cells are the columns, as (taxel, axis)
-    axes: tuple[str, ...] = ()  # names along the last dimension of the shape, or else the first
-    about: tuple[tuple[str, str], ...] = ()  # more metadata of the column; a table in the file
+    shape: tuple[PositiveInt, ...] = ()  # shape of the array that the columns are flattened from, such as (taxel, axis)
+    axes: tuple[str, ...] = ()  # names along the last axis of the shape, or along the first
+    about: tuple[tuple[str, str], ...] = ()  # additional metadata; a table in the file
     skip: bool = False
 
 
 @dataclass(frozen=True)
 class LongColumns:
-    """Columns of a table in long form: one row per channel and moment."""
+    """Columns of a table in long form: one row per channel and time."""
 
     channel: str
     value: str
@@ -113,37 +112,37 @@ class StreamLayout:
     """One stream of each recording."""
 
     name: str
-    files: str = ""  # empty: each container found in the folder
-    time: Time = DECLARED  # the container's own time unless a column or a rate is named
-    columns: tuple[ColumnRule, ...] = ()  # containers: only rules that replace what the file declares
-    format: Format | None = None  # None: by the extension
-    source: str = ""  # the topic, group or dataset inside a container
-    separator: str = ""  # empty: a comma, or a tab in a .tsv
+    files: str = ""  # empty for each container in the folder
+    time: Time = DECLARED  # a container's own time, unless a column or a rate is given
+    columns: tuple[ColumnRule, ...] = ()  # for containers, only the rules that replace declared metadata
+    format: Format | None = None  # None to derive it from the file's suffix
+    source: str = ""  # topic, group or dataset in a container
+    separator: str = ""  # empty for a comma, or a tab in .tsv files
     decimal: Literal[".", ","] = "."
-    comment: str = ""  # start of lines that hold no row
-    header: bool = True  # False: columns are named by ``names``, or column1, column2, …
-    names: tuple[str, ...] = ()  # column names, where the layout's ``header`` is a list
+    comment: str = ""  # prefix of lines to ignore
+    header: bool = True  # False if columns are named by ``names``, or column1, column2, …
+    names: tuple[str, ...] = ()  # column names, if ``header`` in the layout is a list
     encoding: str = "utf-8"  # text files only
-    sheet: str = ""  # workbooks only; empty: the first sheet
-    time_axis: NonNegativeInt = 0  # arrays only: the dimension of the rows
+    sheet: str = ""  # workbooks only; empty for the first sheet
+    time_axis: NonNegativeInt = 0  # arrays only: axis of the rows
     skip_lines: NonNegativeInt = 0  # number of lines above the header
-    missing: tuple[str, ...] = ()  # cells that hold no value: NaN
-    recording: str = ""  # the column that names the recording, where a file holds many
+    missing: tuple[str, ...] = ()  # cells that mean a missing value (NaN)
+    recording: str = ""  # column with the recording's name, if a file contains several recordings
     long: LongColumns | None = None
-    optional: bool = False  # True: recordings without this stream are read too
+    optional: bool = False  # whether recordings without this stream are accepted
 
     @property
     def camera(self) -> str:
-        """Return ``video`` or ``images`` for a stream of frames: its format, or that of its extension; else ""."""
+        """``video`` or ``images`` for a stream of frames, from its format or file suffix; otherwise ""."""
         return camera_format(self.format, self.files)
 
     @property
     def contained(self) -> bool:
-        """True if the stream is one of several in a container."""
+        """Whether the stream is one of several in a container."""
         return self.format in KINDS
 
     def format_of(self, path: Path) -> Format:
-        """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` without both."""
+        """Return the format in the layout, or the one for the file's suffix. Raises `UsageError` if there is neither."""
         if self.format is not None:
             return self.format
         last = extension(path)
@@ -154,12 +153,12 @@ class StreamLayout:
         return EXTENSIONS[last]
 
     def separator_of(self, path: Path) -> str:
-        """Return the separator of the cells of a text file."""
+        """Return the cell separator of a text file."""
         return self.separator or ("\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ",")
 
 
 def extension(path: Path) -> str:
-    """Return the extension of a file, that below .gz where it is compressed.
+    """Return the suffix of a file in lower case, without .gz.
 
     >>> extension(Path("a.CSV")), extension(Path("a.csv.gz")), extension(Path("a"))
     ('.csv', '.csv', '')
@@ -169,7 +168,7 @@ def extension(path: Path) -> str:
 
 
 def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
-    """Return why a file is not read: ``unmatched`` where its format is one that the command could read.
+    """Return the reason why a file is not read: ``unmatched`` if the command supports its format.
 
     >>> why_unreadable("a/b.csv", "no pattern matches"), why_unreadable("a.mcap", "no pattern matches")
     ('no pattern matches', '`tacpipe ingest mcap` reads such files')
@@ -192,13 +191,13 @@ class LabelSource:
     """A source of labels: a table with one row per recording, or YAML or JSON files, one per recording or one for all."""
 
     file: str
-    key: str = ""  # the table's column that names the recording
-    columns: tuple[str, ...] = ()  # empty: all
+    key: str = ""  # table column with the recording's name
+    columns: tuple[str, ...] = ()  # empty for all columns
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Words that the layout declares in addition to those that tacpipe knows."""
+    """Quantities and units that the layout declares in addition to the built-in ones."""
 
     quantities: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
@@ -206,21 +205,21 @@ class Vocabulary:
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything that a layout file states."""
+    """The contents of a layout file."""
 
     streams: tuple[StreamLayout, ...]
-    name: str = ""  # pattern of a recording's name; empty: all placeholders with dashes between
+    name: str = ""  # pattern of a recording's name; empty for all placeholders joined by dashes
     labels: tuple[LabelSource, ...] = ()
     attributes: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
     @property
     def found_by_format(self) -> bool:
-        """True if recordings are the containers in a folder, rather than files that match patterns."""
+        """Whether recordings are containers found by format rather than files that match patterns."""
         return all(not stream.files for stream in self.streams)
 
     @property
     def placeholders(self) -> tuple[str, ...]:
-        """The placeholders that every stream which must be there has, in the order of the first."""
+        """The placeholders in the patterns of all required streams, in the order of the first."""
         if self.found_by_format:
             return ()
         required = [stream for stream in self.streams if not stream.optional] or list(self.streams)
@@ -229,7 +228,7 @@ class Layout:
 
 
 def read_layout(path: Path) -> Layout:
-    """Return the layout in a file. Raises `UsageError`, naming file and entry, for what is not one."""
+    """Return the layout in a file. Raises `UsageError` with file and entry if it is invalid."""
     content = regular.content(path, MAX_LAYOUT_BYTES)
     try:
         text = content.decode("utf-8-sig")
@@ -250,10 +249,10 @@ def parse_layout(text: str, place: str = "The layout") -> Layout:
 
 
 def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", container: Format | None = None) -> Layout:
-    """Return the layout that tables of TOML describe.
+    """Return the layout described by parsed TOML tables.
 
-    Of a layout for a ``container`` format streams have that format where they name none, and need neither files, time
-    nor columns, as the container declares them; without a stream it is about all that a container holds.
+    With a ``container`` format, streams default to that format and need no files, time or columns, because the
+    container declares them. A layout without streams then covers everything in the container.
     """
     _refuse_unknown(tables, place)
     for key in tables:
@@ -288,7 +287,7 @@ def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", con
 
 
 def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], place: str) -> None:
-    """Raise `UsageError` for a quantity or unit that is neither in the vocabulary nor declared in the layout."""
+    """Raise `UsageError` for a quantity or unit that is neither built in nor declared in the layout."""
     local: Vocabulary = fields.filled(Vocabulary, vocabulary_table, f"{place}, [vocabulary]", "entry")
     for stream in layout.streams:
         for number, column in enumerate(stream.columns, 1):
@@ -308,7 +307,7 @@ def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], pla
 
 
 def _refuse_unknown(value: Any, place: str) -> None:
-    """Raise `UsageError` if entries still hold what a guess could not know, naming the first few."""
+    """Raise `UsageError` if entries of a guessed layout have not been filled in, naming the first few."""
     unknown_entries = list(_unknown_entries(value, place))
     if unknown_entries:
         ending = f"; and {len(unknown_entries) - MAX_NAMED} more" if len(unknown_entries) > MAX_NAMED else ""
@@ -318,7 +317,7 @@ def _refuse_unknown(value: Any, place: str) -> None:
 
 
 def _unknown_entries(value: Any, place: str) -> Iterator[str]:
-    """Yield each entry that still holds what a guess could not know, with what is next to it."""
+    """Yield each entry of a guessed layout that has not been filled in, with its neighbours."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         for element in inner if isinstance(inner, list) else [inner]:
             if element == UNKNOWN:
@@ -365,7 +364,7 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
 
 
 def _expect_encoding(stream: StreamLayout, place: str) -> None:
-    """Raise `UsageError` for an encoding that Python does not have."""
+    """Raise `UsageError` for an encoding unknown to Python."""
     try:
         codecs.lookup(stream.encoding)
     except LookupError:
@@ -375,7 +374,7 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
 
 
 def _expect_required(values: Mapping[str, Any], place: str, container: Format | None) -> None:
-    """Raise `UsageError` for an entry that is missing: a container declares what a table does not."""
+    """Raise `UsageError` if a required entry is missing; containers require fewer, because they declare more."""
     if values.get("format") in KINDS:
         if not values.get("source"):
             raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
@@ -404,7 +403,7 @@ def _expect_required(values: Mapping[str, Any], place: str, container: Format | 
 
 
 def camera_format(kind: object, files: object) -> str:
-    """Return ``video`` or ``images`` for a stream of frames: its format, or that of the extension of its files; else "".
+    """Return ``video`` or ``images`` for a stream of frames, from its format or the suffix of its files; otherwise "".
 
     >>> camera_format(None, "{trial}/left.AVI"), camera_format("images", "{trial}/left"), camera_format(None, "a.csv")
     ('video', 'images', '')
@@ -415,7 +414,7 @@ def camera_format(kind: object, files: object) -> str:
 
 
 def _expect_camera(values: Mapping[str, Any], place: str, camera: str) -> None:
-    """Raise `UsageError` for an entry of a table in a stream of frames, and for images without a time."""
+    """Raise `UsageError` for a table entry in a stream of frames, and for images without a time."""
     table_entries = [name for name in ("columns", "recording", "long", "header", "separator") if values.get(name)]
     if table_entries:
         raise UsageError(
@@ -468,7 +467,7 @@ def _parse_labels(value: Any, place: str) -> LabelSource:
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
     labels: LabelSource = fields.filled(LabelSource, values, place, "entry")
-    is_tree = labels.file.lower().endswith(TREES)  # the names in a tree are those of recordings
+    is_tree = labels.file.lower().endswith(TREES)  # names in a YAML or JSON file are recording names
     if not pattern.placeholders(labels.file) and not labels.key and not is_tree:
         raise UsageError(
             f"{place}: {plain(labels.file)} is one file for all recordings. Set key to the column that names them."
@@ -492,5 +491,5 @@ def _expect_table(value: Any, place: str, key: str) -> Mapping[str, Any]:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a layout file writes it; control characters are escaped."""
+    """Return a text quoted for a layout file, with control characters escaped."""
     return json.dumps(plain(text, 500) if not text.isprintable() and text != "\t" else text, ensure_ascii=False)

@@ -31,24 +31,24 @@ from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 from tacpipe.video.files import IMAGE_CODECS
 
-CONTAINER = "container"  # key of the file that holds all streams of a source
+CONTAINER = "container"  # key of the file that contains all streams of a source
 
 
 @dataclass(frozen=True)
 class RecordingFiles:
-    """The files of one recording: a path a stream, what the placeholders are, and its name where a file holds many."""
+    """The files of one recording by stream, its placeholder values, and its name in a file of several recordings."""
 
     name: str
     files: Mapping[str, Path]
     values: Mapping[str, str]
-    episode: str | None = None  # value of the column ``recording``, or episode of a container
+    episode: str | None = None  # value of the column ``recording``, or a container's episode
 
 
 def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
     """Return the recordings below ``folder``, sorted by name.
 
-    Raises `UsageError` if none is found, where one lacks a stream that is not optional, where two files of one stream
-    belong to one recording, and where two recordings get one name.
+    Raises `UsageError` if there is none, if a recording lacks a required stream or has two files for one stream, or if
+    two recordings share a name.
     """
     if layout.found_by_format:
         raise UsageError("The layout has no stream with files.")
@@ -63,7 +63,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
     _refuse_idle(layout, matched, candidates, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
-    stamps: dict[Path, Path] = {}  # the file of the rows to the file of their stamps
+    stamps: dict[Path, Path] = {}  # timestamp file by file of rows
     for stream in layout.streams:
         for path, values in matched[stream.name]:
             if not set(shared) <= set(values):
@@ -104,8 +104,8 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
 def find_contained(layout: Layout, kind: Format, source: Path) -> list[RecordingFiles]:
     """Return the recordings in the containers of a format at or below ``source``, sorted by name.
 
-    They are named after their file, and after the episode where it holds several. Raises `UsageError` if there is no
-    container, and where two recordings get one name.
+    Names consist of the file's name, and of the episode's if a file contains several. Raises `UsageError` if there is
+    no container, or if two recordings share a name.
     """
     paths = find_containers(kind, source)
     if not paths:
@@ -127,9 +127,10 @@ def find_contained(layout: Layout, kind: Format, source: Path) -> list[Recording
 
 
 def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
-    """Return the recordings in a container, [None] where it is one, and whether these names need no container's before them.
+    """Return the recordings in a container ([None] for a single one), and whether their names need no file name as prefix.
 
-    A container that cannot be read is one: reading it shows what is wrong, and others are not kept from being read.
+    An unreadable container counts as one recording: reading it later reports the error, and other containers are still
+    read.
     """
     try:
         container = open_container(kind, path)
@@ -141,7 +142,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
 
 
 def _candidate_paths(layout: Layout, folder: Path) -> list[Path]:
-    """Return what patterns are matched with: all files below a folder, and folders that are containers of the layout."""
+    """Return the paths to match with patterns: all files below a folder, and folders that are containers of the layout."""
     containers = {str(stream.format) for stream in layout.streams if stream.contained}
     paths: list[Path] = []
     for place, folders, names in file_system.walk(folder):
@@ -174,7 +175,7 @@ def _refuse_idle(layout: Layout, matched: Mapping[str, object], candidates: list
 
 
 def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[RecordingFiles]:
-    """Return the recording of these files, or those that they hold."""
+    """Return the recording that consists of these files, or the recordings that they contain."""
     shared_streams = [
         stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
     ]
@@ -200,9 +201,9 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
 
 
 def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
-    """Return the recordings that a file holds: what is in its column ``recording``, or a container's episodes.
+    """Return the recordings in a file: values of the column ``recording``, or a container's episodes.
 
-    None of a container that is one recording.
+    Returns None for a container with a single recording.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -242,9 +243,9 @@ def _describe_values(names: tuple[str, ...], values: tuple[str, ...]) -> str:
     return ", ".join(f"{name} {plain(value)}" for name, value in zip(names, values, strict=True)) or "no placeholder"
 
 
-LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates beyond these are probably stamps in another unit
-MIN_ROWS = 10  # rows needed to estimate a rate
-SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
+LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates outside this range are probably timestamps in another unit
+MIN_ROWS = 10  # minimum number of rows for estimating a rate
+SKIPPED = "skipped"  # attribute that lists the unreadable sources of a recording
 
 
 @dataclass(frozen=True)
@@ -252,17 +253,17 @@ class RecordedStreams:
     """The streams, attributes and notes of one recording."""
 
     streams: Mapping[str, pa.Table | pa.RecordBatchReader]
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes that containers state
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes stored in containers
     notes: Sequence[str] = ()  # omissions and missing parts; notes on rates are added as streams are read
 
 
 def read_streams(
     streams: Sequence[StreamLayout], paths: Mapping[str, Path], episode: str | None, shared: Shared | None = None
 ) -> RecordedStreams:
-    """Return the recording whose files are ``paths`` by stream; ``episode`` is its name where a file holds many.
+    """Return the recording with the files ``paths`` by stream. ``episode`` is its name in a file of several recordings.
 
-    Streams of one container are read in one pass. Raises as `reading.stream_batches` does, and for a stream
-    that its container lacks, unless it is optional.
+    Streams of a container are read in one pass. Raises the errors of `reading.stream_batches`, and one for a required
+    stream that a container lacks.
     """
     tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
     attributes: dict[str, Attribute] = {}
@@ -302,7 +303,7 @@ def read_streams(
 def _with_rate_noted(
     rows: pa.Table | pa.RecordBatchReader, name: str, notes: list[str]
 ) -> pa.Table | pa.RecordBatchReader:
-    """Return the rows of a stream; as its first ones are read, a rate that no sensor has is added to ``notes``."""
+    """Return the rows of a stream. When the first rows are read, an implausible rate is added to ``notes``."""
     if isinstance(rows, pa.Table):
         if rows.num_rows:
             _note_rate(rows, name, notes)
@@ -328,9 +329,9 @@ def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> 
 
 
 def read_container(kind: str, path: Path, episode: str | None) -> RecordedStreams:
-    """Return all readable streams of a container, or of its ``episode``; the notes name the others.
+    """Return all readable streams of a container or of its ``episode``; the notes list the others.
 
-    The attribute ``skipped`` of the recording names them too. Raises `TacpipeError` if nothing can be read.
+    The attribute ``skipped`` of the recording lists them too. Raises `TacpipeError` if nothing can be read.
     """
     contents = open_container(kind, path).read(None, episode)
     notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]
@@ -355,7 +356,7 @@ def _skipped_notes(path: Path, skipped: Mapping[str, str]) -> list[str]:
 def _missing_stream_error(
     path: Path, stream: StreamLayout, contents: EpisodeContents, look: EpisodeContents
 ) -> TacpipeError:
-    """Return the error for a stream of a layout that its container does not have."""
+    """Return the error for a stream of a layout that is missing in its container."""
     reason = contents.skipped.get(stream.source) or look.skipped.get(stream.source)
     if reason:
         return TacpipeError(f"{path}: {plain(stream.source)} of [streams.{stream.name}] cannot be read: {reason}.")

@@ -1,8 +1,8 @@
-"""Read the rows of a file block by block, only those of one recording where a file holds many.
+"""Read the rows of a file block by block, optionally only those of one of its recordings.
 
-The rows of a file of many recordings are cut apart once: each recording then reads only its own rows. The cut is a file of
-Arrow's record batches (https://arrow.apache.org/docs/format/Columnar.html), one for each recording in a block, followed by
-an index in JSON and the index's length in eight bytes.
+A file of several recordings is split once, so that each recording then reads only its own rows. The split file contains
+Arrow record batches (https://arrow.apache.org/docs/format/Columnar.html), one per recording and block, followed by a
+JSON index and the index's length in eight bytes.
 """
 
 from __future__ import annotations
