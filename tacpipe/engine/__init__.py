@@ -1,1 +1,1 @@
-"""How a stage runs: keys, the store's answer, execution of the rest, and publication of the result."""
+"""Run stages: compute keys, reuse stored results, execute what is missing, publish the output."""

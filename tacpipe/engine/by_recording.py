@@ -30,7 +30,7 @@ Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
 
 @dataclass(frozen=True)
 class _RecordingGroup:
-    """A group of recordings: what its key is the digest of, and the recordings."""
+    """A group of recordings, and the identity whose digest is its key."""
 
     identity: Mapping[str, Any]
     entries: Mapping[str, Entry]
@@ -38,7 +38,7 @@ class _RecordingGroup:
 
 @dataclass(frozen=True)
 class ByRecording:
-    """Results of a request recording by recording; counts and notes are added to ``outcome``."""
+    """Computes the results of a request for each recording. Adds counts and notes to ``outcome``."""
 
     store: Store
     request: Request
@@ -49,14 +49,14 @@ class ByRecording:
     def run_step(self, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> Mapping[str, Entry]:
         """Return the result of a map stage, one link of a chain, for each recording of ``source``; raises as `run`.
 
-        A group of recordings has its own record, in addition to those of its recordings. If one recording changed, one
-        record per group is read, and one for each recording of the changed group. Results of many recordings are kept
+        Each group of recordings has a record in addition to the records of its recordings. If one recording changed,
+        one record is read per group, plus one per recording of the changed group. Results of many recordings are stored
         in pages.
         """
         entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
         answered: list[Answer | _RecordingGroup] = []
         missing: list[WorkerTask] = []
-        stored: dict[str, Mapping[str, Any]] = {}  # Records of groups that are incomplete
+        stored: dict[str, Mapping[str, Any]] = {}  # records of incomplete groups, by recording
         reusable = None if self.previous is None else self.previous.reusable(entries, step)
         reusable_pages: Mapping[str, pages.Pages] = {}
         if reusable is not None:
@@ -109,7 +109,7 @@ class ByRecording:
         return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
 
     def _of_group(self, group: _RecordingGroup) -> Mapping[str, Entry] | None:
-        """Return the entries in the record of a group; None if there is no record or an object is missing."""
+        """Return the entries in a group's record, or None if there is no record or an object is missing."""
         record = self.store.record(digest(group.identity))
         if record is None or not records.complete(self.store, record):
             return None
@@ -119,17 +119,17 @@ class ByRecording:
         return entries
 
     def run(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Entry]:
-        """Return the entry of each task of stage ``name``, by recording.
+        """Return the result of each task of stage ``name`` as an entry, by recording.
 
-        Raises `TacpipeError` if recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
-        would run.
+        Raises `TacpipeError` if recordings could not be read, and `WouldChangeError` if ``--check`` is set and the
+        stage would run.
         """
         return _after(
             {recording: result["recordings"][""] for recording, result in self.results(name, tasks).items()}, {}
         )
 
     def results(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Mapping[str, Any]]:
-        """Return what the record of each task of stage ``name`` holds as its result, by recording; raises as `run`."""
+        """Return the ``result`` in each task's record, by recording. Raises the errors of `run`."""
         return {recording: record["result"] for recording, record in self._records(name, tasks).items()}
 
     def _reruns(self, name: str) -> bool:
@@ -161,7 +161,7 @@ class ByRecording:
     def _computed(
         self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]], count: int
     ) -> dict[str, Mapping[str, Any]]:
-        """Return the ``stored`` records and those of the ``missing`` tasks, which are computed; ``count`` is their total."""
+        """Compute the ``missing`` tasks and return their records with the ``stored`` ones; ``count`` is the total."""
         if missing and self.request.check:
             raise WouldChangeError(f"{registry.stage_name(name)} would run for {len(missing)} of {count} recordings.")
         complete = {**stored, **self._compute(name, missing, stored)}
@@ -173,7 +173,7 @@ class ByRecording:
     def _remember_group(
         self, name: str, group: _RecordingGroup, records_by_name: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Entry]:
-        """Return the entries of a group's recordings, and store them under the key of the group if the group is complete."""
+        """Return the entries of a group's recordings. If the group is complete, store them under its key."""
         result = {recording: record["result"]["recordings"][""] for recording, record in records_by_name.items()}
         if self.store.run and len(group.entries) > 1 and len(records_by_name) == len(group.entries):
             summary = Outcome(self.outcome.output)
@@ -184,10 +184,10 @@ class ByRecording:
         return result
 
     def replay(self, source: Manifest, model: Manifest, dataset_dirs: tuple[str, ...], dataset_name: str) -> Manifest:
-        """Return ``source`` after the stages that precede a model's training, run from the stage that it has reached.
+        """Return ``source`` after the stages of a model's chain that it has not gone through yet.
 
-        Shards can be adopted from ``dataset_dirs``, which include the model's directory.
-        Raises `UsageError` if it went through other stages, or if a stage has another version now.
+        Shards may be adopted from ``dataset_dirs``, which include the model's directory. Raises `UsageError` if
+        ``source`` went through other stages, or if a stage now has another version.
         """
         model_chain = model.chain
         if list(source.chain) != list(model_chain[: len(source.chain)]):
@@ -213,7 +213,7 @@ class ByRecording:
     def _compute(
         self, name: str, tasks: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Mapping[str, Any]]:
-        """Compute tasks and return their records; with ``--recompute-and-compare`` compare them with the ``stored`` ones."""
+        """Compute tasks and return their records. With ``--recompute-and-compare``, compare them with ``stored``."""
         computed: dict[str, Mapping[str, Any]] = {}
         if not tasks:
             return computed
@@ -231,7 +231,7 @@ class ByRecording:
                 self.outcome.reused += not result.is_new
                 self.outcome.add_record(name, result.recording, result.record)
                 made_by = result.record["provenance"]
-                computed[result.recording] = {  # Only what is needed: memory must hold a million of these
+                computed[result.recording] = {  # only the necessary fields, because there may be a million
                     "result": result.record["result"],
                     "provenance": {name: made_by[name] for name in ("notes", "code", "packages") if name in made_by},
                 }
@@ -246,12 +246,12 @@ class ByRecording:
         other_errors = sorted({(-failure.exit_code, failure.error) for failure in bad.values() if not failure.at_fault})
         if other_errors and all(
             code == -FAILED for code, _ in other_errors
-        ):  # A failing disk gives the same error each time: report it once
+        ):  # a failing disk gives the same error for each recording: report it once
             raise error(FAILED, other_errors[0][1])
         if not bad or (self.request.skip_bad and not other_errors):
             return
         waited = [failure.error for failure in bad.values() if failure.exit_code == LOCKED]
-        if waited:  # Another process computes the recording; nothing is wrong with it
+        if waited:  # another process is computing the recording, which may be valid
             raise LockedError(waited[0])
         lines = _lines({recording: bad[recording].error for recording in bad})
         plural = "recordings" if len(bad) > 1 else "recording"
@@ -264,7 +264,7 @@ class ByRecording:
 
 
 def _after(results: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[str, Entry]:
-    """Return the results of a stage in the order of names, each with the attributes of ``entries`` before its own."""
+    """Return results ordered by name, each with the attributes of its entry in ``entries`` first."""
     return {
         name: {
             "attributes": {**entries[name]["attributes"], **entry["attributes"]}
@@ -277,7 +277,7 @@ def _after(results: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[s
 
 
 def error(exit_code: int, sentence: str) -> TacpipeError:
-    """Return an error with a sentence and an exit code."""
+    """Return an error with this sentence and exit code."""
     failure = TacpipeError(sentence)
     failure.exit_code = exit_code
     return failure
@@ -290,9 +290,8 @@ def _lines(bad: Mapping[str, str]) -> str:
 def run_chain_of_model(recordings: Dataset, model: Dataset) -> Dataset:
     """Run the remaining stages of a model's chain on recordings and return the result.
 
-    Stored results are reused, and new ones are stored, as with ``tacpipe predict``. Both datasets
-    must be open. Raises `UsageError` if the recordings went through other stages, `TacpipeError` if one of them
-    cannot be read.
+    Stored results are reused and new ones are stored, as by ``tacpipe predict``. Both datasets must be open. Raises
+    `UsageError` if the recordings went through other stages, `TacpipeError` if a recording cannot be read.
     """
     assert recordings.path is not None and model.path is not None
     source = recordings.source

@@ -1,4 +1,4 @@
-"""A stage run from Python: what `tacpipe.run` was given as the request of a command, and what it made, opened."""
+"""Run a stage from Python: turn the arguments of `tacpipe.run` into a request, and open its output."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import AUTO, Device
 
 Given = str | PathLike[str] | Dataset
-_STACK = 3  # frames from a warning to who called `tacpipe.run`
+_STACK = 3  # stack frames from a warning to the caller of `tacpipe.run`
 
 
 @dataclass(frozen=True)
 class How:
-    """The arguments of `tacpipe.run` that name no dataset."""
+    """The arguments of `tacpipe.run` that are not datasets."""
 
     fold: int = 0
     role: str | None = None
@@ -49,7 +49,7 @@ def call(
     params: Mapping[str, Any],
     options: How,
 ) -> Dataset | Path:
-    """Run stage ``name`` and return its output: see `tacpipe.run`, whose arguments these are."""
+    """Run stage ``name`` and return its output; see `tacpipe.run` for the arguments."""
     stage = registry.load(name)
     for flag, kind in OPTIONS.items():
         fields.check(getattr(options, flag), kind, flag)
@@ -92,7 +92,7 @@ def call(
 def _refuse_unread(
     name: str, stage: AnyStage, datasets: Sequence[Given], arguments: Mapping[str, Given], options: How
 ) -> None:
-    """Raise `UsageError` for an argument that the stage does not read, and for datasets too few or too many."""
+    """Raise `UsageError` for arguments that the stage does not read, and for a wrong number of datasets."""
     kinds = set(stage.arguments.values())
     reads = {
         "model": stage.reads_model,
@@ -115,7 +115,7 @@ def _refuse_unread(
 
 
 def _path(dataset: Given) -> Path:
-    """Return the path of a dataset. Raises `UsageError` if it has none, or if only some of its recordings are selected."""
+    """Return the path of a dataset. Raises `UsageError` if it has none or is a selection of recordings."""
     if not isinstance(dataset, Dataset):
         return Path(dataset)
     if dataset.path is None:

@@ -1,7 +1,6 @@
 """Read chains of commands from a ``dvc.yaml`` file: their stages, what each reads and writes, and their order.
 
-Texts in which ``${name}`` represents a value are filled in as DVC fills them in. A stage runs after those whose outputs it
-reads.
+``${name}`` in text is replaced as DVC replaces it. A stage runs after the stages whose outputs it reads.
 """
 
 from __future__ import annotations
@@ -25,9 +24,10 @@ Values = Mapping[str, Any]
 
 
 def fill_template(value: Any, values: Values, place: str) -> Any:
-    """Return ``value`` with each ``${name}`` in its texts replaced; a text that is only such a name becomes its value.
+    """Return ``value`` with each ``${name}`` in its texts replaced; a text that consists only of a name becomes its value.
 
-    Errors state ``place``. Raises `UsageError` for a name that has no value, and for a list or a mapping within a text.
+    ``place`` is included in errors. Raises `UsageError` for a name without a value, and for a list or mapping inside a
+    text.
 
     >>> fill_template(["${a.b[1]}", "x-${a.c}"], {"a": {"b": [1, 2], "c": True}}, "dvc.yaml")
     [2, 'x-true']
@@ -46,10 +46,10 @@ def fill_template(value: Any, values: Values, place: str) -> Any:
 
 
 def expand(definition: Mapping[str, Any], values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
-    """Yield the stages of a definition: the part of each name after ``@``, the template and its values.
+    """Yield the stages of a definition: the part of the name after ``@``, the template and its values.
 
-    A definition without ``foreach`` and ``matrix`` is one stage, with an empty part. Raises `UsageError` if
-    ``foreach`` is not a list or mapping, or ``matrix`` not a mapping of lists.
+    A definition without ``foreach`` and ``matrix`` is one stage with an empty part. Raises `UsageError` if ``foreach``
+    is not a list or mapping, or ``matrix`` not a mapping of lists.
     """
     if "foreach" in definition:
         for key, stage_values in _foreach_items(fill_template(definition["foreach"], values, place), place):
@@ -105,11 +105,11 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-PARAMS = "params.yaml"  # Its values can be used in every text
+PARAMS = "params.yaml"  # its values can be used in every text
 _OUTPUTS = ("outs", "metrics", "plots")
-_SHOWN = 8  # names of stages that an error lists
+_SHOWN = 8  # number of stage names listed in an error
 
-# The schema of DVC 3: a type, a list of one schema, a mapping of keys, any of several in a tuple.
+# The schema of DVC 3: a type, a list with one schema, a mapping of keys, or a tuple of alternatives.
 _VARS = [(str, dict)]
 _OPTIONS = {
     **dict.fromkeys(("cache", "persist", "checkpoint", "push"), bool),
@@ -143,34 +143,34 @@ _EXPECTED = {
 
 @dataclass(frozen=True)
 class ChainStage:
-    """One stage of a chain: its commands in their order, and the paths that it reads and writes."""
+    """One stage of a chain: its commands in order, and the paths that it reads and writes."""
 
-    name: str  # Full name, with the part after ``@`` in a group
+    name: str  # full name, including the part after ``@``
     commands: Sequence[str]
     reads: Sequence[str]
     writes: Sequence[str]
-    frozen: bool = False  # it is not run
+    frozen: bool = False  # whether the stage is skipped
 
     @property
     def group(self) -> str:
-        """The name as it stands in the file."""
+        """The name in the file, without the part after ``@``."""
         return self.name.partition("@")[0]
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Stages in the order in which they run, and the names of those that each depends on directly."""
+    """Stages in execution order, and the direct dependencies of each by name."""
 
     stages: Sequence[ChainStage]
     after: Mapping[str, frozenset[str]]
 
 
 def load(file: Path, names: Sequence[str] = ()) -> Chain:
-    """Return the stages of a file of the format of ``dvc.yaml``, in their order.
+    """Return the stages of a ``dvc.yaml`` file in execution order.
 
-    ``names`` are stages or groups of stages (``train`` for every ``train@…``); with them, only these and the stages that
-    they depend on are returned. Raises `UsageError` for a file that is no such chain, for parts of DVC's format that are
-    not supported, for unknown names, and for stages that depend on each other in a circle.
+    With ``names``, which are stages or groups (``train`` for every ``train@…``), only these and their dependencies are
+    returned. Raises `UsageError` for an invalid file, for unsupported parts of DVC's format, for unknown names, and for
+    circular dependencies.
     """
     by_name: dict[str, ChainStage] = {}
     for stage in _stages(file):
@@ -208,19 +208,17 @@ def _stages(file: Path) -> Iterator[ChainStage]:
 
 
 def _check(content: Mapping[str, Any], schema: Mapping[str, Any], place: str) -> None:
-    """Raise `UsageError` for a key that a part of the file does not have, and for a value of the wrong form."""
+    """Raise `UsageError` for an unknown key in a part of the file, and for a value that does not match the schema."""
     for key, value in content.items():
         if key not in schema:
             raise UsageError(f"{place}: there is no key {excerpt(key)}; there are {listed(schema, len(schema))}.")
-        if not _fits(value, schema[key]) and not (
-            key == "do" and isinstance(value, Mapping)
-        ):  # its keys are checked next
+        if not _fits(value, schema[key]) and not (key == "do" and isinstance(value, Mapping)):  # keys are checked below
             expected = _EXPECTED.get(key, "a text")
             raise UsageError(f"{place}: its {key} is {excerpt(value)}; it must be {expected}.")
 
 
 def _fits(value: Any, schema: Any) -> bool:
-    """Return whether a value has the form of a schema: a type, or a list, mapping or tuple of such."""
+    """Return whether a value matches a schema: a type, or a list, mapping or tuple of schemas."""
     if isinstance(schema, tuple):
         return any(_fits(value, choice) for choice in schema)
     if isinstance(schema, list):
@@ -263,7 +261,7 @@ def _stage(name: str, definition: Mapping[str, Any], values: Values, file: Path,
 
 
 def _paths(entries: Sequence[Any], folder: str, place: str) -> list[str]:
-    """Return the paths of entries, which are paths or mappings from paths to options: from ``folder`` what lies in it."""
+    """Return the paths of entries, which are paths or mappings from paths to options, relative to ``folder``."""
     paths = []
     for entry in entries:
         for path in entry if isinstance(entry, Mapping) else [entry]:
@@ -279,7 +277,7 @@ def _is_within(path: str, folder: str) -> bool:
 
 
 def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> Values:
-    """Return the values that texts may use: those of ``before``, and over them those of ``vars``."""
+    """Return the values available to texts: those of ``before``, overridden by those of ``vars``."""
     values = dict(before)
     for entry in entries:
         if isinstance(entry, str) and entry.endswith((".yaml", ".yml")):
@@ -301,7 +299,7 @@ def _merged(before: Values, over: Values) -> dict[str, Any]:
 
 
 def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
-    """Return what a YAML file holds; nothing of one that may be ``missing`` and is."""
+    """Return the contents of a YAML file; an empty mapping if the file does not exist and may be ``missing``."""
     try:
         value = config_text.load_yaml(regular.content(file, config_text.MAX_CHARACTERS))
     except FileNotFoundError:
@@ -318,9 +316,9 @@ def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
 
 
 def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozenset[str]]:
-    """Return, for each stage, the names of the stages whose outputs it reads, or reads something within."""
+    """Return for each stage the names of the stages whose outputs, or parts of them, it reads."""
     writers: dict[str, str] = {}
-    writers_below: dict[str, set[str]] = {}  # Maps a folder to the stages that write below it
+    writers_below: dict[str, set[str]] = {}  # stages that write below a folder, by folder
     for stage in stages:
         for path in stage.writes:
             if writers.setdefault(path, stage.name) != stage.name:

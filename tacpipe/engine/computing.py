@@ -1,6 +1,6 @@
-"""Tasks become records: a key is leased, its stage is run, and its result is committed.
+"""Compute the records of tasks: lease the key, run the stage, commit the result.
 
-Of a store that is kept elsewhere results are sent while other tasks are computed.
+With a remote store, results are uploaded while other tasks are computed.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from tacpipe.training import devices
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-MAX_PENDING = 8  # tasks that wait for a distant store while one is computed
-_MANY = 4  # tasks for which threads are started
+MAX_PENDING = 8  # maximum number of tasks that wait for a remote store while one is computed
+_MANY = 4  # minimum number of tasks for which threads are started
 
 
 class _Computing:
-    """Compute one task, or several that overlap their requests to a remote store."""
+    """Computes one task, or several with overlapping requests to a remote store."""
 
     def __call__(self, task: WorkerTask) -> Done:
-        """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
+        """Compute a task and return its outcome; a `TacpipeError` becomes a `Done` with its message."""
         store = opened(task.store, task.run)
         try:
             return _begin(task, store)()
@@ -46,10 +46,10 @@ class _Computing:
             store.close()
 
     def compute_all(self, tasks: Sequence[WorkerTask]) -> Iterator[Done]:
-        """Yield the outcome of each task, in order.
+        """Yield the outcome of each task in order.
 
-        While a task is computed, the records of the next tasks are read from a remote store and results of earlier tasks
-        are sent: each of these requests takes as long as a small recording.
+        While a task is computed, the records of the next tasks are fetched from a remote store and results of earlier
+        tasks are uploaded, because each request takes as long as a small recording.
         """
         stores: dict[tuple[str, str], Store] = {}
         for task in tasks:
@@ -69,8 +69,8 @@ compute = _Computing()
 
 
 def _overlapped(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
-    """Yield what becomes of each task. Stages run in this thread alone."""
-    from concurrent.futures import ThreadPoolExecutor  # Not loaded for a cache hit
+    """Yield the outcome of each task. Stages run only in this thread."""
+    from concurrent.futures import ThreadPoolExecutor  # not loaded for a cache hit
 
     pool = ThreadPoolExecutor(MAX_PENDING)
     looks: deque[Future[None]] = deque()
@@ -80,7 +80,7 @@ def _overlapped(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
         for task, store in tasks[:MAX_PENDING]:
             looks.append(pool.submit(store.seek, digest(task.identity)))
         for place, (task, store) in enumerate(tasks):
-            with contextlib.suppress(TacpipeError):  # The next look reports the error
+            with contextlib.suppress(TacpipeError):  # the next access reports the error
                 looks.popleft().result()
             if place + MAX_PENDING < len(tasks):
                 later, its_store = tasks[place + MAX_PENDING]
@@ -122,17 +122,17 @@ def _failed(task: WorkerTask, store: Store, error: TacpipeError) -> Done:
 
 @dataclass(frozen=True)
 class _Made:
-    """Result of a stage whose content is stored, before its record is written."""
+    """A stage's result whose content is stored, before its record is written."""
 
     result: Mapping[str, Any]
     provenance: Mapping[str, Any]
-    replace: bool  # an older record names objects that are gone
+    replace: bool  # whether an existing record refers to missing objects
     durable: bool
 
 
 @dataclass(frozen=True)
 class _Sending:
-    """Commit a result when called; the leases end with that."""
+    """Commits a result when called, and then ends the leases."""
 
     task: WorkerTask
     store: Store
@@ -168,17 +168,17 @@ def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Do
     replace = task.replace or record is not None
     with registry.collect_packages() as packages:
         stage = registry.load_step(task.name)
-        code = provenance.code(stage)  # The file may be edited while the stage runs
+        code = provenance.code(stage)  # read first, because the file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
     origin = {**provenance.describe_provenance(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
-    if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
+    if stage.source:  # until a dataset's manifest exists, only the record marks this as a recording
         _manifest_of(task, stage, result).keep(store, durable=True)
     return _Made(result, origin, replace, stage.source)
 
 
 def _manifest_of(task: WorkerTask, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
-    """Return a manifest of one recording that was read from published files."""
+    """Return a manifest with one recording that was read from published files."""
     (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
     files, values = inputs[stage.argument("Files")], inputs.get(stage.argument("Values"))
     return Manifest(

@@ -31,17 +31,17 @@ from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
 
-_MAX_MESSAGE_BYTES = 1 << 20  # Longest error message
+_MAX_MESSAGE_BYTES = 1 << 20  # maximum length of an error message
 
 
 @dataclass(frozen=True)
 class SharedFiles:
-    """The shared files of the run that a store works for, among its drafts: a collection sweeps those of dead runs."""
+    """Files shared by the tasks of a run. They are kept with the run's drafts, so collection removes those of dead runs."""
 
     store: Store
 
     def file(self, content_key: Any, make: Callable[[Draft], None]) -> Path:
-        """Return the file that ``make`` wrote for the JSON value ``content_key``, now or earlier in any process.
+        """Return the file that ``make`` wrote for the JSON value ``content_key``, in this or an earlier process.
 
         Raises the errors of ``make``; an input error is stored and raised again for each caller.
         """
@@ -63,19 +63,19 @@ class SharedFiles:
         return Path(path)
 
 
-_CODE = "code"  # the file of a workspace with the digest of the code that writes its checkpoints
+_CODE = "code"  # file in a workspace with the digest of the code that writes its checkpoints
 log = logging.getLogger(__name__)
 
 
 class ScratchStore:
-    """Takes content as a store does, and keeps only its name."""
+    """Accepts content like a store and keeps only its digest and size."""
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Return name and size of the content."""
         return Object(bytes_digest(content), len(content))
 
     def put_written(self, write: Callable[[Any], object], *, durable: bool = False) -> Object:
-        """Return name and size of what is written."""
+        """Return name and size of the content that ``write`` produces."""
         hashed = Hashed()
         write(hashed)
         return Object(hashed.digest, hashed.bytes)
@@ -84,7 +84,7 @@ class ScratchStore:
 def execute(
     task: WorkerTask, store: Store, sink: Store | ScratchStore, *, followed: bool = True
 ) -> tuple[dict[str, Any], list[str]]:
-    """Call the stage for the task, put the content into ``sink``, and return the ``result`` of a record and notes.
+    """Call the stage for a task, put its content into ``sink``, and return the ``result`` of the record, and notes.
 
     With ``followed``, the progress of a training is reported to trackers and the display.
     """
@@ -97,7 +97,7 @@ def execute(
                 extras.explain_missing(f"Stage {stage_name}", lambda: registry.package(stage_name)),
             ):
                 returned = _result(task.name, stage, stage(params, **arguments))
-                result = _stored(returned, sink, durable=stage.source)  # Batches are read here
+                result = _stored(returned, sink, durable=stage.source)  # batches are read here
         except Exception as error:
             extras.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
@@ -121,7 +121,7 @@ def _stored(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> d
 
 
 def differences(stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> list[str]:
-    """Return the paths of shards and files whose content differs; ``name`` is the recording of a mapped stage."""
+    """Return the paths of shards and files whose content differs. ``name`` is the recording of a map stage."""
 
     def contents(result: Mapping[str, Any]) -> dict[str, str]:
         shards = {
@@ -136,7 +136,7 @@ def differences(stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: 
 
 
 class _Reader:
-    """Function that `reader` returns; pickled into another process it reads from the same store."""
+    """The function that `reader` returns. Unpickled in another process, it reads from the same store."""
 
     def __init__(self, store: Store, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> None:
         self._store, self._dataset_dirs, self._sizes = store, dataset_dirs, sizes
@@ -149,7 +149,7 @@ class _Reader:
         except MissingError as error:
             try:
                 content = _adopt(self._store, name, path, self._dataset_dirs, size)
-            except StorageError as unread:  # a copy may be there: the stage that made it is the other way to have it
+            except StorageError as unread:  # try a copy before recomputing the object
                 try:
                     return _remake(self._store, name, path, str(error), size)
                 except DamagedError:
@@ -157,14 +157,14 @@ class _Reader:
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def large_file(self, name: str, path: str, least_bytes: int) -> Path | None:
-        """Return the path of an object of so many bytes in the store, verified and repaired; None for a smaller one."""
+        """Return the path of a verified object of at least ``least_bytes`` in the store, or None for a smaller one."""
         file = Path(self._store.object_path(name))
         try:
             if file.stat().st_size < least_bytes:
                 return None
             for _ in self._store.blocks(name):
                 pass
-        except OSError:  # reading it whole states what is wrong
+        except OSError:  # reading the whole object reports the error
             return None
         except MissingError:
             self(name, path)
@@ -182,11 +182,11 @@ def _reader_at(place: str, dataset_dirs: tuple[str, ...], sizes: Mapping[str, in
 def reader(
     store: Store, dataset_dirs: tuple[str, ...] = (), sizes: Mapping[str, int] | Manifest = MappingProxyType({})
 ) -> Callable[[str, str], bytes]:
-    """Return a function (digest, path within its dataset) -> content that repairs damaged objects.
+    """Return a function (digest, path in its dataset) -> content that repairs damaged objects.
 
-    It reads from the store; missing objects are adopted from ``dataset_dirs``, or recomputed from their
-    record. ``sizes`` are those in bytes that a manifest declares, by digest, or the manifest: nothing much larger is read.
-    Raises `DamagedError` if neither can be done. It can be pickled.
+    It reads from the store. Missing objects are adopted from ``dataset_dirs`` or recomputed from their record.
+    ``sizes`` are the sizes in bytes that a manifest declares by digest, or the manifest; nothing much larger is read.
+    Raises `DamagedError` if the object cannot be restored. The function can be pickled.
     """
     return _Reader(store, dataset_dirs, sizes)
 
@@ -194,7 +194,7 @@ def reader(
 def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
     content = paths.verified_copy(name, path, beside_of, size)
     if content is not None:
-        with contextlib.suppress(TacpipeError):  # A read-only store stays damaged; the intact copy is used
+        with contextlib.suppress(TacpipeError):  # a read-only store stays damaged; the intact copy is used
             store.prepare()
             store.put(content, durable=True)
     return content
@@ -214,12 +214,12 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
             obstacle = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
         key = digest(identity)
-        if key in _remaking:  # The stage returns its input: another stage made the object first
+        if key in _remaking:  # the stage returns its input, so another stage created the object
             continue
         _remaking.add(key)
         try:
             with store.leases.hold(key, f"{identity['stage']}, for {path}"):
-                if not store.has(name, size):  # Otherwise another process has recomputed it
+                if not store.has(name, size):  # otherwise another process has recomputed it
                     execute(WorkerTask(store.place, identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
@@ -238,14 +238,14 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
     )
 
 
-_remaking: set[str] = set()  # keys that this process makes again, one because another one lacks its input
+_remaking: set[str] = set()  # keys that this process is recomputing, possibly as inputs of one another
 _makers_by_object: dict[
     str, dict[str, list[tuple[Any, Any]]]
-] = {}  # store, digest, identities of what gave it and provenance
+] = {}  # identities and provenance of the results with an object, by store and digest
 
 
 def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
-    """Return identity and provenance of the records that name an object; all records are read once for many objects."""
+    """Return identity and provenance of the records that name an object. Reads all records once for many objects."""
     root = str(store.root)
     if name not in _makers_by_object.get(root, {}):
         _makers_by_object[root] = {}
@@ -260,7 +260,7 @@ def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
 
 @contextmanager
 def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict[str, Any]]:
-    """Yield the arguments that the identity describes, by name."""
+    """Yield the stage's arguments by name, prepared from the identity."""
     read = reader(store, task.dataset_dirs)
     inputs = task.identity["inputs"]
     arguments: dict[str, Any] = {}
@@ -292,7 +292,7 @@ def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict
 
 
 def _roles(identity: str | Mapping[str, Any] | None, read: Reader) -> dict[tuple[str, int], str]:
-    """Return (recording, fold) to role: of a split by its digest, or of one of its folds."""
+    """Return the role by (recording, fold) in a split, given by its digest, or in one of its folds."""
     if identity is None:
         return {}
     if isinstance(identity, str):
@@ -302,7 +302,7 @@ def _roles(identity: str | Mapping[str, Any] | None, read: Reader) -> dict[tuple
 
 
 def workspace(store: Store, key: str) -> Path:
-    """Return the folder in which a key's training keeps what it resumes from."""
+    """Return the folder with the checkpoints from which a key's training resumes."""
     return store.root / "checkpoints" / key
 
 
@@ -327,7 +327,7 @@ def _begun_workspace(store: Store, key: str) -> Path:
 
 
 def remove_empty_workspace(store: Store, key: str) -> None:
-    """Remove the folder of a training that saved nothing; one with a checkpoint stays."""
+    """Remove the workspace of a training that saved no checkpoint."""
     folder = workspace(store, key)
     with contextlib.suppress(OSError):
         if {path.name for path in folder.iterdir()} <= {_CODE}:
@@ -336,7 +336,7 @@ def remove_empty_workspace(store: Store, key: str) -> None:
 
 @contextmanager
 def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
-    """Report the training of a stage that has a workspace to trackers and the display while the block runs."""
+    """Report a stage's training to trackers and the display within the block, if it has a workspace."""
     workspace = arguments.get(stage.argument("Workspace") or "")
     if workspace is None:
         yield
@@ -350,14 +350,14 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
 
 @contextmanager
 def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
-    """Yield the followers in this process of a training in another process; none if the stage trains nothing."""
+    """Yield the followers in this process of a training in another process; an empty list if the stage trains nothing."""
     if registry.load_step(task.name).argument("Workspace") is None:
         yield ()
         return
     store = opened(task.store)
     local_workspace = (
         None if store.distant else workspace(store, digest(task.identity))
-    )  # The workspace of a remote store is in the worker's folder
+    )  # the workspace of a remote store is in the worker's folder
     with display.on_stderr(registry.stage_name(task.name), local_workspace) as displays:
         yield (*following.trackers(), *displays)
 
@@ -401,7 +401,7 @@ def _entry(recording: RecordingOutput, sink: Store | ScratchStore, *, durable: b
 
 
 def _shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
-    """Store a table, or batches as they come, as a shard."""
+    """Store a table, or batches as they arrive, as a shard."""
     from tacpipe.io import parquet
 
     if hasattr(table, "num_rows"):

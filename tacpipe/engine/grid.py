@@ -1,6 +1,6 @@
-"""Run a request for several folds of a split, each in a separate process, and estimate how long a grid of trainings takes.
+"""Run a request for several folds of a split in separate processes, and estimate how long a grid of trainings takes.
 
-For an estimate, batches of the first missing training are timed.
+The estimate times batches of the first missing training.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tacpipe.store.location import locate
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, TrainedNetwork
 
-PLACE = "{fold}"  # is replaced by the number of the fold in paths
+PLACE = "{fold}"  # placeholder for the fold's number in paths
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 
 
 def folds(text: str) -> tuple[int, ...]:
-    """Return the folds that an option names, in order; raises `UsageError` if it names none.
+    """Return the folds in an option's text, in order. Raises `UsageError` if there are none.
 
     >>> folds("3"), folds("0-3"), folds("4,0-1,1")
     ((3,), (0, 1, 2, 3), (4, 0, 1))
@@ -44,9 +44,9 @@ def folds(text: str) -> tuple[int, ...]:
 
 
 def requests(request: Request, numbers: Sequence[int]) -> list[Request]:
-    """Return the request for each fold, its number in all paths that hold `PLACE`.
+    """Return the request for each fold, with its number in all paths that contain `PLACE`.
 
-    Raises `UsageError` if several folds would be written to one place.
+    Raises `UsageError` if several folds would be written to one path.
     """
     if len(numbers) > 1 and PLACE not in str(request.output):
         raise UsageError(
@@ -66,9 +66,9 @@ def _fold_request(request: Request, number: int) -> Request:
 
 
 def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:
-    """Yield each request and its outcome as they end, ``jobs`` at a time; 0 means one job per core.
+    """Yield each request with its outcome when it ends, running ``jobs`` at a time (0 for one per core).
 
-    A request that fails does not stop the others. Processes end with this one, as those of `Local` do.
+    A request that fails does not stop the others. The processes end with this one, like those of `Local`.
     """
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(requests)]
     pool = Local(jobs, pool_from=2)
@@ -88,21 +88,21 @@ def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:
             return position, error
 
 
-TIMED_S = 3.0  # Batches are timed this long, without the slower first one
+TIMED_S = 3.0  # duration for which batches are timed, after the slower first one
 _HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
 class DurationEstimate:
-    """Upper estimate of a grid's duration: each model takes as long as the first, and none stops early."""
+    """Upper estimate of a grid's duration, assuming that each model takes as long as the first and none stops early."""
 
-    models: int  # Missing models
+    models: int  # number of missing models
     at_once: int
-    each_s: float  # alone
-    hours: float  # Total
+    each_s: float  # duration of one model running alone
+    hours: float  # total
 
     def __str__(self) -> str:
-        """Return it as a sentence."""
+        """Return the estimate as a sentence."""
         noun = "model" if self.models == 1 else "models"
         return (
             f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
@@ -112,9 +112,9 @@ class DurationEstimate:
 
 
 def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimate | None:
-    """Return how long the missing trainings take, ``jobs`` at a time; None if it cannot be estimated.
+    """Return how long the missing trainings take, ``jobs`` at a time, or None if that cannot be estimated.
 
-    There is no estimate if nothing is missing, if no network is trained, and if the first training fails.
+    There is no estimate if nothing is missing, if no network is trained, or if the first training fails.
     """
     with terminal.showing_progress(False):
         try:
@@ -130,7 +130,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
 
 
 def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) -> float:
-    """Return how long ``models`` take that take ``each_s`` alone with so many threads, where these share the cores.
+    """Return how long ``models`` trainings take, ``at_once`` at a time, each with ``threads`` and ``each_s`` if run alone.
 
     >>> total_s(60, 5, 1, 2, 2), total_s(60, 4, 2, 1, 2), total_s(60, 4, 2, 2, 2)
     (300.0, 120.0, 240.0)
@@ -140,7 +140,7 @@ def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) 
 
 
 def _is_missing(request: Request) -> bool:
-    """Return whether the store has no answer to a request."""
+    """Return whether a request has no stored result."""
     store = locate(*request.locations)
     return request.rerun or store.record(digest(RequestInputs(request, store).identity())) is None
 
@@ -152,18 +152,18 @@ def _timed(request: Request) -> float | None:
             pipeline.run(replace(request, executor="local", track=()))
     except _TimedError:
         return stopwatch.all_s
-    return None  # it is made already, and trained no network
+    return None  # already stored, and no network was trained
 
 
 class _TimedError(Exception):
-    """Enough batches were timed; nothing is wrong."""
+    """Raised to end a training after enough batches were timed."""
 
 
 class _Stopwatch:
-    """Times batches of the first network, and ends its training."""
+    """Times batches of the first network and then ends its training."""
 
     def __init__(self) -> None:
-        self.all_s = 0.0  # Reading and all epochs of the remaining networks
+        self.all_s = 0.0  # reading, and all epochs of the other networks
         self._started_s = self._begun_s = time.monotonic()
         self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
         self._network, self._done = TrainedNetwork(1), 0
@@ -173,7 +173,7 @@ class _Stopwatch:
         self._network, self._done = network, len(history)
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
-        loss()  # waits for the device
+        loss()  # blocks until the device has finished
         now_s = time.monotonic()
         if self._first is None and passed < 1:
             self._first = now_s, passed

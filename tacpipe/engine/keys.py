@@ -1,4 +1,4 @@
-"""Compute identities, of which keys are digests, of shards, datasets and runs; define the tasks that compute results."""
+"""Compute the identities of shards, datasets and runs, whose digests are keys, and define the tasks that compute results."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ _MAX_TRIALS = 1_000_000
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """One key to make: all that a worker process needs."""
+    """One key to compute, with everything that a worker process needs."""
 
-    store: str  # its path or address
-    name: str  # Name of the stage
+    store: str  # path or address of the store
+    name: str  # name of the stage
     identity: Mapping[str, Any]
     recording: str = ""
-    files: Mapping[str, str] | None = None  # Files of a published source: name to path
+    files: Mapping[str, str] | None = None  # paths of the files of a published source, by name
     dataset_dirs: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
-    replace: bool = False  # the old record names objects that are gone
-    dry: bool = False  # compute and compare, store nothing
-    rerun: bool = False  # compute although a result is stored
-    device: Device = AUTO  # the device that networks are trained on
-    run: str = ""  # the lease of the run that it is part of
+    replace: bool = False  # whether the existing record refers to missing objects
+    dry: bool = False  # whether the result is only compared and not stored
+    rerun: bool = False  # whether to compute even if a result is stored
+    device: Device = AUTO  # device for training networks
+    run: str = ""  # lease of the run that the task belongs to
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,20 @@ class Done:
     record: Mapping[str, Any] | None
     error: str = ""
     exit_code: int = 0
-    is_new: bool = True  # False if another process was faster
-    at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process
+    is_new: bool = True  # False if another process finished first
+    at_fault: bool = (
+        True  # whether the recording caused the error, rather than the disk, a damaged input or another process
+    )
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the key of a result is the digest of; ``params`` are a stage's dataclass, or its values by name."""
+    """Return the identity of a result, whose digest is the key. ``params`` is a stage's dataclass, or its values by name."""
     values = params if isinstance(params, Mapping) else params_of.to_json(params)
     return {"stage": name, "version": version, "params": values, "inputs": inputs}
 
 
 def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
-    """Return what a key holds of a recording: digests of its streams, and the attributes in ``reads`` (None: all)."""
+    """Return a recording's part of a key: the digests of its streams, and the attributes in ``reads`` (None for all)."""
     attributes = entry["attributes"]
     if reads is not None and reads != ALL:
         attributes = {name: attributes[name] for name in reads if name in attributes}
@@ -63,7 +65,7 @@ def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
 
 
 def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
-    """Return what a whole-dataset key holds of the ``chosen`` recordings: names, attributes, digests, chain, files."""
+    """Return a dataset's part of a key: names, attributes and digests of the ``chosen`` recordings, chain, files."""
     recordings: Mapping[str, Entry]
     if isinstance(chosen, pages.Recordings) and reads in (None, ALL):
         recordings = pages.KeyRecordings(chosen.pages)
@@ -88,7 +90,7 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
 
 
 def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:
-    """Return the identity of a group's results in a map stage, which covers the keys of all its recordings."""
+    """Return the identity of a map stage's results for a group, which covers the keys of all its recordings."""
     recordings_digest = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
     return {"group": step["stage"], "step": step, "recordings": recordings_digest}
 
@@ -96,7 +98,7 @@ def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Ent
 def shard_tasks(
     store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]
 ) -> list[WorkerTask]:
-    """Return one task per included recording of ``source`` for the map stage of a link of a chain."""
+    """Return one task per included recording of ``source`` for the stage ``step`` of a chain."""
     stage = registry.load_step(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")

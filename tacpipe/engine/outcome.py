@@ -12,8 +12,13 @@ from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.printable import listed
 
-_NAMED = 5  # recordings that a note names
-_FROM_RECORDS = ("recordings_by_note", "code", "packages", "unlike")  # fields that `describe_results` puts into words
+_NAMED = 5  # maximum number of recordings that a note names
+_FROM_RECORDS = (
+    "recordings_by_note",
+    "code",
+    "packages",
+    "unlike",
+)  # fields that `describe_results` turns into sentences
 
 
 @dataclass
@@ -29,20 +34,20 @@ class Outcome:
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    recordings_by_note: dict[str, list[str]] = field(
+    recordings_by_note: dict[str, list[str]] = field(default_factory=dict)  # recordings by the stage's note about them
+    code: dict[str, dict[str, int]] = field(default_factory=dict)  # number of results by stage and digest of its code
+    packages: dict[str, dict[str, int]] = field(
         default_factory=dict
-    )  # note of a stage to the recordings that it is about
-    code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
-    packages: dict[str, dict[str, int]] = field(default_factory=dict)  # the same by plug-in package
-    unlike: list[str] = field(default_factory=list)  # How the computers that produced differing results differ
+    )  # number of results by plug-in package and digest of its code
+    unlike: list[str] = field(default_factory=list)  # differences between the computers that produced differing results
 
     def begin(self) -> None:
-        """Count nothing and restore nothing: what the store answers, or what is computed, is added from here."""
+        """Reset all counts and summaries, before stored or computed results are added."""
         self.ran = self.reused = 0
         self.restore({})
 
     def add_record(self, stage: str, recording: str, record: Mapping[str, Any]) -> None:
-        """Add the notes of one record and the code that computed it."""
+        """Add the notes of a record and the code that computed it."""
         provenance_of_record = record["provenance"]
         for note in provenance_of_record.get("notes") or ():
             self.recordings_by_note.setdefault(note, []).append(recording)
@@ -68,21 +73,21 @@ class Outcome:
         self.unlike += [difference for difference in unlike if difference not in self.unlike]
 
     def of_results(self) -> dict[str, Any]:
-        """Return what `add_record` added, as the record of a whole run keeps it."""
+        """Return the summary of all added records, to be stored in the record of a run."""
         return {"code": self.code, "packages": self.packages, "notes": self.recordings_by_note}
 
     def restore(self, summary: Mapping[str, Any]) -> None:
-        """Restore the summary that `of_results` returned; older records have none."""
+        """Restore a summary that `of_results` returned; older records contain none."""
         self.code, self.packages = summary.get("code") or {}, summary.get("packages") or {}
         self.recordings_by_note = summary.get("notes") or {}
 
     def describe_differences(self) -> str:
-        """Describe the differences from the stored results, and whether another computer's rounding may explain them."""
+        """Describe the differences from the stored results, and whether rounding on another computer may explain them."""
         computers = f" (computed with other {'; '.join(self.unlike)}, which rounds differently)" if self.unlike else ""
         return f"these differ from what is stored: {'; '.join(self.differs)}{computers}"
 
     def describe_results(self) -> list[str]:
-        """Return the notes of stages, and how many results were computed by other code than their stage has now."""
+        """Return the notes of stages, and warnings about results computed by other code than the stage has now."""
         count = self.ran + self.reused
         lines = []
         for text, names in self.recordings_by_note.items():
@@ -95,13 +100,13 @@ class Outcome:
         return [*lines, *stages.values(), *(line for name, line in packages.items() if name not in described)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the outcome as a command prints it."""
+        """Return the outcome as JSON for the command's output."""
         value = {name: value for name, value in vars(self).items() if name not in _FROM_RECORDS}
         return {**value, "output": str(self.output)}
 
 
 def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[str, int]]) -> None:
-    """Add to ``total`` how many results were computed by each code, by stage or package."""
+    """Add the number of results by code to ``total``, by stage or package."""
     for name, numbers in counts.items():
         added = total.setdefault(name, {})
         for code, number in numbers.items():
@@ -110,7 +115,7 @@ def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[s
 
 def _other_package(package: str, counts: Mapping[str, int]) -> str:
     """Return the warning for a plug-in package as `_other_code` does for a stage."""
-    now = registry.package_code(package)  # None: it is gone, and its results stay valid
+    now = registry.package_code(package)  # None if the package was removed; its results stay valid
     outdated = sum(number for code, number in counts.items() if code != now)
     if now is None or not outdated:
         return ""

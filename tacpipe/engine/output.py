@@ -26,57 +26,57 @@ from tacpipe.store.store import MissingError, Store
 
 @dataclass(frozen=True)
 class Unread:
-    """A result that is shown already, as noted; its manifest is not read."""
+    """A result that is already shown according to a note, so that its manifest is not read."""
 
     rows: int
 
 
 class CommandSource(Protocol):
-    """Source of a command's result."""
+    """The source of a command's result."""
 
     @property
     def key(self) -> str:
-        """Key of the run."""
+        """The key of the run."""
 
     def count(self, manifest: Manifest) -> int:
         """Return the number of stored results that a manifest consists of."""
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
-        """Take over what is known of the run before; return whether it gave the manifest of this digest."""
+        """Restore the outcome of an earlier run; return whether it produced the manifest with this digest."""
 
     @property
     def reads(self) -> Sequence[str]:
-        """The digests of the manifests that it is made of."""
+        """The digests of the manifests that the result is computed from."""
 
     def answer(self) -> Manifest | None:
-        """Return the result if the store has it whole; nothing is run."""
+        """Return the result if it is completely stored, else None. Runs nothing."""
 
     def make(self) -> Manifest:
-        """Return the result, having run what was missing; the run is not remembered."""
+        """Compute what is missing and return the result. The run is not recorded."""
 
     def result(self, *, rerun: bool, previous: Previous | None = None) -> Manifest:
-        """Return the result, answered by the store or made and remembered; ``rerun``: made in any case.
+        """Return the stored result, or compute and record it; with ``rerun``, always compute it.
 
-        Of a ``previous`` run what did not change is taken over.
+        Unchanged parts of a ``previous`` run are reused.
         """
 
 
 def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: CommandSource) -> Manifest | Unread:
-    """Return the manifest that the output shows once the request is met; the only way in which a command writes it.
+    """Return the manifest that the output shows after the request. Commands write their output only through this.
 
-    Where a note states that it shows the answer, and still holds, that is not read.
+    If a valid note states that the output already shows the stored result, its manifest is not read.
 
     ===============  ==================================  ==============================================
     output           ``--check``                         otherwise
     ===============  ==================================  ==============================================
-    shows the answer  nothing to do                       nothing to do
-    shows another     raises `WouldChangeError`           the answer, or what is made, is published
+    shows the result  nothing to do                       nothing to do
+    shows another     raises `WouldChangeError`           the stored or computed result is published
     must not change   raises `UsageError`                 raises `UsageError`, before anything is run
     ===============  ==================================  ==============================================
 
-    With ``--recompute-and-compare`` the result is made and the output stays as it is. While the result is made and
-    published nothing that it is made of is collected. Where the store turns out to be damaged as it is linked, the result
-    is recomputed.
+    With ``--recompute-and-compare`` the result is computed and the output stays as it is. Until the result is
+    published, nothing that it is computed from is collected. If an object turns out to be damaged when it is linked,
+    the result is recomputed.
     """
     place = _place(store, request)
     if (unread := place.unread(work)) is not None:
@@ -99,14 +99,14 @@ def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: Com
         try:
             result = work.result(rerun=request.rerun, previous=previous)
             return place.published(work, result, previous)
-        except MissingError:  # An object is damaged, which shows when it is linked: all that are damaged are recomputed
+        except MissingError:  # linking found a damaged object: recompute all that are damaged
             if result is not None:
                 _quarantine_damaged(store, result)
             return place.published(work, work.result(rerun=False))
 
 
 def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
-    """Read all objects of a dataset, so that every damaged one is in quarantine and counts as missing."""
+    """Read all objects of a dataset, so that damaged ones are quarantined and count as missing."""
     for name, size in dict(manifest.sizes()).items():
         with suppress(MissingError):
             for _ in store.blocks(name, size):
@@ -114,7 +114,7 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
 
 
 def existing_answer(store: Store, request: Request, work: CommandSource) -> Manifest | Unread | None:
-    """Return the result of `settle` if the output already shows the stored answer, else None; nothing is changed."""
+    """Return the result of `settle` if the output already shows the stored result, else None. Changes nothing."""
     place = _place(store, request)
     if (unread := place.unread(work)) is not None:
         return unread
@@ -138,35 +138,32 @@ class _Place(ABC):
 
     @property
     def root(self) -> dict[str, Any] | None:
-        """Root in the store: the last dataset that was written there."""
+        """The root in the store: the last dataset written to this output."""
         return self.store.roots.get(self.path)
 
     @abstractmethod
     def shows(self, hit: Manifest, look: Look | None) -> bool:
-        """Return whether it holds the answer already and nothing is to be written; its root too is known.
-
-        The files are part of the ``look``.
-        """
+        """Return whether the output and its root already show the result. Adds the files to ``look``."""
 
     def unread(self, work: CommandSource) -> Unread | None:
-        """Return what is known of the answer where it is noted that all of it is shown, and the note still holds."""
+        """Return the result without reading it, if a valid note states that it is completely shown; else None."""
         return None
 
     def look(self) -> Look | None:
-        """Return a look at all files that begins now, where what it finds is worth a note."""
+        """Return a new look at all files, or None if its findings would not be noted."""
         return None
 
     def note(self, look: Look | None, work: CommandSource, hit: Manifest) -> bool:
-        """Note that the look found all of the answer shown; return whether that is noted."""
+        """Note that the look found the whole result; return whether the note was written."""
         return False
 
     @property
     def source_manifests(self) -> list[str]:
-        """The digests of manifests of which results may be taken over."""
+        """The digests of manifests whose results may be reused."""
         return []
 
     def previous(self) -> Previous | None:
-        """Return the run that gave what is shown, where all of that is noted and still there."""
+        """Return the run that produced the shown result, if a note describes it and all of it still exists."""
         return None
 
     def published(self, work: CommandSource, result: Manifest, previous: Previous | None = None) -> Manifest:
@@ -175,7 +172,7 @@ class _Place(ABC):
 
     @abstractmethod
     def refuse(self, plan: replacing.ResultPlan) -> None:
-        """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
+        """Raise `UsageError` before anything is computed if the command would replace a protected output."""
 
     @abstractmethod
     def publish(self, result: Manifest) -> Manifest:
@@ -186,7 +183,7 @@ class _Place(ABC):
         return result
 
     def check(self, result: Manifest) -> None:
-        """Raise `WouldChangeError` if the output was made from other inputs, `UsageError` if it would be refused."""
+        """Raise `WouldChangeError` if the output was computed from other inputs, `UsageError` if it is protected."""
         root = self.root
         if root is None or root["manifest"] != result.content_digest:
             raise WouldChangeError(f"{self.request.output} would change: it was made from other inputs or params.")
@@ -195,7 +192,7 @@ class _Place(ABC):
 class _Directory(_Place):
     """The directory of a dataset."""
 
-    _linked = False  # True if the directory holds only links to objects
+    _linked = False  # whether the directory contains only links to objects
 
     def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root
@@ -214,7 +211,7 @@ class _Directory(_Place):
 
     @cached_property
     def _noted(self) -> Note | None:
-        """The note on what is shown here, if that is the manifest that was noted."""
+        """The note about this directory, if it describes the manifest shown here."""
         note, root = presence.read_note(self.store, self.path), self.root
         if note is None or root is None or root["manifest"] != note.head.manifest:
             return None
@@ -265,7 +262,7 @@ class _Directory(_Place):
         appearance = directory.showing(self.store, published, self.path)
         if appearance == "links":
             look.note(head, published.contents())
-        elif not appearance:  # An existing file has other content of the same size
+        elif not appearance:  # an existing file of the same size has other content
             directory.publish(self.store, published, self.path)
         return published
 
@@ -275,11 +272,10 @@ class _Directory(_Place):
             replacing.refuse_plan(self._occupant(), self.request.output, plan)
 
     def settled(self, result: Manifest) -> Manifest:
-        """Return ``result`` as it is published.
+        """Return ``result`` in its published form.
 
-        Recordings keep the labels that were set by hand, even if they were deleted or replaced in the meantime and
-        return. Ingested recordings are appended to the existing ones. Raises `DamagedError` if the existing dataset
-        cannot be read.
+        Recordings keep the labels that were set by hand, even if they were deleted or replaced in between. Ingested
+        recordings are appended to the existing ones. Raises `DamagedError` if the existing dataset cannot be read.
         """
         if not result.recorded:
             return result
@@ -306,7 +302,7 @@ class _Directory(_Place):
             self.store.roots.set(self.path, result.content_digest, key=key)
             return result
 
-        def decided() -> directory.DirectoryChange:  # Labels may have been set in the meantime
+        def decided() -> directory.DirectoryChange:  # labels may have been set in the meantime
             settled = self.settled(result)
             self._refuse_losses(settled)
             complete = previous is not None and previous.is_current()
@@ -319,9 +315,9 @@ class _Directory(_Place):
             replacing.refuse_losses(self._occupant(), self.request.output, result)
 
     def _occupant(self) -> Manifest | None:
-        """Return the manifest that is there; None also where both it and its root are damaged.
+        """Return the manifest in the directory, or None if there is none or both it and its root are damaged.
 
-        Recordings are not written there then, as `settled` states; what is computed from others is computed again.
+        Then recordings are not written there, as `settled` states; results computed from others are computed again.
         """
         try:
             return replacing.occupant(self.store, self.request.output)
@@ -330,7 +326,7 @@ class _Directory(_Place):
 
 
 class _File(_Place):
-    """One file of a result, in place of a dataset."""
+    """A single file of a result, written in place of a dataset."""
 
     def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root

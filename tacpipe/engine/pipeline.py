@@ -1,4 +1,4 @@
-"""Run a command: determine what is needed, answer from the store, compute the missing results, publish the dataset."""
+"""Run a command: determine what is needed, reuse stored results, compute the missing ones, publish the dataset."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracker
 from tacpipe.training import following
 
-_NOTHING: Entry = {"attributes": {}, "shards": {}}  # Entry of a recording whose part returns only files
+_NOTHING: Entry = {"attributes": {}, "shards": {}}  # entry of a recording whose part of the stage returns only files
 
 
 def open_dataset(path: Path | str) -> Dataset:
-    """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
+    """Return the dataset at ``path``; its shards are read from the store, or adopted from the directory."""
     located = manifest.find(path)
     directory = located.directory.absolute()
     read = execution.reader(locate(directory), (str(directory),), located.manifest)
@@ -62,18 +62,18 @@ def run(request: Request) -> Outcome:
         outcome = work.outcome
         with _tracked(request, trackers, outcome, store) as end_tracking:
             result = output.settle(store, request, inputs.plan(), work)
-            if isinstance(result, Manifest):  # Otherwise there was nothing to track
+            if isinstance(result, Manifest):  # otherwise there is nothing to track
                 end_tracking(result)
     return _concluded(outcome, inputs, result, started)
 
 
 def answered(request: Request) -> Outcome | None:
-    """Return what `run` would return where there is nothing to do, or None if something is to be computed or written.
+    """Return the outcome of `run` if there is nothing to do, or None if something must be computed or written.
 
-    It raises what `run` would raise before that. Nothing is computed, and nothing is changed.
+    Raises the errors that `run` would raise before that. Computes and changes nothing.
     """
     started = time.perf_counter()
-    if request.check or request.compare or request.rerun or request.track:  # These always compute or report something
+    if request.check or request.compare or request.rerun or request.track:  # these always compute or report something
         return None
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
@@ -95,7 +95,7 @@ def _concluded(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unrea
 def _tracked(
     request: Request, trackers: dict[str, Tracker], outcome: Outcome, store: Store
 ) -> Iterator[Callable[[Manifest], None]]:
-    """Have trackers follow trainings in the block; yield the function that ends their run with the resulting manifest."""
+    """Let trackers follow trainings in the block. Yields the function that ends their run with the resulting manifest."""
     if not trackers:
         yield lambda result: None
         return
@@ -115,7 +115,7 @@ def _tracked(
 
 
 class _RequestRun:
-    """Result of a request, from the store or by computing what is missing there."""
+    """Produces the result of a request from the store, or by computing what is missing."""
 
     def __init__(
         self, request: Request, store: Store, inputs: RequestInputs, identity: Mapping[str, Any], chosen: ChosenExecutor
@@ -124,11 +124,11 @@ class _RequestRun:
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [dataset.digest for dataset in inputs.used]
-        self.previous: Previous | None = None  # Earlier run whose unchanged results are reused
+        self.previous: Previous | None = None  # earlier run whose unchanged results are reused
 
     @property
     def key(self) -> str:
-        """Key of the run."""
+        """The key of the run."""
         return self.outcome.key
 
     def count(self, manifest_of_run: Manifest) -> int:
@@ -136,7 +136,7 @@ class _RequestRun:
         return len(self.inputs.merged.included) if self.stage.part else len(manifest_of_run.recordings) or 1
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
-        """Take over what is known of the run before; return whether it gave the manifest of this digest."""
+        """Restore the outcome of an earlier run; return whether it produced the manifest with this digest."""
         record = self.store.record(self.key)
         if record is None or record["result"]["files"][manifest.NAME]["digest"] != manifest_digest:
             return False
@@ -146,7 +146,7 @@ class _RequestRun:
         return True
 
     def answer(self) -> Manifest | None:
-        """Return the manifest that this run gave before, if everything it names is still there."""
+        """Return the manifest of an identical earlier run if everything it names still exists, else None."""
         self.outcome.begin()
         record = self.store.record(self.outcome.key)
         if record is None:
@@ -159,7 +159,7 @@ class _RequestRun:
                 page.digest for page in (stored_manifest.pages.pages if stored_manifest.pages is not None else ())
             )
             sizes = list(stored_manifest.sizes())
-        except MissingError:  # the manifest, or a page of it
+        except MissingError:  # of the manifest or one of its pages
             return None
         self.store.announce(name for name, _ in sizes)
         if not all(self.store.has(name, size) for name, size in sizes):
@@ -182,11 +182,13 @@ class _RequestRun:
         return result
 
     def make(self) -> Manifest:
-        """Return the manifest of the result, having run what was missing."""
+        """Compute what is missing and return the result's manifest."""
         for dataset in self.inputs.used:
-            source_manifest = dataset.manifest  # one edited by hand is refused before anything is written
+            source_manifest = dataset.manifest  # raises if the manifest was edited by hand, before anything is written
             if self.store.run:
-                source_manifest.keep(self.store)  # explain and gc follow a dataset to the manifests it descends from
+                source_manifest.keep(
+                    self.store
+                )  # `explain` and `gc` trace a dataset to the manifests that it was computed from
         result = self._make()
         try:
             manifest.check_pages(result, fresh=True)
@@ -226,7 +228,7 @@ class _RequestRun:
         )
 
     def _own_tasks(self) -> list[WorkerTask]:
-        """Return one task per recording of a stage that reads no dataset: from a source, or to simulate."""
+        """Return one task per recording for a stage without input datasets: an ingest or a simulation."""
         request, stage = self.request, self.stage
         if stage.source:
             sources, digests = self.inputs.sources, self.inputs.source_digests
@@ -254,7 +256,7 @@ class _RequestRun:
 
     @cached_property
     def _source(self) -> Manifest:
-        """The given datasets read as one, after the stages that the recordings go through first."""
+        """The input datasets merged into one, after the stages of the model's chain."""
         source, first = self.inputs.merged, self.stage.first
         stages = first(self.request.params) if first is not None else {}
         if not stages:
@@ -268,7 +270,7 @@ class _RequestRun:
 
     @cached_property
     def _parts(self) -> Manifest:
-        """Result of the stage's part for each recording: tables, and files by their names in the result."""
+        """Results of the stage's part for each recording: tables, and files by name."""
         source, name = self._source, f"{self.request.name}{registry.PART}"
         assert self.stage.part is not None
         step = keys.chain_step(name, self.stage.part, self.request.params, None)
@@ -281,7 +283,7 @@ class _RequestRun:
         return Manifest(name, self.stage.part.version, step["params"], recordings=recordings, files=files)
 
     def _originals(self) -> dict[str, Any]:
-        """Return the shards that were given as files of the result, where the stage asks for them; they are in the store."""
+        """Return the input shards that become files of the result, if the stage requests them."""
         folder = self.stage.originals(self.request.params) if self.stage.originals is not None else ""
         if not folder:
             return {}
@@ -291,7 +293,7 @@ class _RequestRun:
             for stream, shard in entry["shards"].items():
                 path = shard_path(recording, stream)
                 if not self.store.has(shard["digest"], shard["bytes"]):
-                    read(shard["digest"], path)  # adopts it, or computes it again
+                    read(shard["digest"], path)  # adopts or recomputes the shard
                 originals[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
         return originals
 
@@ -333,7 +335,7 @@ class _RequestRun:
         return keys.of_dataset(source, reads, source.included)
 
     def _roles(self, name: str) -> Any:
-        """Return what identifies the roles of the argument ``name``, or None if its option was not given."""
+        """Return the identity of the roles of argument ``name``, or None if its option was not given."""
         dataset = self.inputs.named_datasets.get(name)
         fold = self.request.fold
         if dataset is None:
@@ -377,7 +379,7 @@ class _RequestRun:
         result_of_task: Mapping[str, Any] = computed.record["result"]
         if self.request.compare and is_stored and record is not None:
             self.outcome.compare(record, computed.record, name)
-            result_of_task = record["result"]  # Everything else was computed from the stored result
+            result_of_task = record["result"]  # later steps were computed from the stored result
         elif self.request.compare and not counted:
             raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
         self.outcome.ran += computed.is_new and counted
@@ -385,7 +387,7 @@ class _RequestRun:
         return result_of_task
 
     def _fit(self) -> dict[str, Any]:
-        """Return the files that the stage's fit computed from the training recordings, or those of ``--codec``."""
+        """Return the files that the stage fitted to the training recordings, or those of ``--codec``."""
         codec, name, fit = self.inputs.named_datasets.get("codec"), self.request.name, self.stage.fit
         if codec is not None:
             step = codec.manifest.chain[-1] if codec.manifest.chain else {}
@@ -401,7 +403,7 @@ class _RequestRun:
         return dict(self._run_whole(f"{name}.fit", identity, counted=False)["files"])
 
     def _remember(self, result_manifest: Manifest) -> None:
-        """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
+        """Store the manifest and, if every recording was valid, the run, so that a rerun is a cache hit."""
         stored = vars(result_manifest.keep(self.store, durable=result_manifest.recorded))
         if not self.outcome.bad:
             result = {"recordings": {}, "files": {manifest.NAME: stored}}

@@ -1,8 +1,8 @@
-"""The run that gave what an output shows: of pages of recordings that did not change since, its results are taken over.
+"""Reuse the results of the run that produced an output, for pages of recordings that have not changed since.
 
-That rests on what a hit rests on: the record of that run names the manifest that it read and the one that it gave. A page
-that is the same in both manifests, of then and of now, has the same keys, and so the same page of results. A note on the
-directory states that the objects of these are there, once it was found to hold.
+The run's record names the manifests that it read and produced. A page that is equal in the old and the new input
+manifest has equal keys, hence the same page of results. A note on the directory records that the objects of these
+results exist, once this was checked.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from tacpipe.store.store import Store
 
 @dataclass(frozen=True)
 class Reusable:
-    """Results that are taken over: pages by the digest of the page that they are results of, and what records state."""
+    """Reusable results: result pages by the digest of their input page, and the summary of their records."""
 
     pages: Mapping[str, Pages]
-    summary: Mapping[str, Any]  # Argument of `Outcome.add_group`
+    summary: Mapping[str, Any]  # argument of `Outcome.add_group`
 
     @property
     def count(self) -> int:
-        """How many recordings they are."""
+        """Number of recordings."""
         return sum(part.total("recordings") for part in self.pages.values())
 
 
 @dataclass
 class Previous:
-    """A run over one dataset, recording by recording, whose output is as it left it."""
+    """A completed run over one dataset whose output has not changed since."""
 
     store: Store
     directory: Path
     note: Note
     look: Look
     record: Mapping[str, Any]
-    source: Manifest  # its input
-    result: Manifest  # its result
+    source: Manifest  # input
+    result: Manifest  # output
 
     def reusable(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Reusable | None:
-        """Return the reusable results of a link of a chain for ``entries``; None if there are none."""
+        """Return the reusable results of one stage of a chain for ``entries``, or None if there are none."""
         before, results = self.source.included, self.result.pages
         if results is None or not (isinstance(entries, pages.Recordings) and isinstance(before, pages.Recordings)):
             return None
@@ -66,7 +66,7 @@ class Previous:
             number = places.get(page.first)
             if page.digest not in now or number is None or number == len(results):
                 continue
-            # Same first names and count: the page holds the results of exactly these recordings
+            # equal first names and counts mean that the page has the results of exactly these recordings
             result = results.pages[number]
             covers_page = firsts[number + 1] == follower and result.recordings == page.recordings
             if covers_page and self.store.has(result.digest, result.bytes):
@@ -78,12 +78,12 @@ class Previous:
         return None if summary is None else Reusable(reusable, summary)
 
     def is_current(self) -> bool:
-        """Return whether the directory still shows the run's result and its files did not change."""
+        """Return whether the directory still shows the run's result with unchanged files."""
         root = self.store.roots.get(self.directory)
         return root is not None and root["manifest"] == self.note.head.manifest and self.look.unchanged
 
     def succeed(self, head: Head, published: Manifest) -> bool:
-        """Note that the directory holds all of ``published`` now; return False if each file must be checked for that."""
+        """Note that the directory now contains all of ``published``; return False if this requires checking each file."""
         before, now = pages.differing(self.result.recordings, published.recordings)
         removed = [shard_path(name, stream) for name, entry in before.items() for stream in entry["shards"]]
         placed = [
@@ -109,14 +109,14 @@ class Previous:
         )
 
     def _summary(self, stage: str, replaced_names: set[str], count: int) -> Mapping[str, Any] | None:
-        """Return the summary of all results except ``replaced_names``; None if it is not known."""
+        """Return the summary of all results except ``replaced_names``, or None if it is unknown."""
         provenance = self.record["provenance"]
         codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
         packages: Mapping[str, Mapping[str, int]] = provenance.get("packages") or {}
         for counts in filter(None, (codes, *packages.values())):
-            if [*counts.values()] != [len(self.result.recordings)]:  # it is unknown which results other code computed
+            if [*counts.values()] != [len(self.result.recordings)]:  # the code that computed each result is unknown
                 return None
-        excluded = {*replaced_names, ""}  # The empty name is a stage over a whole dataset, which runs again
+        excluded = {*replaced_names, ""}  # the empty name is a stage over a whole dataset, which runs again
         notes_of_run: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
         notes = {note: [name for name in names if name not in excluded] for note, names in notes_of_run.items()}
         return {
@@ -127,15 +127,15 @@ class Previous:
 
 
 def inputs(store: Store, note: Note) -> Sequence[str]:
-    """Return the digests of the manifests that the run read which gave what is noted."""
+    """Return the digests of the manifests read by the run that a note describes."""
     record = store.record(note.head.key)
     return [] if record is None else list(record["identity"].get("datasets", ()))
 
 
 def find(store: Store, directory: Path, note: Note) -> Previous | None:
-    """Return the run whose result ``directory`` shows, as noted; None if it is unknown or incomplete.
+    """Return the run that produced the noted content of ``directory``, or None if it is unknown or incomplete.
 
-    Everything that it names must be announced before, and protected from collection until the new result is published.
+    Its objects must already be announced, so that they are protected from collection until the new result is published.
     """
     record = None if store.distant else store.record(note.head.key)
     if record is None or "run" not in record["identity"]:

@@ -1,6 +1,6 @@
-"""Describe the processor, threads and software that computed a result; stored with results, part of no key or digest.
+"""Describe the processor, threads and software that computed a result. Stored with results; never part of a key or digest.
 
-The last digit of a sum depends on them: matrix kernels are chosen by the processor's instructions, and each thread adds up
+The last digit of a sum depends on them: the processor's instructions determine the matrix kernels, and each thread sums
 its own part.
 """
 
@@ -23,16 +23,16 @@ from tacpipe.plugins.stage import AnyStage
 from tacpipe.training import devices
 
 _CPUINFO = Path("/proc/cpuinfo")
-# those that the kernels of OpenBLAS, oneDNN, torch and numpy are chosen by
+# instruction sets by which OpenBLAS, oneDNN, torch and numpy choose kernels
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
-# variables that choose kernels by name
+# environment variables that select kernels
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
-JOBS = "TACPIPE_JOBS"  # processes of a command that is given no --jobs, or 0
+JOBS = "TACPIPE_JOBS"  # number of processes of a command without --jobs, or with 0
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def describe_processor() -> dict[str, Any]:
-    """Return the processor's ``model``, its vector ``instructions``, kernels ``chosen`` by variables, and ``threads``."""
+    """Return the processor's ``model``, vector ``instructions``, kernels ``chosen`` by variables, and ``threads``."""
     chosen = {name: os.environ[name] for name in _CHOSEN if name in os.environ}
     return {**_processor(), "chosen": chosen, "threads": threads()}
 
@@ -48,7 +48,7 @@ def threads() -> int:
 
 @contextlib.contextmanager
 def shared_by(processes: int) -> Iterator[None]:
-    """Have processes that start in the block compute with `each_of` so many."""
+    """Divide the cores among this number of processes started in the block."""
     variables = each_of(processes)
     os.environ.update(variables)
     try:
@@ -59,9 +59,9 @@ def shared_by(processes: int) -> Iterator[None]:
 
 
 def each_of(processes: int) -> dict[str, str]:
-    """Return the variables that give each of so many processes its part of the cores, or None if the environment has one.
+    """Return the variables that give each of several processes its part of the cores; empty if they are already set.
 
-    Of several processes with as many threads each as there are cores, most threads wait for one another.
+    If each process had as many threads as there are cores, threads would wait for one another.
     """
     if any(name in os.environ for name in THREADS):
         return {}
@@ -71,7 +71,7 @@ def each_of(processes: int) -> dict[str, str]:
 def jobs() -> int:
     """Return the default number of processes of a command: the value of `JOBS`, else one per usable core.
 
-    Raises `UsageError` if `JOBS` is no number above 0.
+    Raises `UsageError` if `JOBS` is not a positive integer.
     """
     setting = os.environ.get(JOBS, "")
     if not setting:
@@ -82,12 +82,12 @@ def jobs() -> int:
 
 
 def jobs_of(commands: int) -> dict[str, str]:
-    """Return the variable that gives each of so many commands its part of the cores, or None if the environment has it."""
+    """Return the variable that gives each of several commands its part of the cores; empty if it is already set."""
     return {} if JOBS in os.environ else {JOBS: str(max(1, usable_cores() // max(1, commands)))}
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1  # macOS
@@ -95,7 +95,7 @@ def usable_cores() -> int:
 
 @functools.cache
 def _processor() -> dict[str, Any]:
-    values: dict[str, str] = {}  # Values of the first core
+    values: dict[str, str] = {}  # values for the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
             for line in lines:
@@ -130,7 +130,7 @@ def _environment() -> dict[str, Any]:
     git = ["git", "rev-parse", "HEAD"]
     try:
         commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
-    except (OSError, subprocess.SubprocessError):  # no git, or none that answers in time
+    except (OSError, subprocess.SubprocessError):  # git is not installed or does not respond in time
         commit = ""
     return {
         "libraries": libraries,
@@ -153,7 +153,7 @@ def describe_provenance(seconds: float) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def worker(name: str) -> Iterator[None]:
-    """Have what is made in the block state the name of the executor's worker that made it."""
+    """Record ``name`` as the executor's worker for results computed in the block."""
     token = _worker.set(name)
     try:
         yield
@@ -162,7 +162,7 @@ def worker(name: str) -> Iterator[None]:
 
 
 def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the differences between two computers that change rounding; empty if ``stored`` does not state them.
+    """Return the differences between two computers that affect rounding; empty if ``stored`` does not record them.
 
     >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
     ['threads: 1, now 2']
@@ -185,9 +185,9 @@ def _text(value: Any) -> str:
 
 
 def code(stage: AnyStage) -> str | None:
-    """Return the digest of the file that a stage's function is written in, or None if it cannot change by itself.
+    """Return the digest of the file with a stage's function, or None if it cannot change on its own.
 
-    That is a built-in stage that was installed: it changes with the version of tacpipe alone.
+    An installed built-in stage changes only with the version of tacpipe.
     """
     name = stage.function.__module__
     file = getattr(sys.modules.get(name), "__file__", None)
@@ -196,14 +196,14 @@ def code(stage: AnyStage) -> str | None:
         return None
     try:
         return remembered_file_digest(file)
-    except OSError:  # it was removed while it ran
+    except OSError:  # the file was removed while the program runs
         return None
 
 
 def code_of_packages(identity: Mapping[str, Any], used: Iterable[str] = ()) -> dict[str, str]:
-    """Return the digest of the code of each plug-in package that computes a result, by the package's name.
+    """Return the code digest of each plug-in package that takes part in a result, by package name.
 
-    These are the packages ``used`` by the stage and those of the architectures that its ``identity`` names.
+    These are the packages ``used`` by the stage and those of the architectures named in its ``identity``.
     """
     lineages = (value.get("lineage") or {} for value in identity["inputs"].values() if isinstance(value, Mapping))
     params = [identity["params"], *(lineage.get("params") or {} for lineage in lineages)]
@@ -215,5 +215,5 @@ def code_of_packages(identity: Mapping[str, Any], used: Iterable[str] = ()) -> d
 
 
 def code_of_training() -> str:
-    """Return the digest of all code that may take part in a training: tacpipe's own and that of every plug-in package."""
+    """Return the digest of all code that may take part in a training: tacpipe and every plug-in package."""
     return digest({package: registry.package_code(package) for package in (registry.OWN, *registry.plugin_packages())})

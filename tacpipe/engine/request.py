@@ -23,7 +23,7 @@ from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
 
-# Types of the options of a run that are no params
+# types of the options of a run that are not params
 OPTIONS = {
     "jobs": NonNegativeInt,
     "executor": str,
@@ -33,15 +33,15 @@ OPTIONS = {
 }
 
 
-DATASETS = ("model", "split", "codec", "extend", "init")  # given by name
+DATASETS = ("model", "split", "codec", "extend", "init")  # options that name a dataset
 PATHS = (*DATASETS, "source")
 
 
 @dataclass(frozen=True)
 class Request:
-    """Request of a command."""
+    """The request of a command."""
 
-    name: str  # Name of the stage
+    name: str  # name of the stage
     params: Any
     output: Path
     datasets: Sequence[Path] = ()
@@ -54,18 +54,18 @@ class Request:
     extend: Path | None = None
     init: Path | None = None
     jobs: int = 0
-    executor: str = ""  # NAME or NAME://ADDRESS; empty: that of the environment, or this computer
-    device: Device = AUTO  # the device that networks are trained on
+    executor: str = ""  # NAME or NAME://ADDRESS; empty for the environment's executor, or this computer
+    device: Device = AUTO  # device for training networks
     skip_bad: bool = False
     check: bool = False
     compare: bool = False
-    rerun: bool = False  # compute what is stored too, and store what comes out
+    rerun: bool = False  # whether to compute stored results again and store the new ones
     track: Sequence[str] = ()  # trackers that follow the training, as ``NAME`` or ``NAME:PLACE``
-    replace: bool = False  # the output may hold another stage's dataset, or recordings and labels that will go
+    replace: bool = False  # whether the output may replace another stage's dataset, or recordings and labels
 
     @property
     def reads(self) -> list[Path]:
-        """All that was given to read: datasets, model, split and the like, the folder of a published source."""
+        """All paths to read: datasets, model, split and the like, and the folder of a published source."""
         return [*self.datasets, *self.named_paths.values()]
 
     @property
@@ -75,17 +75,17 @@ class Request:
 
     @property
     def locations(self) -> list[Path]:
-        """Return the places to look for the store: the output, then the datasets that are read."""
+        """Return the paths where the store is searched: the output, then the input datasets."""
         return [self.output, *self.datasets, *(path for name, path in self.named_paths.items() if name in DATASETS)]
 
     @property
     def single_file(self) -> bool:
-        """Return whether the output is one file, such as a report, instead of a dataset directory."""
+        """Whether the output is one file, such as a report, instead of a dataset directory."""
         return self.output.suffix == ".html"
 
 
 class RequestInputs:
-    """All that a request reads."""
+    """Everything that a request reads."""
 
     def __init__(self, request: Request, store: Store) -> None:
         self.request, self.store = request, store
@@ -94,7 +94,7 @@ class RequestInputs:
         self.named_datasets: dict[str, Found] = {
             name: manifest.find(path) for name, path in request.named_paths.items() if name in DATASETS
         }
-        self.notes: list[str] = []  # Warnings for the user
+        self.notes: list[str] = []  # warnings for the user
         self.sources = _discover(self.stage, request)
         self.source_digests = _hash(self.sources)
 
@@ -116,7 +116,7 @@ class RequestInputs:
         }
 
     def describe_unread(self) -> list[str]:
-        """Return sentences about the files below the source that no recording is read from."""
+        """Return sentences about files below the source that are not part of a recording."""
         if self.request.source is None or not self.sources:
             return []
         read = {path for source in self.sources.values() for path in source.files.values()}
@@ -128,7 +128,7 @@ class RequestInputs:
         return container.describe_unread(self.request.source, read, reason, self.request.output)
 
     def plan(self) -> ResultPlan:
-        """Return what is known of the result before anything is computed."""
+        """Return the properties of the result that are known before it is computed."""
         return ResultPlan(
             self.request.name, self.stage.version, params_of.to_json(self.request.params), dict(self.source_digests)
         )
@@ -144,31 +144,31 @@ class RequestInputs:
 
     @property
     def used(self) -> list[Found]:
-        """All datasets that were given."""
+        """All input datasets."""
         return [*self.datasets, *self.named_datasets.values()]
 
     @property
     def dataset_dirs(self) -> tuple[str, ...]:
-        """Directories of all datasets, from which shards can be adopted."""
+        """Directories of all input datasets, from which shards can be adopted."""
         return tuple(str(dataset.directory.absolute()) for dataset in self.used)
 
     @cached_property
     def merged(self) -> Manifest:
-        """The given datasets read as one."""
+        """The input datasets merged into one."""
         if not self.datasets:
             raise UsageError(f"{self.request.name} needs a dataset to read.")
         return selection.merge_manifests([dataset.manifest for dataset in self.datasets])
 
     @property
     def model(self) -> Manifest:
-        """The given model's manifest."""
+        """The manifest of the input model."""
         if "model" not in self.named_datasets:
             raise UsageError(f"{self.request.name} needs a model to read.")
         return self.named_datasets["model"].manifest
 
     @cached_property
     def roles(self) -> dict[str, str]:
-        """Recording to role in the fold that was asked for."""
+        """Role by recording in the requested fold."""
         split = self.named_datasets.get("split")
         if split is None:
             raise UsageError(
@@ -181,7 +181,7 @@ class RequestInputs:
         return selection.roles_in_fold(selection.read_roles(content), self.request.fold, split_path)
 
     def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
-        """Return the recordings of ``source`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
+        """Return the recordings of ``source`` with this role. Raises `UsageError` if there are none, unless ``may_lack``."""
         chosen = {name: entry for name, entry in source.included.items() if self.roles.get(name) == role}
         unknown = sorted(set(source.included) - set(self.roles))
         if unknown:
@@ -214,7 +214,7 @@ def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
 
 
 def _hash(sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
-    """Return the digests of files and values by recording; threads gain nothing for files of about 100 kB."""
+    """Return the digests of files and values by recording. Threads would not speed up files of about 100 kB."""
     return {
         name: {
             **{file: remembered_file_digest(path) for file, path in source.files.items()},

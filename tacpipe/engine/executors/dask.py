@@ -1,11 +1,11 @@
-"""Workers of Dask: those of a running scheduler, or processes of this computer that are started for one command.
+"""Dask workers: those of a running scheduler, or processes on this computer that are started for one command.
 
-``dask`` starts workers here, ``dask://localhost:8786`` and ``tls://host:8786`` name a scheduler. Whoever reaches a scheduler
-without TLS can run programs as its user: one on another computer must have it. Certificates come from Dask's own
-configuration.
+``dask`` starts workers on this computer; ``dask://localhost:8786`` and ``tls://host:8786`` connect to a scheduler.
+Anyone who can connect to a scheduler without TLS can run programs as its user, so schedulers on other computers must
+use TLS. Certificates come from Dask's own configuration.
 
-A worker needs tacpipe and the store: it reads and writes there, and what it is sent are keys. Where it dies, Dask gives
-its tasks to another one; what it had finished is in the store and is found there.
+A worker needs tacpipe and access to the store. It receives keys, and reads and writes the store itself. If a worker
+dies, Dask gives its tasks to another one; finished results are already in the store.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
 
 def local_versions(stage: str) -> dict[str, Any]:
-    """Return the versions that must agree for a task of ``stage`` to be computed by another process.
+    """Return the versions that must match for another process to compute a task of ``stage``.
 
-    Raises `UsageError` if there is no such stage.
+    Raises `UsageError` if the stage does not exist.
     """
     stage_object = registry.load(registry.stage_name(stage))
     environment = provenance.describe_provenance(0.0)
@@ -58,7 +58,7 @@ def local_versions(stage: str) -> dict[str, Any]:
 
 
 def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
-    """Return the differences between a ``worker`` and this process, in words.
+    """Return phrases about the differences between a ``worker`` and this process.
 
     >>> unlike({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
     ['numpy 1.26 (here 2.1)', 'no torch (here 2.13)']
@@ -71,18 +71,20 @@ def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
 
 
 NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-_MAX_BATCH = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
+_MAX_BATCH = 50  # tasks per Dask task, which spreads its overhead of 1.6 ms
 _CONNECT_S = 10
 _POLL_S = 1.0
-_abandoned: list[contextlib.ExitStack] = []  # clusters of an interrupted command, kept so that nothing closes them
+_abandoned: list[
+    contextlib.ExitStack
+] = []  # clusters of an interrupted command, referenced so that nothing closes them
 
 
 @contextlib.contextmanager
 def connected(address: str, jobs: int) -> Iterator[Dask]:
-    """Yield workers: of the scheduler at ``address`` (``host:port``, this computer's), or ``jobs`` that are started here.
+    """Yield the workers of the scheduler at ``address`` (``host:port`` on this computer), or ``jobs`` newly started ones.
 
-    Raises `UsageError` for another computer's scheduler, `TacpipeError` if none answers, and `MissingModuleError`
-    without Dask.
+    Raises `UsageError` for a scheduler on another computer, `TacpipeError` if it does not respond, and
+    `MissingModuleError` if Dask is not installed.
     """
     if not address:
         with _started(jobs or provenance.jobs()) as workers:
@@ -100,7 +102,7 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
 
 @contextlib.contextmanager
 def encrypted(address: str, jobs: int) -> Iterator[Dask]:
-    """Yield the workers of the scheduler at ``address``, reached with TLS; raises as `connected`."""
+    """Yield the workers of the scheduler at ``address``, connected with TLS. Raises the errors of `connected`."""
     if not address:
         raise UsageError("The executor tls needs the address of a scheduler: give tls://HOST:PORT.")
     with extras.explain_missing("The executor tls"):
@@ -122,20 +124,20 @@ def encrypted(address: str, jobs: int) -> Iterator[Dask]:
 
 
 class Dask:
-    """The workers that a client of Dask reaches."""
+    """The workers that a Dask client is connected to."""
 
     def __init__(self, client: Client, expected: int = 0) -> None:
-        """Take a client, and how many workers are ``expected`` where they do not all start at once."""
+        """Use a client. ``expected`` is the number of workers if they do not all start at once."""
         self.client, self._expected = client, expected
         self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
 
     def run(
         self, compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], preload: Sequence[str]
     ) -> Iterator[Done]:
-        """Yield ``compute(task)`` of every task, in any order.
+        """Yield ``compute(task)`` for every task, in any order.
 
-        Raises `TacpipeError` if there is no worker, where one is unlike this process or cannot reach the store, where
-        workers die over a task again and again, and where the scheduler is gone.
+        Raises `TacpipeError` if there is no worker, if a worker has other versions or cannot reach the store, if
+        workers repeatedly die on a task, and if the scheduler is lost.
         """
         if not tasks:
             return
@@ -153,19 +155,19 @@ class Dask:
             store = opened(tasks[0].store, tasks[0].run)
             try:
                 for result in self._results(futures, tasks[0].name):
-                    if result.record is not None:  # a worker announces it too, until that worker ends
+                    if result.record is not None:  # the worker announces it too, but only until the worker ends
                         store.announce(records.digests(result.record["result"]))
                     yield result
             finally:
                 store.close()
-                with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
+                with contextlib.suppress(Exception):  # the scheduler forgets them anyway when the client disconnects
                     self.client.cancel(futures)  # type: ignore[no-untyped-call]
 
     @contextlib.contextmanager
     def _followed(self, tasks: Sequence[WorkerTask]) -> Iterator[str]:
-        """Follow the training of a task in a worker; yield the topic of its messages, empty without followers.
+        """Follow the training of a task in a worker. Yields the topic of its messages, "" without followers.
 
-        Followers are called in a thread of their own: the client's own thread must not wait for a tracker's server.
+        Followers are called in a separate thread, because the client's thread must not wait for a tracker's server.
         """
         with contextlib.ExitStack() as stack:
             followers = stack.enter_context(execution.watching(tasks[0])) if len(tasks) == 1 else ()
@@ -180,7 +182,7 @@ class Dask:
             try:
                 yield topic
             finally:
-                with contextlib.suppress(Exception):  # the scheduler may be gone
+                with contextlib.suppress(Exception):  # the scheduler may be lost
                     self.client.unsubscribe_topic(topic)  # type: ignore[no-untyped-call]
                 messages.put(None)
                 thread.join()
@@ -226,7 +228,7 @@ class Dask:
 
 @contextlib.contextmanager
 def _started(workers: int) -> Iterator[Dask]:
-    """Yield workers of this computer, each a process of one thread, that end with the block or with this process."""
+    """Yield single-threaded worker processes on this computer that end with the block or with this process."""
     with extras.explain_missing("The executor dask"):
         import cryptography  # noqa: F401  (TLS of one command's own: other users of this computer reach its port)
         import dask
@@ -253,7 +255,7 @@ def _started(workers: int) -> Iterator[Dask]:
             )
             yield Dask(stack.enter_context(Client(cluster, security=security, set_as_default=False)))  # type: ignore[no-untyped-call]
         except KeyboardInterrupt:
-            if termination.requested():  # closing the cluster takes seconds, and this process ends
+            if termination.requested():  # closing the cluster takes seconds, and this process is ending
                 _abandoned.append(stack.pop_all())
                 for process in multiprocessing.active_children():
                     process.kill()
@@ -282,7 +284,7 @@ def _client(address: str) -> Iterator[Client]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Have Dask log nothing in the block: a worker or scheduler that is gone is a sentence of ours."""
+    """Silence Dask's log within the block; lost workers and schedulers are reported as errors of tacpipe."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -299,7 +301,7 @@ def _dask_loggers() -> list[str]:
 
 
 def _is_here(address: str) -> bool:
-    """Return whether a scheduler's address is of this computer.
+    """Return whether a scheduler's address is on this computer.
 
     >>> _is_here("localhost:8786"), _is_here("127.0.0.1:8786"), _is_here("[::1]:8786"), _is_here("10.0.0.7:8786")
     (True, True, True, False)
@@ -312,14 +314,14 @@ def _is_here(address: str) -> bool:
 
 
 def _absolute(task: WorkerTask) -> WorkerTask:
-    """Return the task with paths that hold in another process's folder."""
+    """Return the task with absolute paths, which are valid in other processes."""
     if task.files is None:
         return task
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
 def _passed_on(messages: Queue[following.TrainingMessage | None], followers: Sequence[following.Follower]) -> None:
-    """Call followers with what comes, until None does."""
+    """Call followers with each message until None arrives."""
     receiver = following.Receiver(followers)
     while (message := messages.get()) is not None:
         receiver.take(message)
@@ -328,14 +330,14 @@ def _passed_on(messages: Queue[following.TrainingMessage | None], followers: Seq
 
 # ---- in a worker
 
-_one_at_a_time = threading.Lock()  # A process computes one task at a time, whatever its number of threads
-_leases: dict[str, str] = {}  # Leases of this worker, by the lease of the run that they belong to
+_one_at_a_time = threading.Lock()  # a process computes one task at a time, whatever its number of threads
+_leases: dict[str, str] = {}  # this worker's leases by the lease of their run
 
 
 def _work(
     versions: Mapping[str, Any], compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], topic: str
 ) -> list[Done] | Exception:
-    """Return ``compute`` of each task, or the error that prevented it; trainings are followed by a topic's readers."""
+    """Return ``compute`` of each task, or the error that prevented it. Progress of trainings is published on ``topic``."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -357,7 +359,7 @@ def _check(name: str, versions: Mapping[str, Any], task: WorkerTask) -> None:
             f"Worker {name} would not compute what this computer does: {'; '.join(differences)}. Install the same there."
         )
     store = opened(task.store)
-    if store.distant:  # reached by its address, with this worker's own credentials
+    if store.distant:  # opened by its address, with this worker's own credentials
         try:
             store.record(digest(task.identity))
         except TacpipeError as error:
@@ -370,15 +372,15 @@ def _check(name: str, versions: Mapping[str, Any], task: WorkerTask) -> None:
 
 
 def _at_work(run: str) -> bool:
-    """Return whether the command that began a run is still at work, as far as its lease shows."""
+    """Return whether the command that started a run is still running, according to its lease."""
     return os.path.exists(run)  # noqa: PTH110
 
 
 def _lease(task: WorkerTask) -> str:
-    """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run is at work.
+    """Return a lease of this worker that announces the objects it creates while the task's run is active.
 
-    Two computers do not write to one lease: on a network file system one would overwrite what the other announces. In a
-    bucket the client has announced the keys, so there is none.
+    Two computers never write to one lease, because on a network file system one would overwrite the other's entries. In
+    a bucket the client has announced the keys, so no lease is needed.
     """
     if opened(task.store).distant:
         return ""
@@ -391,7 +393,7 @@ def _lease(task: WorkerTask) -> str:
 
 
 def _keep(store: Store, run: str, lease_paths: Queue[str]) -> None:
-    """Hold a lease until a run has ended; put the path of the lease into ``lease_paths``."""
+    """Hold a lease until a run has ended. Puts the lease's path into ``lease_paths``."""
     run_ended = threading.Event()
     with store.leases.running() as announcing:
         lease_paths.put(announcing.path)

@@ -1,7 +1,7 @@
-"""Compute tasks in this process or on workers of this computer, which is the default executor.
+"""The default executor: compute tasks in this process or in worker processes on this computer.
 
-Workers are forked from one process that has imported modules and has done nothing else, so each starts in milliseconds. They
-take several tasks at a time, so that progress is shown without much overhead.
+Workers are forked from a process that has only imported modules, so each starts in milliseconds. They take several
+tasks at a time, so that progress is shown with little overhead.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 Task = TypeVar("Task")
 Done = TypeVar("Done")
-_A_WORKER = 8  # how often a worker comes back for more: progress against overhead
+_A_WORKER = 8  # chunks per worker, a compromise between progress and overhead
 
 
 def divide_into_chunks(tasks: Sequence[Task], workers: int, max_size: int | None = None) -> list[Sequence[Task]]:
-    """Divide the tasks into chunks of the same size, several per worker, of at most ``max_size`` tasks.
+    """Divide tasks into chunks of equal size, several per worker, with at most ``max_size`` tasks each.
 
     >>> divide_into_chunks("abcdefg", 1, 3), [len(chunk) for chunk in divide_into_chunks(range(64), 2)]
     (['a', 'b', 'c', 'd', 'e', 'f', 'g'], [4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4])
@@ -41,15 +41,18 @@ def divide_into_chunks(tasks: Sequence[Task], workers: int, max_size: int | None
 
 
 def compute_each(compute: Callable[[Task], Done], tasks: Sequence[Task]) -> Iterator[Done]:
-    """Yield ``compute(task)`` for each task, or ``compute.compute_all(tasks)``, which may overlap tasks, if it exists."""
+    """Yield ``compute(task)`` for each task.
+
+    Uses ``compute.compute_all(tasks)``, which may overlap tasks, if that exists.
+    """
     batch_compute: Callable[[Sequence[Task]], Iterator[Done]] | None = getattr(compute, "compute_all", None)
     return map(compute, tasks) if batch_compute is None else batch_compute(tasks)
 
 
 def compute_chunk(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
-    """Return ``compute(task)`` of each task; or a mistake in a stage, to be raised where the stage was asked for.
+    """Return ``compute(task)`` of each task, or the exception of a faulty stage, to be raised in the main process.
 
-    That exception can be pickled, and a note of it holds the traceback.
+    The exception can be pickled, and its note contains the traceback.
     """
     try:
         with memory.raising_shortage():
@@ -70,17 +73,17 @@ def compute_chunk(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> lis
 def start_fork_server(preload: Sequence[str]) -> ForkServerContext:
     """Start the fork server, which imports the modules ``preload``, and return the context that starts processes.
 
-    A process starts one server, with the modules of the first call. SIGINT is blocked in the server and in the processes
-    that it forks, because this process handles Ctrl-C. Modules that do not exist are skipped.
+    Each process starts one server, with the modules of the first call. SIGINT is blocked in the server and in the
+    processes that it forks, because this process handles Ctrl-C. Modules that do not exist are skipped.
     """
     import multiprocessing
     import signal
     from multiprocessing import forkserver, resource_tracker
 
-    memory.require_library("pyarrow")  # Each process loads it
+    memory.require_library("pyarrow")  # each process loads it
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(list(preload))
-    resource_tracker.ensure_running()  # It unblocks signals, so it starts before they are blocked
+    resource_tracker.ensure_running()  # it unblocks signals, so it starts before they are blocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
@@ -91,9 +94,9 @@ def start_fork_server(preload: Sequence[str]) -> ForkServerContext:
 
 @contextlib.contextmanager
 def without_main() -> Iterator[None]:
-    """Have a process that starts in the block not import the program's main module, of which workers need nothing.
+    """Prevent processes that start in the block from importing the program's main module, which workers do not need.
 
-    A script that calls `tacpipe.run` at its top level would otherwise run once more in each worker.
+    Otherwise a script that calls `tacpipe.run` at its top level would run again in each worker.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
@@ -103,20 +106,21 @@ def without_main() -> Iterator[None]:
         sys.modules["__main__"] = main
 
 
-_POOL_FROM = 8  # starting workers costs more than a few shards
+_POOL_FROM = 8  # below this number of tasks, starting workers costs more than it saves
 
 
 class Local:
-    """Processes of this computer."""
+    """Worker processes on this computer."""
 
     def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
-        """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
+        """Use ``jobs`` processes (0 for one per usable core), started only for ``pool_from`` tasks or more."""
         self.jobs, self._pool_from = jobs or provenance.jobs(), pool_from
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
-        """Yield ``compute(task)`` of every task, in any order.
+        """Yield ``compute(task)`` for every task, in any order.
 
-        Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
+        Raises `TacpipeError` if a worker dies (out of memory, killed); results of other workers are in the store by
+        then.
         """
         jobs = min(self.jobs, len(tasks))
         in_this_process = jobs <= 1 or len(tasks) < self._pool_from
@@ -125,14 +129,14 @@ class Local:
 
 @contextlib.contextmanager
 def connected(address: str, jobs: int) -> Iterator[Local]:
-    """Yield the executor of this computer, with ``jobs`` processes, or one a usable core for 0; it has no ``address``."""
+    """Yield the local executor with ``jobs`` processes, or one per usable core for 0. ``address`` must be empty."""
     if address:
         raise UsageError(f"The executor local runs on this computer and has no address: leave {address} out.")
     yield Local(jobs)
 
 
 def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
-    from multiprocessing.connection import wait  # 10 ms that a hit does not pay
+    from multiprocessing.connection import wait  # takes 10 ms that a cache hit should not pay
 
     pending = divide_into_chunks(tasks, jobs)
     workers: dict[Connection, Connection] = {}
@@ -151,18 +155,18 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
                 idle.append(worker)
     finally:
         for worker, life in workers.items():
-            life.close()  # Ends the worker at any point: files are never left half written
+            life.close()  # ends the worker at any point; files are never left half written
             worker.close()
 
 
 def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connection]) -> None:
-    """Start ``jobs`` workers; add the connection to each, and the one that keeps it alive, to ``workers``."""
+    """Start ``jobs`` workers. Adds the connection to each, and the one that keeps it alive, to ``workers``."""
     server = start_fork_server(preload)
     for number in range(jobs):
         ours, theirs = server.Pipe()
         alive, life = server.Pipe(duplex=False)
         workers[ours] = life
-        # a worker that received half of its task would report that
+        # a worker that received half of a task would report an error
         with termination.deferred(), _death_told(), without_main():
             server.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
         theirs.close()
@@ -170,7 +174,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
 
 
 def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> None:
-    """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives."""
+    """Compute the tasks that arrive over ``tasks`` while the process at the other end of ``alive`` lives."""
     os.environ.update(variables)
     termination.end_with(alive.fileno())
     while True:
@@ -205,33 +209,33 @@ def _death_told() -> Iterator[None]:
         ) from error
 
 
-VARIABLE = "TACPIPE_EXECUTOR"  # names one where a command does not
+VARIABLE = "TACPIPE_EXECUTOR"  # environment variable with the default executor
 LOCAL = "local"
 
 
 class Executor(Protocol):
-    """Interface of an executor's plug-in, which computes tasks.
+    """Interface of an executor plug-in, which computes tasks.
 
-    The plug-in's entry point names a function ``connected(address, jobs)`` that returns a context manager of it:
-    ``address`` is what was given behind the executor's name (``host:port`` of ``dask://host:port``, or empty), ``jobs``
-    how many processes were asked for, 0 for as many as are sensible.
+    The plug-in's entry point is a function ``connected(address, jobs)`` that returns a context manager of an executor.
+    ``address`` is the part after the executor's name (``host:port`` in ``dask://host:port``, or empty); ``jobs`` is the
+    requested number of processes, 0 for a sensible default.
     """
 
     def run(self, compute: Callable[[Any], Any], tasks: Sequence[Any], preload: Sequence[str]) -> Iterator[Any]:
-        """Yield ``compute(task)`` of every task (`tacpipe.engine.keys.WorkerTask`), in any order.
+        """Yield ``compute(task)`` for every task (`tacpipe.engine.keys.WorkerTask`), in any order.
 
-        ``preload`` are modules that a worker will need. Raises `TacpipeError` if tasks cannot be computed there; what
-        was finished is in the store by then. Where the iterator is closed, nothing that waits is begun. What a result
-        names is announced in the lease of the tasks' run before the result is yielded.
+        ``preload`` are modules that a worker will need. Raises `TacpipeError` if tasks cannot be computed; finished
+        results are in the store by then. After the iterator is closed, no waiting task is started. The objects of a
+        result are announced in the lease of the tasks' run before the result is yielded.
         """
         ...  # a protocol has no body
 
 
 class ChosenExecutor:
-    """The executor that a command names, used within a block; it is opened for the first work."""
+    """The executor that a command names, used in a ``with`` block and connected when it is first needed."""
 
     def __init__(self, executor: str, jobs: int) -> None:
-        """Take an executor as ``NAME`` or ``NAME://ADDRESS``; empty: `VARIABLE`, or `LOCAL`. Raises `UsageError`."""
+        """Select an executor: ``NAME`` or ``NAME://ADDRESS``, or the default if empty. Raises `UsageError`."""
         name, _, self._address = (executor or os.environ.get(VARIABLE, "") or LOCAL).partition("://")
         self._jobs = jobs
         self._connect = registry.load_executor(name)
@@ -245,7 +249,7 @@ class ChosenExecutor:
         return self._stack.__exit__(*raised)
 
     def opened(self) -> Executor:
-        """Return the executor, connected."""
+        """Return the executor, connecting it if necessary."""
         if self._open is None:
             connection: AbstractContextManager[Executor] = self._connect(self._address, self._jobs)
             self._open = self._stack.enter_context(connection)

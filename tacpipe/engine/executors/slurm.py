@@ -1,8 +1,8 @@
-"""Workers that are jobs of Slurm: submitted for one command, with what Dask's configuration requests for a job.
+"""Slurm jobs as workers, submitted for one command with the resources in Dask's configuration.
 
-Account, partition, cores, memory, walltime and other directives stand in the section ``jobqueue.slurm`` of Dask's
-configuration, as dask-jobqueue documents; ``slurm://PARTITION`` names another partition. Each job is one worker. Its
-connection is encrypted, with certificates made for the command.
+Account, partition, cores, memory, walltime and other directives are in the section ``jobqueue.slurm`` of Dask's
+configuration, as documented by dask-jobqueue; ``slurm://PARTITION`` selects another partition. Each job is one worker.
+Its connection is encrypted, with certificates created for the command.
 """
 
 from __future__ import annotations
@@ -26,21 +26,25 @@ if TYPE_CHECKING:
     from dask_jobqueue import SLURMCluster
     from distributed import Client, Security
 
-JOBS = 4  # Number of jobs without --jobs
-CORES, MEMORY = 1, "4 GiB"  # Resources of a job unless Dask's configuration states them
+JOBS = 4  # number of jobs without --jobs
+CORES, MEMORY = 1, "4 GiB"  # resources of a job that Dask's configuration does not set
 SECTION = "jobqueue.slurm"
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # each 1 in Dask's workers unless it is set
+_THREADS = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+)  # set to 1 in Dask's workers unless configured
 _POLL_S = 0.5
-_SHOWN_S = 5.0  # a wait that is longer is stated
+_SHOWN_S = 5.0  # a longer wait is reported
 
 
 @contextlib.contextmanager
 def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
-    """Yield ``jobs`` workers, `JOBS` for 0, each a job in the partition ``address``, or in the configured one.
+    """Yield ``jobs`` workers (`JOBS` for 0), each a job in the partition ``address`` or in the configured one.
 
-    It waits for the first of them; others join when Slurm starts them. The jobs are cancelled when the block ends. Raises
-    `TacpipeError` if jobs cannot be submitted or all of them end before one has started work, and
-    `MissingModuleError` without dask-jobqueue.
+    Waits for the first worker; others join when Slurm starts them. The jobs are cancelled at the end of the block.
+    Raises `TacpipeError` if jobs cannot be submitted or all end before one has started, and `MissingModuleError` if
+    dask-jobqueue is not installed.
     """
     with extras.explain_missing("The executor slurm"), _interrupts():
         import dask_jobqueue  # noqa: F401, I001  (first: what else is missing comes with it; it adds to Dask's configuration)
@@ -62,7 +66,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[None]:
-    """Keep the handler of Ctrl-C: dask-jobqueue replaces it on import by one that ends the process with exit code 0."""
+    """Restore the handler of Ctrl-C: importing dask-jobqueue replaces it by one that exits with code 0."""
     before = signal.getsignal(signal.SIGINT)
     try:
         yield
@@ -71,7 +75,7 @@ def _interrupts() -> Iterator[None]:
 
 
 def _shared(config: Any) -> Path:
-    """Return the shared folder for certificates and output of jobs: the configured one, or one in the home directory."""
+    """Return the shared folder for certificates and job output: the configured one, or one in the home directory."""
     configured = config.get(f"{SECTION}.shared-temp-directory")
     folder = Path(configured).expanduser() if configured else Path.home() / ".cache/tacpipe"
     folder.mkdir(parents=True, exist_ok=True)
@@ -79,7 +83,7 @@ def _shared(config: Any) -> Path:
 
 
 def _certified(folder: Path) -> Security:
-    """Return a new certificate and its key, in files that only their owner reads."""
+    """Return a new certificate and key, in files that only their owner can read."""
     from distributed import Security
 
     temporary = Security.temporary()  # type: ignore[no-untyped-call]
@@ -100,7 +104,7 @@ def _certified(folder: Path) -> Security:
 
 @contextlib.contextmanager
 def _submitted(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
-    """Submit the jobs; cancel them when the block ends."""
+    """Submit the jobs, and cancel them at the end of the block."""
     from dask_jobqueue import SLURMCluster
 
     def configured(name: str, default: Any) -> Any:
@@ -113,8 +117,8 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
         cores=cores,
         memory=configured("memory", MEMORY),
         processes=1,
-        nanny=True,  # a worker alone may hang as it closes
-        # one task at a time, on all cores of the job; it is Slurm that limits memory
+        nanny=True,  # without it, a worker may hang when it closes
+        # one task at a time on all cores of the job; Slurm limits the memory
         worker_extra_args=[*configured("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
         job_script_prologue=[*configured("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
         job_name="tacpipe",
@@ -130,7 +134,7 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
 
     numbers: Sequence[str] = ()
     try:
-        while len(cluster.worker_spec) < jobs:  # Like `scale`, which discards the answer of sbatch
+        while len(cluster.worker_spec) < jobs:  # like `scale`, which discards the output of sbatch
             cluster.worker_spec.update(cluster.new_worker_spec())
         try:
             cluster.sync(submit)
@@ -144,14 +148,14 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
         numbers = _numbers(cluster)
         yield cluster
     finally:
-        if numbers:  # `close` asks each worker, too slow for an interrupted command, which must end within a second
+        if numbers:  # `close` waits for each worker, but an interrupted command must end within a second
             subprocess.run(["scancel", *numbers], check=False, capture_output=True)
         with contextlib.suppress(Exception):
-            cluster.close(timeout=None if numbers else 1.0)  # The default timeout without a worker is 10 s
+            cluster.close(timeout=None if numbers else 1.0)  # the default timeout without a worker is 10 s
 
 
 def _numbers(cluster: SLURMCluster) -> list[str]:
-    """Return the numbers of the jobs that were submitted."""
+    """Return the numbers of the submitted jobs."""
     return [str(job.job_id) for job in cluster.workers.values() if job.job_id]
 
 
@@ -166,7 +170,7 @@ def _reason(text: str) -> str:
 
 
 def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
-    """Return when one job has begun to work. Raises `TacpipeError` if all have ended before."""
+    """Wait until a job has started to work. Raises `TacpipeError` if all jobs end first."""
     began_s, is_noted = time.monotonic(), False
     while not client.scheduler_info(n_workers=-1)["workers"]:
         if not _waiting(numbers):
@@ -181,14 +185,14 @@ def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
 
 
 def _waiting(numbers: Sequence[str]) -> bool:
-    """Return whether one of the jobs waits or runs; True if Slurm does not answer."""
+    """Return whether any of the jobs is pending or running; True if Slurm does not respond."""
     command = ["squeue", "--noheader", "--format=%T", "--jobs", ",".join(numbers)]
     queue = subprocess.run(command, check=False, capture_output=True, text=True)
     return queue.returncode != 0 or bool(queue.stdout.strip())
 
 
 def _printed(folder: Path) -> str:
-    """Return the last line that a job printed to standard error, as a sentence."""
+    """Return the last line of a job's standard error as a sentence."""
     for file in sorted(folder.glob("*.err")):
         lines = file.read_text(errors="replace").strip().splitlines()
         if lines:
