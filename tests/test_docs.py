@@ -441,7 +441,7 @@ QUESTIONS = {  # Questions of users, each with the page and the heading of the a
     "How do I clean the store?": ("howto/data.md", "Manage data and the store"),
     "How do I get data into LeRobot?": ("howto/export.md", "LeRobot"),
     "Can I trust the cache?": ("promises.md", "Guarantees and evidence"),
-    "How do I add my sensor?": ("howto/board.md", "Connect a board of your own"),
+    "How do I add my sensor?": ("howto/board.md", "Connect your own board"),
     "How do I use my network?": ("extending/model.md", "A model"),
     "How do I label slips?": ("howto/label.md", "Slips"),
     "What does skill mean?": ("reference/metrics.md", "What skill means"),
