@@ -1,4 +1,4 @@
-"""docs/promises.md names the tests of each guarantee, and the pages on guarantees name every file of tests/promises."""
+"""The page of evidence names the tests of each guarantee, and the pages on guarantees name every file of tests/promises."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import pytest
 
 TESTS = Path(__file__).parent
 DOCS = TESTS.parent / "docs"
-PAGE = DOCS / "promises.md"
-TEXT = "".join((DOCS / name).read_text() for name in ("promises.md", "explanation/limits.md", "benchmarks/faults.md"))
+GUARANTEES = DOCS / "explanation" / "guarantees.md"
+EVIDENCE = DOCS / "reference" / "evidence.md"
+TEXT = "".join(page.read_text() for page in (EVIDENCE, DOCS / "explanation/limits.md", DOCS / "benchmarks/faults.md"))
 NAMED = re.compile(r"`(?:tests/)?((?:\w+/)*test_[\w*]+\.py)`")
 
 
 def rows() -> Iterator[list[str]]:
-    """Yield the cells of each row of the table of promises."""
-    table = PAGE.read_text().split("## Guarantees and evidence")[1].split("\n## ")[0]
-    for line in table.splitlines():
+    """Yield the cells of each row of the table of evidence."""
+    for line in EVIDENCE.read_text().split("\n## ")[0].splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if line.startswith("| ") and cells[0] not in ("guarantee", "---"):
             yield cells
@@ -34,11 +34,14 @@ def test_every_file_of_tests_promises_is_named() -> None:
     assert sorted(set(TESTS.glob("promises/test_*.py")) - named_files) == []
 
 
+def test_the_page_of_evidence_has_the_guarantees_in_their_order() -> None:
+    guarantees = re.findall(r"^- \*\*(.+?)\.\*\* ", GUARANTEES.read_text().split("\n## Assumptions")[0], re.MULTILINE)
+    assert len(guarantees) > 20
+    assert guarantees == [cells[0] for cells in rows()]
+
+
 def test_every_promise_names_a_test() -> None:
-    promises = list(rows())
-    assert len(promises) > 20
-    without = [cells[0] for cells in promises if len(cells) != 3 or not NAMED.search(cells[2])]
-    assert without == ["Bad input gives one sentence and the documented exit code, and leaves everything as it was."]
+    assert [cells[0] for cells in rows() if len(cells) != 3 or not NAMED.search(cells[2])] == ["Bad input"]
 
 
 def test_every_promise_states_how_it_is_kept() -> None:

@@ -1,4 +1,4 @@
-"""Statements of docs/threats.md that no other test tries."""
+"""Statements of docs/explanation/threats.md that no other test tries."""
 
 from __future__ import annotations
 
