@@ -39,6 +39,7 @@ def pages() -> dict[str, str]:
     """Return the text of each generated page by path."""
     return {
         "reference/cli.md": command_line(),
+        **{f"reference/cli/{name}.md": command_page(name) for name in command_families()},
         "reference/params.md": params(),
         "reference/python.md": python(),
         "reference/live-messages.md": live_messages(),
@@ -63,15 +64,41 @@ def stage_names() -> list[str]:
 
 
 def command_line() -> str:
-    """Return the page of all commands, each with its help as the program prints it."""
+    """Return the page that lists all commands, with a link to the page of each."""
+    from tacpipe.cli import commands
+    from tacpipe.cli import help as plain_help
+    from tacpipe.plugins import registry
+
+    summaries = {**registry.commands(), **commands.SUMMARIES}
     parts = [
         "# Command line\n",
-        "The help of every command, as `tacpipe COMMAND --help` prints it. `-h` prints the common options. "
+        "Each page has the help of one command, as `tacpipe COMMAND --help` prints it. `-h` prints the common options. "
         "[Options that commands share](options.md) has them in one table.\n",
-        f"```text\n{help_of([])}\n```\n",
     ]
+    for title, names in plain_help.SECTIONS.items():
+        parts += [f"## {title}\n", "| command | purpose |", "| --- | --- |"]
+        parts += [f"| [`{name}`](cli/{name}.md) | {summaries[name]} |" for name in names]
+        parts.append("")
+    return "\n".join([*parts, "## Options without a command\n", f"```text\n{help_of([])}\n```\n"])
+
+
+def command_families() -> dict[str, list[list[str]]]:
+    """Return the words of each command, and of the commands that a group holds, by the first word."""
+    families: dict[str, list[list[str]]] = {}
     for words in command_names():
-        parts += [f"## tacpipe {' '.join(words)}\n", f"```text\n{help_of(words)}\n```\n"]
+        families.setdefault(words[0], []).append(words)
+    return families
+
+
+def command_page(name: str) -> str:
+    """Return the page of a command or of a group of commands, with the help as the program prints it."""
+    stages = stage_names()
+    parts = []
+    for words in command_families()[name]:
+        parts += [f"{'##' if parts else '#'} tacpipe {' '.join(words)}\n"]
+        if ".".join(words) in stages:
+            parts.append(f"[Params of this stage](../params.md#{'-'.join(words)})\n")
+        parts.append(f"```text\n{help_of(words)}\n```\n")
     return "\n".join(parts)
 
 

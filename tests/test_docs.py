@@ -281,17 +281,19 @@ def module(name: str) -> ModuleType:
     return loaded
 
 
-def test_the_reference_has_every_command_with_the_help_that_it_prints(
+def test_the_reference_has_a_page_for_every_command_with_the_help_that_it_prints(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reference = hooks()
-    names = {" ".join(words) for words in reference.command_names()}
-    page = reference.command_line()
+    pages, navigation = reference.pages(), (ROOT / "mkdocs.yml").read_text()
     monkeypatch.setenv("COLUMNS", "102")
 
-    assert set(COMMANDS) <= names
+    assert set(COMMANDS) <= {" ".join(words) for words in reference.command_names()}
+    for name in reference.command_families():
+        assert f"{name}: reference/cli/{name}.md" in navigation
+        assert f"(cli/{name}.md)" in pages["reference/cli.md"]
     for command in ("synchronize", "store gc", "train forward", "acquire"):
-        assert lab.run(f"{command} --help").out.strip() in page
+        assert lab.run(f"{command} --help").out.strip() in pages[f"reference/cli/{command.split()[0]}.md"]
 
 
 def test_the_reference_has_every_param_of_every_stage() -> None:
@@ -543,7 +545,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     build = ("-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site"))
     process = run_python(ROOT, *build, environment={"NO_MKDOCS_2_WARNING": "1"})
     assert process.returncode == 0, process.stderr
-    assert "tacpipe synchronize" in (tmp_path / "site" / "reference" / "cli.html").read_text()
+    assert "tacpipe synchronize" in (tmp_path / "site" / "reference" / "cli" / "synchronize.html").read_text()
     assert (tmp_path / "site" / "reference" / "python.html").read_text().count("doc-heading") > 5
 
 
