@@ -493,7 +493,14 @@ def test_every_page_is_at_most_two_links_from_the_readme() -> None:
 
 def test_pages_are_short() -> None:
     """Count words outside of code; troubleshooting is a table to look up."""
-    longest = {"tutorials": 900, "howto": 600, "explanation": 1000, "tasks": 1000, "quickstart.md": 500, "concepts.md": 700}
+    longest = {
+        "tutorials": 900,
+        "howto": 600,
+        "explanation": 1000,
+        "tasks": 1000,
+        "quickstart.md": 500,
+        "concepts.md": 700,
+    }
     limits = {page: longest.get(page.name, longest.get(page.parent.name)) for page in DOCS}
     counts = {
         page: len(re.sub(r"^```.*?^```$|<!--.*?-->", "", page.read_text(), flags=re.DOTALL | re.MULTILINE).split())
