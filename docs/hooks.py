@@ -65,11 +65,10 @@ def stage_names() -> list[str]:
 
 def command_line() -> str:
     """Return the page that lists all commands, with a link to the page of each."""
-    from tacpipe.cli import commands
     from tacpipe.cli import help as plain_help
-    from tacpipe.plugins import registry
 
-    summaries = {**registry.commands(), **commands.SUMMARIES}
+    overview = help_of([])
+    summaries = dict(re.findall(r"^  ([a-z]+) {2,}(.+)$", overview, re.MULTILINE))
     parts = [
         "# Command line\n",
         "Each page has the help of one command, as `tacpipe COMMAND --help` prints it. `-h` prints the common options. "
@@ -79,7 +78,7 @@ def command_line() -> str:
         parts += [f"## {title}\n", "| command | purpose |", "| --- | --- |"]
         parts += [f"| [`{name}`](cli/{name}.md) | {summaries[name]} |" for name in names]
         parts.append("")
-    return "\n".join([*parts, "## Options without a command\n", f"```text\n{help_of([])}\n```\n"])
+    return "\n".join([*parts, "## Options without a command\n", f"```text\n{overview}\n```\n"])
 
 
 def command_families() -> dict[str, list[list[str]]]:
