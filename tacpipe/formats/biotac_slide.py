@@ -148,14 +148,14 @@ def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
     import pyarrow as pa
 
     from tacpipe.channels import schema
-    from tacpipe.formats.csv_table import file_row
+    from tacpipe.formats.csv_table import place
 
     t_ns = table.column("t_ns").to_numpy()
     back = np.diff(t_ns) <= 0
     if back.any():
         row = int(back.argmax()) + 1
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: the timestamp is {(t_ns[row] - t_ns[row - 1]) / 1e6:g} ms after the one "
+            f"{path}, {place(path, row)}: the timestamp is {(t_ns[row] - t_ns[row - 1]) / 1e6:g} ms after the one "
             f"before; it must be later. Put the rows in order or leave the slide out."
         )
     return pa.Table.from_arrays(table.columns, schema=pa.schema([schema.time_field(), *fields]))

@@ -59,14 +59,14 @@ def read_marker(path: Path, name: str) -> tuple[Floats, float]:
 
 def require_unit(path: Path, quaternions: Floats, name: str) -> None:
     """Raise `TacpipeError` with file and row if a quaternion (time, 4) is not of unit length; NaN is accepted."""
-    from tacpipe.formats.csv_table import file_row
+    from tacpipe.formats.csv_table import place
 
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.abs(length - 1) > UNIT_TOLERANCE
     if bad.any():
         row = int(bad.argmax())
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: {name} has length {length[row]:.4g}, a rotation has 1. "
+            f"{path}, {place(path, row)}: {name} has length {length[row]:.4g}, a rotation has 1. "
             f"Check that its columns are in the order x, y, z, w."
         )
 

@@ -91,7 +91,7 @@ def _poses(path: Path) -> Floats:
     import numpy as np
 
     from tacpipe.formats import xela
-    from tacpipe.formats.csv_table import file_row
+    from tacpipe.formats.csv_table import place
     from tacpipe.signals.kinematics import continuous, quaternions_of
 
     entries = [f"ee_T_{row}{column}" for row in range(4) for column in range(4)]  # named by row and column
@@ -103,7 +103,7 @@ def _poses(path: Path) -> Floats:
     if (error > ORTHONORMAL_TOLERANCE).any():
         row = int((error > ORTHONORMAL_TOLERANCE).argmax())
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
+            f"{path}, {place(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
             f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
         )
     return np.column_stack([moved, continuous(quaternions_of(turned))])
@@ -113,25 +113,23 @@ def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
     """Return seconds as integer nanoseconds (time,). Raises `TacpipeError` if they decrease."""
     import numpy as np
 
-    from tacpipe.formats.csv_table import file_row
+    from tacpipe.formats.csv_table import place
 
     back = np.diff(time_s) < 0
     if back.any():
         row = int(back.argmax()) + 1
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: time runs backwards from {time_s[row - 1]:.9g} s to "
+            f"{path}, {place(path, row)}: time runs backwards from {time_s[row - 1]:.9g} s to "
             f"{time_s[row]:.9g} s. Put the rows in order or leave the trial out."
         )
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
 def _require_flags(path: Path, names: list[str], marks: list[NDArray[np.int8]]) -> None:
-    from tacpipe.formats.csv_table import file_row
+    from tacpipe.formats.csv_table import place
 
     for name, values in zip(names, marks, strict=True):
         bad = (values < 0) | (values > 1)
         if bad.any():
             row = int(bad.argmax())
-            raise TacpipeError(
-                f"{path}, row {file_row(path, row)}, column {name} holds {values[row]}; it must be 0 or 1."
-            )
+            raise TacpipeError(f"{path}, {place(path, row)}, column {name} holds {values[row]}; it must be 0 or 1.")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.csv_table import file_row, read_csv, read_record
+from tacpipe.formats.csv_table import place, read_csv, read_record
 
 
 @pytest.fixture
@@ -59,16 +59,16 @@ def test_a_byte_order_mark_is_no_part_of_a_name(file: Path) -> None:
         ("a,b\n", "has a header and no rows"),
         ("a,c\n1,2\n", "lacks the column b; its header begins with a, c"),
         ("a,a,b\n1,2,3\n", "more than one column a"),
-        ("a,b\n1,2\n3\n", "row 3 has 1 fields instead of 2; it was cut short"),
-        ("a,b\n1,2\n\n3,", "row 4, column b holds '', which is not a number"),
-        ("a,b\n1,2\n3,4,5\n", "row 3 has 3 fields instead of 2; a cell or a comma is too much"),
-        ("a,b\n1,2,\n3,4,\n", "row 2 has 3 fields instead of 2"),
-        ("a,b\n1,2\nx,4\n", "row 3, column a holds 'x', which is not a number"),
-        ("a,b\n1,2\n1_0,4\n", "row 3, column a holds '1_0'"),
-        ("a,b\n1,NA\n", "row 2, column b holds 'NA'"),
-        ("a,b\n\n1,2\n\n1,-nan\n", "row 5, column b holds nan; it must be a finite number"),
-        ("a,b\n1,inf\n", "row 2, column b holds inf"),
-        ("a,b\n1,1e400\n", "row 2, column b holds inf"),
+        ("a,b\n1,2\n3\n", "line 3 has 1 cells instead of 2; it was cut short"),
+        ("a,b\n1,2\n\n3,", "line 4, column b holds '', which is not a number"),
+        ("a,b\n1,2\n3,4,5\n", "line 3 has 3 cells instead of 2; a cell or a separator is too much"),
+        ("a,b\n1,2,\n3,4,\n", "line 2 has 3 cells instead of 2"),
+        ("a,b\n1,2\nx,4\n", "line 3, column a holds 'x', which is not a number"),
+        ("a,b\n1,2\n1_0,4\n", "line 3, column a holds '1_0'"),
+        ("a,b\n1,NA\n", "line 2, column b holds 'NA'"),
+        ("a,b\n\n1,2\n\n1,-nan\n", "line 5, column b holds nan; it must be a finite number"),
+        ("a,b\n1,inf\n", "line 2, column b holds inf"),
+        ("a,b\n1,1e400\n", "line 2, column b holds inf"),
     ],
 )
 def test_a_fault_is_named_with_file_and_row(file: Path, content: str, message: str) -> None:
@@ -82,9 +82,10 @@ def test_a_fault_is_named_with_file_and_row(file: Path, content: str, message: s
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("a,b\n1,2,\n3,4\n", "row 3 does not end in a comma"),
-        ("a,b\n1,2,\n3,4,5\n", "row 3 has 3 fields instead of 2"),
-        ("a,b\n1,2,\n3\n", "row 3 has 1 fields instead of 2; it was cut short"),
+        ("a,b\n1,2,\n3,4\n", "line 3 has 2 cells instead of 3; it was cut short"),
+        ("a,b\n1,2,\n3,4,5\n", "line 3 ends in '5' and other rows in a comma"),
+        ("a,b\n1,2,5\n3,4,\n", "line 2 ends in '5' and other rows in a comma"),
+        ("a,b\n1,2,\n3\n", "line 3 has 1 cells instead of 3; it was cut short"),
     ],
 )
 def test_a_row_unlike_those_that_end_in_a_comma_is_named(file: Path, content: str, message: str) -> None:
@@ -96,7 +97,7 @@ def test_a_row_unlike_those_that_end_in_a_comma_is_named(file: Path, content: st
 @pytest.mark.parametrize("cell", ["0.5", "-1", "65536", "nan"])
 def test_what_is_no_unsigned_16_bit_number_is_named(file: Path, cell: str) -> None:
     file.write_text(f"a\n1\n{cell}\n")
-    with pytest.raises(TacpipeError, match=rf"row 3, column a .*{cell}"):
+    with pytest.raises(TacpipeError, match=rf"line 3, column a .*{cell}"):
         read_csv(file, ["a"], integers=pa.uint16())
 
 
@@ -104,7 +105,7 @@ def test_nan_is_let_through_where_it_is_allowed_and_infinity_is_not(file: Path) 
     file.write_text("a\nnan\n-nan\n")
     assert np.isnan(read_csv(file, ["a"], allow_nan=True).column("a").to_numpy()).all()
     file.write_text("a\nnan\n-inf\n")
-    with pytest.raises(TacpipeError, match=r"row 3, column a .*-inf"):
+    with pytest.raises(TacpipeError, match=r"line 3, column a .*-inf"):
         read_csv(file, ["a"], allow_nan=True)
 
 
@@ -112,13 +113,13 @@ def test_bytes_that_are_no_text_and_a_file_that_is_not_there_are_named(file: Pat
     with pytest.raises(TacpipeError, match="cannot be read"):
         read_csv(file, ["a"])
     file.write_bytes(b"a\n\xff\xfe\n")
-    with pytest.raises(TacpipeError, match="row 2, column a"):
+    with pytest.raises(TacpipeError, match="line 2, column a"):
         read_csv(file, ["a"])
 
 
 def test_a_row_is_counted_as_an_editor_counts(file: Path) -> None:
     file.write_text("a\n1\n\n2\n")
-    assert [file_row(file, index) for index in (0, 1)] == [2, 4]
+    assert [place(file, index) for index in (0, 1)] == ["line 2", "line 4"]
 
 
 def test_a_record_is_its_cells_by_name(file: Path) -> None:
@@ -133,7 +134,7 @@ def test_commas_in_notes_are_put_together_again(file: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("a\n", "has 0 rows"), ("a\n1\n2\n", "has 2 rows"), ("a,b\n1,2,3\n", "row 2 has 3 fields under a header of 2")],
+    [("a\n", "has 0 rows"), ("a\n1\n2\n", "has 2 rows"), ("a,b\n1,2,3\n", "line 2 has 3 cells under a header of 2")],
 )
 def test_a_record_of_another_shape_is_refused(file: Path, content: str, message: str) -> None:
     file.write_text(content)
@@ -159,5 +160,5 @@ def test_seconds_may_have_fewer_decimals_and_stand_in_any_column(file: Path) -> 
 @pytest.mark.parametrize("cell", ["12.0123456789", "-12.5", "nan", "9999999999", "99999999999"])
 def test_what_is_no_unix_time_is_told_with_its_row(file: Path, cell: str) -> None:
     file.write_text(f"time,a\n11.0,1\n\n{cell},2\n")
-    with pytest.raises(TacpipeError, match=r"row 4, column time"):
+    with pytest.raises(TacpipeError, match=r"line 4, column time"):
         read_csv(file, ["a"], seconds="time")

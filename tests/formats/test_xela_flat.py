@@ -129,9 +129,9 @@ def test_a_trial_that_lacks_a_file_is_found_and_named_when_read(flat_trial: Tria
         ("meta_data.csv", "40.0", "-3", "column frequency_hz holds '-3'"),
         ("meta_data.csv", "2021-11-24 15:19:09.142171", "noon", "column start_time holds 'noon'"),
         ("meta_data.csv", "box,1,0", "box,yes,0", "column seen holds 'yes'; it must be 0 or 1"),
-        ("meta_data.csv", "7,box", "7,box,box", "row 2 has 9 fields under a header of 8"),
+        ("meta_data.csv", "7,box", "7,box,box", "line 2 has 9 cells under a header of 8"),
         ("xela_sensor1.csv", "txl16_z", "txl17_z", "lacks the column txl16_z"),
-        ("xela_sensor2.csv", ".0\n", ".5\n", "row 2, column txl16_z holds"),
+        ("xela_sensor2.csv", ".0\n", ".5\n", "line 2, column txl16_z holds"),
         ("marker.csv", "marker1_position_x", "x", "lacks the column marker1_position_x"),
     ],
 )
@@ -149,7 +149,7 @@ def test_a_quaternion_that_is_no_rotation_is_named_with_its_row(flat_trial: Tria
     lines = (folder / "robot_state.csv").read_text().splitlines()
     lines[3] = ",".join([*lines[3].split(",")[:-4], "1", "1", "1", "1"])
     (folder / "robot_state.csv").write_text("\n".join(lines) + "\n")
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_state_orientation.*2"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv, line 4: ee_state_orientation.*2"):
         read(folder)
 
 

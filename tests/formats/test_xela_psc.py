@@ -68,7 +68,7 @@ def test_labels_are_bytes_and_what_was_commanded_is_kept(psc_trial: Trial) -> No
 def test_time_that_runs_backwards_is_named_with_its_row(psc_trial: Trial) -> None:
     folder = psc_trial()
     set_cell(folder / "robot_state.csv", 5, "time", "0.005")
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 5.*0\.01 s.*0\.005 s"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv, line 5.*0\.01 s.*0\.005 s"):
         read(folder)
 
 
@@ -76,14 +76,14 @@ def test_time_that_runs_backwards_is_named_with_its_row(psc_trial: Trial) -> Non
 def test_what_is_no_rigid_transform_is_named_with_its_row(psc_trial: Trial, column: str, cell: str) -> None:
     folder = psc_trial()
     set_cell(folder / "robot_state.csv", 4, column, cell)
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_T"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv, line 4: ee_T"):
         read(folder)
 
 
 def test_a_label_that_is_neither_0_nor_1_is_named(psc_trial: Trial) -> None:
     folder = psc_trial()
     set_cell(folder / "slip_label.csv", 3, "fail", "2")
-    with pytest.raises(TacpipeError, match=r"slip_label\.csv, row 3.*2"):
+    with pytest.raises(TacpipeError, match=r"slip_label\.csv, line 3.*2"):
         read(folder)
 
 

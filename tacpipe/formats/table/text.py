@@ -105,7 +105,7 @@ class TextTable:
 
         Raises `TacpipeError` for a file without a row, and for a name that comes twice.
         """
-        for line, cells in self._read_rows():
+        for line, cells in self.rows():
             if self.stream.names:
                 self._expect_width(line, cells)
                 return list(self.stream.names)
@@ -168,7 +168,7 @@ class TextTable:
 
     def place(self, index: int) -> str:
         """Return the line that holds the data row ``index`` (from 0), as errors name it."""
-        for position, (line, _) in enumerate(self._read_rows()):
+        for position, (line, _) in enumerate(self.rows()):
             if position == index + self.stream.header:
                 return f"line {line}"
         raise IndexError(f"{self.path} has no row {index}.")
@@ -215,7 +215,7 @@ class TextTable:
             commented = bool(comment) and text.startswith(comment)
             header &= number < self.stream.skip_lines or not text or commented
 
-    def _read_rows(self) -> Iterator[tuple[int, list[str]]]:
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield the number and the cells of each line that holds some, the header among them."""
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
@@ -238,7 +238,7 @@ class TextTable:
 
     def _first_fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
         """Return a sentence about the first row that is not as declared, or None."""
-        rows = self._read_rows()
+        rows = self.rows()
         if self.stream.header:
             next(rows)
         checked_columns = [(index, name, types[name]) for index, name in enumerate(names) if name in types]
@@ -251,8 +251,12 @@ class TextTable:
                 if not self._is_allowed(cells[index], kind):
                     place = f"{self.path}, line {line}, column {plain(name)}"
                     sentence = f"{place} holds {excerpt(cells[index])}, which is not {describe_type(kind)}."
-                    return f"{sentence} Correct the cell, or declare it in missing."
+                    return f"{sentence} {self.remedy(kind)}"
         return None
+
+    def remedy(self, kind: pa.DataType) -> str:
+        """Return what to do about a cell that is not of its type ``kind``."""
+        return "Correct the cell, or declare it in missing."
 
     def _is_allowed(self, cell: str, kind: pa.DataType) -> bool:
         if cell in self.stream.missing:

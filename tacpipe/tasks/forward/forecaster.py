@@ -49,10 +49,10 @@ NEEDED: dict[str, model_files.Kind] = {
     **dict.fromkeys(("scaling.feature_half", "scaling.channel_count"), list),
     **dict.fromkeys(("params", "trained_on"), dict),
     "rate_hz": float,
-    "largest_level": (float, model_files.NONE),  # absent from older models
+    "largest_level": float,
 }
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
-SHRINKAGE = "shrinkage"  # tensor of the weights file, (horizon,): see `Shrunk`; models of levels and older ones lack it
+SHRINKAGE = "shrinkage"  # tensor of the weights file, (horizon,): see `Shrunk`; models of levels lack it
 
 
 class WindowArrays(NamedTuple):
