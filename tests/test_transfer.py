@@ -302,42 +302,6 @@ def test_a_dataset_is_named_by_its_path_within_its_project(
     assert projects.place(Path(path))[1] == name
 
 
-def as_before_projects(remote: Path, name: str) -> None:
-    """Write the only root of a remote store as pushes did before projects had an identity."""
-    store = Store(remote)
-    (root,) = store.roots.all()
-    store.roots.remove(root)
-    store.roots.write({key: value for key, value in root.items() if key != "project"} | {"path": name})
-    (file,) = remote.glob("roots/*.json")
-    assert file.stem == values_digest(["pushed", name]), "which is where these lie"
-
-
-def test_what_was_pushed_before_projects_is_pulled_and_succeeded_by_whoever_has_had_it(
-    two: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    enter(two, "one", monkeypatch)
-    two.run("store push ../remote data/r")
-    as_before_projects(two.folder / "remote", "data/r")
-    shutil.rmtree(".tacpipe/projects")
-    assert snapshots(two) == [("", "data/r", "pushed here")]
-    enter(two, "two", monkeypatch)
-    two.run("store push ../remote data/r")  # has never had it: it stays
-    assert sorted(snapshots(two)) == [("", "data/r", "pushed here"), ("two", "data/r", "pushed here")]
-    for name, source in (("one", ":data/r"), ("two", "data/r")):
-        (two.folder / f"of-{name}/.tacpipe").mkdir(parents=True)
-        enter(two, f"of-{name}", monkeypatch)
-        two.run(f"store pull ../remote {source if name == 'one' else 'two:data/r'}")
-        assert Path("data/r/manifest.json").read_bytes() == (two.folder / name / "data/r/manifest.json").read_bytes()
-    enter(two, "one", monkeypatch)
-    two.run("label data/r trial-000 --label material=foam")
-    two.run("store push ../remote data/r")
-    assert sorted(snapshots(two)) == [
-        ("one", "data/r", "pushed earlier"),
-        ("one", "data/r", "pushed here"),
-        ("two", "data/r", "pushed here"),
-    ]
-
-
 def test_one_push_of_a_name_waits_for_another(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     enter(two, "one", monkeypatch)
     two.run("store push ../remote data/r")

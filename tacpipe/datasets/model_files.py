@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 CONFIG = "config.json"
 MAX_SIZE = 100_000  # rows, points, units: what no model of touch comes near
-NONE = type(None)
 _KINDS = {
     int: "a whole number",
     float: "a number",
@@ -177,7 +176,7 @@ def _require(name: str, path: str, value: Any, kind: Kind) -> None:
     right = any(_is(value, allowed) for allowed in kinds)
     if not right:
         described = "is missing" if value is None else f"is {excerpt(value)}"
-        description = " or ".join(_KINDS[allowed] for allowed in kinds if allowed is not NONE)
+        description = " or ".join(_KINDS[allowed] for allowed in kinds)
         raise TacpipeError(
             f"{name}: {path} {described}; it must be {description}. Copy the model again from whoever made it."
         )

@@ -1,8 +1,7 @@
 """Name the datasets that projects pushed, find one by its name, and refuse a push that would replace a newer one.
 
-A name belongs to a project: ``exp:data/rec`` is ``data/rec`` of the project ``exp``, and ``:data/rec`` one that was pushed
-before projects had an identity. Each push is a snapshot. The newest one is what a pull takes, and those before it are the
-history of the name.
+A name belongs to a project: ``exp:data/rec`` is ``data/rec`` of the project ``exp``. Each push is a snapshot. The newest one
+is what a pull takes, and those before it are the history of the name.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
     """Return how each of the pushed roots of a store is named, by its project's id and its path.
 
     >>> one, two = ({"id": digit * 32, "name": "exp"} for digit in "ab")
-    >>> list(labels([{"path": "rec", "project": one}, {"path": "rec"}]).values())
-    ['exp:rec', ':rec']
+    >>> list(labels([{"path": "rec", "project": one}]).values())
+    ['exp:rec']
     >>> list(labels([{"path": "rec", "project": one}, {"path": "rec", "project": two}]).values())
     ['aaaaaaaa:rec', 'bbbbbbbb:rec']
     """
@@ -63,22 +62,20 @@ def label(root: Root, every: Iterable[Root]) -> str:
 def _roots_of_project(requested: str, pushed_roots: Iterable[Root]) -> list[Root]:
     """Return the pushed roots that ``PROJECT:PATH`` names.
 
-    A project is given by its name, by `MIN_DIGITS` or more digits of its id, or by nothing for what has none.
+    A project is given by its name, or by `MIN_DIGITS` or more digits of its id.
     """
     project, colon, path = requested.partition(":")
     return [root for root in pushed_roots if colon and root["path"] == path and _belongs_to(project, root)]
 
 
 def _belongs_to(project: str, root: Root) -> bool:
-    if not project:
-        return not project_id(root)
     by_id = len(project) >= MIN_DIGITS and project_id(root).startswith(project)
     return by_id or root.get("project", {}).get("name") == project
 
 
 def project_in(store: AnyStore, wanted: str) -> Project:
     """Return the project of a store that has this name, or an id that begins so. Raises `UsageError` if there is not one."""
-    names_by_id = {project_id(root): root["project"]["name"] for root in roots(store) if project_id(root)}
+    names_by_id = {project_id(root): root["project"]["name"] for root in roots(store)}
     matching = [
         identifier
         for identifier, name in names_by_id.items()
@@ -97,8 +94,7 @@ def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
     """Return the root that is ``wanted`` by the project ``own``: a ``PROJECT:PATH``, or a path, in the project ``name``.
 
     A name alone is that of ``own``. Where ``own`` never pushed anything it may be that of the only project that has it,
-    as on a second computer; and what was pushed before projects had an identity may be anybody's. Raises `UsageError`
-    where none or several are meant, and names what is there.
+    as on a second computer. Raises `UsageError` where none or several are meant, and names what is there.
     """
     all_roots = roots(store)
     matching = _roots_of_project(wanted, all_roots) or _roots_of_name(name, all_roots, own)
@@ -123,11 +119,8 @@ def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
 
 def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | None) -> list[Root]:
     """Return the pushed roots that a name alone may mean for a project."""
-    same_name = [root for root in pushed_roots if root["path"] == name]
-    if project is None:
-        return same_name
-    return [root for root in same_name if project_id(root) == project.id] or [
-        root for root in same_name if not project_id(root)
+    return [
+        root for root in pushed_roots if root["path"] == name and (project is None or project_id(root) == project.id)
     ]
 
 

@@ -189,27 +189,19 @@ def _publish_name(
     else:
         raise TacpipeError(f"{name} is pushed to {target.place} by others all the time. Run the same command again.")
     _expect_kept(target, name, owner, dataset.digest)
-    if before is not None and not project_id(before):
-        target.roots.remove(before)  # its manifests are in the history of the new one
 
 
 def _predecessor(
     target: AnyStore, local_store: Store, dataset: manifest_of.Found, owner: Project, name: str, *, replace: bool
 ) -> Root | None:
-    """Return the root that a push succeeds, None if there is none. Raises `UsageError` as `push` does.
-
-    What was pushed before projects had an identity is succeeded where this one has had it, and left alone else.
-    """
+    """Return the root that a push succeeds, None if there is none. Raises `UsageError` as `push` does."""
+    before = target.roots.pushed(name, owner.id)
+    if before is None or replace:
+        return before
     local = local_store.roots.get(dataset.directory.absolute()) or {}
     seen_manifests = {dataset.digest, local.get("manifest"), local.get("previous"), *local.get("pushed", ())}
     seen_manifests |= {entry["manifest"] for entry in local.get("history", ())}
-    before = target.roots.pushed(name, owner.id)
-    if before is None:
-        older = target.roots.pushed(name)
-        return older if older is not None and older["manifest"] in seen_manifests else None
-    if not replace:
-        pushed_roots = pushed.roots(target)
-        pushed.refuse_newer(target, before, seen_manifests, pushed.label(before, pushed_roots))
+    pushed.refuse_newer(target, before, seen_manifests, pushed.label(before, pushed.roots(target)))
     return before
 
 

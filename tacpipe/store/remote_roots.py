@@ -40,7 +40,7 @@ class RemoteRoots:
         """Return None: no path of this computer is a root there."""
         return None
 
-    def pushed(self, name: str, project: str = "") -> Root | None:
+    def pushed(self, name: str, project: str) -> Root | None:
         """Return the root that a project pushed as ``name``, or None.
 
         Raises `DamagedError` if its newest version is damaged.

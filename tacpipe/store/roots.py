@@ -64,8 +64,8 @@ class Roots:
         self.store.sync(self._file(PUSHED, name, project["id"]))
         return True
 
-    def pushed(self, name: str, project: str = "") -> Root | None:
-        """Return what the project of this id pushed as ``name``, or None; without an id, what was pushed before projects."""
+    def pushed(self, name: str, project: str) -> Root | None:
+        """Return what the project of this id pushed as ``name``, or None."""
         return self.at(self._file(PUSHED, name, project))
 
     def note_pushed(self, path: Path, manifest: str) -> None:
@@ -158,14 +158,11 @@ def decoded(value: Any) -> Root | None:
     """Return the root that a JSON value holds, None for one that is damaged."""
     root: Root = dict(value) if isinstance(value, dict) else {}
     check = root.pop("check", None)
-    if check is None and "kind" not in root and isinstance(root.get("path"), str):  # Roots of version 0.1
-        root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED
-        return root if _formed(root) else None
     return root if check is not None and check == digest(root) and _formed(root) else None
 
 
 def project_id(root: Mapping[str, Any]) -> str:
-    """Return the id of the project that pushed a root, or empty if none did, or before projects had one."""
+    """Return the id of the project that pushed a root, or empty if none did."""
     return str(root.get("project", {}).get("id", ""))
 
 

@@ -437,7 +437,7 @@ def parse_record(content: bytes, key: str) -> dict[str, Any] | None:
     The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
     """
     begins = _RECORD.match(content)
-    if begins is None:  # written by an earlier version
+    if begins is None:  # not canonical JSON, as records of format 1 may be
         record: dict[str, Any] = json.loads(content)
         return record if sound(record, key) else None
     text = content.decode("ascii")
@@ -468,11 +468,11 @@ def _after(text: str, start: int, words: str) -> int:
 
 
 def sound(record: dict[str, Any], key: str) -> bool:
-    """Return whether a record belongs to the key and is unchanged since it was written (old ones have no check)."""
+    """Return whether a record belongs to the key and is unchanged since it was written."""
     identity, result = canonical(record["identity"]), canonical(record["result"])  # once: a store has many records
     body = b'{"identity":%b,"result":%b}' % (identity, result)
-    is_valid = set(record) <= {"identity", "result", "digest", "provenance", "check"}
-    is_valid = is_valid and ("check" not in record or record["check"] == digest(record["provenance"]))
+    is_valid = set(record) == {"identity", "result", "digest", "provenance", "check"}
+    is_valid = is_valid and record["check"] == digest(record["provenance"])
     return is_valid and bytes_digest(identity) == key and bytes_digest(body) == record["digest"]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -168,10 +167,9 @@ class Forecaster:
         return np.array(self.config["scaling"]["channel_count"])
 
     @property
-    def largest_level(self) -> float | None:
-        """The largest 95th percentile over channels of counts from rest, over training rows; None in an older model."""
-        level = self.config.get("largest_level")
-        return None if level is None else float(level)
+    def largest_level(self) -> float:
+        """The largest 95th percentile over channels of counts from rest, over training rows."""
+        return float(self.config["largest_level"])
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
@@ -278,12 +276,6 @@ class Forecaster:
     def _check_levels(self, touch: AnyFloats) -> None:
         """Refuse windows (window, context, channel) whose levels are not near rest; see `ForwardModel.predict`."""
         largest = self.largest_level
-        if largest is None:
-            warnings.warn(
-                "This model was trained before levels were kept, so it is not checked that windows hold counts above rest.",
-                stacklevel=4,
-            )
-            return
         medians = np.median(np.abs(touch), axis=(1, 2))  # (window,)
         wrong = np.flatnonzero(medians > FARTHEST * largest)
         if largest > 0 and len(wrong):

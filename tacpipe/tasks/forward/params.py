@@ -247,7 +247,7 @@ class ForwardConfig(TypedDict):
     look_ahead: NotRequired[LookAhead]
     timeline: str
     scaling: ForwardScaling
-    largest_level: NotRequired[float | None]  # absent from older models
+    largest_level: float
     validation: dict[str, float]  # loss and epoch of the stored weights
     trained_on: dict[str, str]  # digests of recordings by name
     objects: list[str]

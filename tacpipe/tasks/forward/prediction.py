@@ -176,7 +176,7 @@ class ForwardModel(Forecaster):
         `largest_level`, half of all channels are further from rest than in training hardly any channel ever was. Offsets
         of a XELA uSkin are at least four times `largest_level` on 52 published trials; true windows reach 0.9 of it if
         the model was trained on the weakest of these trials alone, and 0.1 if on all. An offset below twice
-        `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
+        `largest_level` goes unnoticed.
         """
         if plan is not None:
             window = cast("AnyFloats", data)

@@ -121,15 +121,7 @@ class ClassDistance:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another.
-
-        Raises `TacpipeError` for tensors of an earlier version, which held no training slides.
-        """
-        if "slides" not in tensors:
-            raise TacpipeError(
-                "The model was calibrated by an earlier version, with another score of unknown. Run `tacpipe calibrate` "
-                "again."
-            )
+        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another."""
         stored = {name: tensors[name] for name in NAMES}
         stored["projection"] = stored["projection"].astype(np.float64)
         distance = cls(**stored, patterns=Rocket.from_tensors(tensors_under(PATTERNS, tensors)))

@@ -218,20 +218,10 @@ def test_raw_counts_are_refused_and_counts_above_rest_are_not(
 
 def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: ForwardModel) -> None:
     window, plan = windows()
-    assert forecaster.largest_level is not None
     window[..., :3] = 40 * forecaster.largest_level  # a quarter of all channels
     assert np.isfinite(forecaster.predict(window, plan)).all()
     window[..., : len(CHANNELS)] = 1.9 * forecaster.largest_level
     assert np.isfinite(forecaster.predict(window, plan)).all()
-
-
-def test_a_model_that_keeps_no_level_predicts_with_a_warning(models: Mapping[str, Mapping[str, bytes]]) -> None:
-    config = json.loads(models["gru raw"]["config.json"])
-    del config["largest_level"]
-    older = ForwardModel.load({**models["gru raw"], "config.json": json.dumps(config).encode()})
-    with pytest.warns(UserWarning, match="trained before levels were kept"):
-        predicted = older.predict(*windows())
-    assert np.array_equal(predicted, ForwardModel.load(models["gru raw"]).predict(*windows()))
 
 
 def published(files: Mapping[str, Path]) -> FakeShard:

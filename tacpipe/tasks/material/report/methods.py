@@ -65,12 +65,6 @@ class MaterialResult(context.ReportResult):
         """The predictions for each slide that the model has not seen."""
         return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
-    @property
-    def given(self) -> Tree:
-        """The params that are stored with the model; dropout had no effect in an older version."""
-        params = super().given
-        return {**params, "dropout": 0.0} if params.get("dropout_mode") == "noop" else params
-
     @cached_property
     def sensors(self) -> tuple[str, ...]:
         """The sensors whose slides the model was evaluated on."""
