@@ -396,7 +396,7 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
         estimators.check_network(scores_network, scores, torch.zeros(5, 8, 4), 4)
     flat = build_train_params("touch", architecture="flat")
     network = members.network(flat, ["pdc_th"])
-    read = members.patches(flat)
+    read = flat.point_inputs
     prediction = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
     assert prediction.shape == (2, 1)
 

@@ -201,13 +201,6 @@ def test_a_root_remembers_what_was_at_its_path_before(store: Store, tmp_path: Pa
     assert root is not None and (root["manifest"], root["previous"]) == ("second", "first")
 
 
-@pytest.mark.parametrize(("path", "kind"), [("/lab/data/s", "absolute"), ("data/s", "pushed")])
-def test_a_root_as_it_was_once_written_is_read(store: Store, path: str, kind: str) -> None:
-    old = {"path": path, "manifest": "ab" * 32, "previous": None, "written_s": 1}
-    (store.root / "roots" / "old.json").write_text(json.dumps(old))
-    assert store.roots.all() == [{**old, "kind": kind}]
-
-
 def test_a_store_of_another_format_is_refused(store: Store) -> None:
     (store.root / "format").write_text("7\n")
     with pytest.raises(TacpipeError, match="format 7"):

@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -218,6 +219,7 @@ class MinirocketClassifier:
     weight next to patterns is the one that errs least on training slides that are left out one by one.
     """
 
+    ANY_LENGTH: ClassVar[bool] = False  # True: slides of fewer frames than in training are read, too
     patterns: Rocket
     readout: Readout
     share: float  # weight of strength; patterns have 1

@@ -18,7 +18,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import ClassVar, Literal, Self, get_args
 
 import numpy as np
 
@@ -261,6 +261,7 @@ class StatisticsClassifier:
     contact conditions or drift may give away; what the third gets right is neither.
     """
 
+    ANY_LENGTH: ClassVar[bool] = True  # slides of fewer frames than in training are read, too
     readout: Readout
     view: View = "all"
 

@@ -223,6 +223,7 @@ class RecurrentClassifier(nn.Module):
     """The paper's X-LSTM: header, LSTM, and a linear layer that classifies its last state, which are its latents."""
 
     ANY_LENGTH = True
+    DECODES = False  # there are no reconstructed frames whose error could be measured
 
     def __init__(self, shape: AutoencoderShape) -> None:
         super().__init__()

@@ -80,8 +80,12 @@ def load(base: Kind, name: str) -> Kind:
 
 def title(base: Any, architecture: str) -> str:
     """Return the name of an architecture in reports: ``TITLE`` of its class; without one, the architecture itself."""
-    named = (kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG))
-    return str(getattr(next(named, None), "TITLE", architecture))
+    return str(getattr(find(base, architecture), "TITLE", architecture))
+
+
+def find(base: Any, architecture: str) -> Kind | None:
+    """Return the class of an architecture that extends ``base``; None if its package is not installed."""
+    return next((kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG)), None)
 
 
 def require(base: Any, value: Any) -> None:

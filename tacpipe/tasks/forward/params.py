@@ -172,6 +172,7 @@ class Recurrent(ForwardModelParams):
 
 
 Params = ForwardModelParams  # params of any architecture
+PAPER = Recurrent.architecture  # the architecture of the paper
 
 
 class CodecDescription(TypedDict):

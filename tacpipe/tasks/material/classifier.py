@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, cast
@@ -16,7 +18,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import MinirocketClassifier
-from tacpipe.models.readout import Level, StatisticsClassifier, View
+from tacpipe.models.readout import Level, StatisticsClassifier
 from tacpipe.models.recurrent_autoencoder import AutoencoderShape
 from tacpipe.models.tensors import tensors_under
 from tacpipe.models.transfer import Bands, Transfer
@@ -27,7 +29,7 @@ from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
-from tacpipe.tasks.material.params import Estimator, Params
+from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import SlideLayout, Slides, difference
 from tacpipe.tasks.recordings import OpenedChain
@@ -43,18 +45,11 @@ NEEDED = {
 }
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
 ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
-ROCKET, STATISTICS, SPECTRA = "minirocket", "statistics", "spectra"
 UNKNOWN_ANSWER = "unknown"
-MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
-LEVEL_VIEWS: dict[str, View] = {
-    "level_only": "level",
-    "level_removed": "level_removed",
-}  # baselines of the architecture statistics
 
 Config = dict[str, Any]
 ReadoutModel = MinirocketClassifier | StatisticsClassifier
 Baseline = Level | ReadoutModel | FittedEstimator
-READOUTS: dict[str, type[ReadoutModel]] = {ROCKET: MinirocketClassifier, STATISTICS: StatisticsClassifier}
 
 
 @dataclass(frozen=True)
@@ -65,10 +60,30 @@ class ReaderOutput:
     latents: Float32s | None  # (slide, latent)
 
 
+class Reader(ABC):
+    """A fitted model of one sensor."""
+
+    GIVES_LIKELIHOODS: ClassVar[bool] = False  # True: the softmax of scores are probabilities, if uncertain ones
+
+    @property
+    def any_length(self) -> bool:
+        """True if slides of fewer frames than in training are read, too."""
+        return False
+
+    @abstractmethod
+    def read(self, frames: Float32s) -> ReaderOutput:
+        """Return scores, and latents if it has any, of slides (slide, time, channel) in device counts."""
+
+    def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
+        """Return the scores (slide, class) of latents by what another sensor learned. Needs a reader with latents."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class NetworkReader:
+class NetworkReader(Reader):
     """A network of one sensor and the scaling in front of it."""
 
+    GIVES_LIKELIHOODS: ClassVar[bool] = True
     network: Network
     scaling: Affine
 
@@ -90,6 +105,11 @@ class NetworkReader:
                 latents.append(output.latents.cpu().numpy())
         return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
+    def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
+        """Return the scores (slide, class) that the classifier of a partner gives to latents of this sensor."""
+        assert isinstance(partner, NetworkReader)
+        return partner.scores_of(latents)
+
     def scores_of(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
         device = next(self.network.parameters()).device
@@ -100,7 +120,7 @@ class NetworkReader:
 
 
 @dataclass(frozen=True)
-class ReadoutReader:
+class ReadoutReader(Reader):
     """Features and a linear readout of one sensor."""
 
     fitted: ReadoutModel
@@ -109,7 +129,7 @@ class ReadoutReader:
     @property
     def any_length(self) -> bool:
         """True if slides of fewer frames than in training are read, too: by statistics over time."""
-        return isinstance(self.fitted, StatisticsClassifier)
+        return self.fitted.ANY_LENGTH
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
@@ -117,40 +137,36 @@ class ReadoutReader:
 
 
 @dataclass(frozen=True)
-class SpectraReader:
+class SpectraReader(Reader):
     """Spectra over spatial frequency of one sensor, and the classes that it and other sensors learned."""
 
+    GIVES_LIKELIHOODS: ClassVar[bool] = True
     bands: Bands
     rate_hz: float
     speed_m_s: float
     transfer: Transfer
     classes: tuple[int, ...]
-    any_length: ClassVar[bool] = False  # the distance slid decides the wave lengths that it distinguishes
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
         spectra = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
         return ReaderOutput(spread(self.transfer.learned.scores(spectra), self.transfer.classes, self.classes), spectra)
 
-    def expected(self, latents: Float32s) -> Float32s:
+    def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
 @dataclass(frozen=True)
-class EstimatorReader:
+class EstimatorReader(Reader):
     """An estimator of one sensor."""
 
     fitted: FittedEstimator
     classes: tuple[int, ...]
-    any_length: ClassVar[bool] = False  # its features have a fixed size
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the estimator's scores of slides (slide, time, channel) in device counts."""
         return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
-
-
-Reader = NetworkReader | ReadoutReader | SpectraReader | EstimatorReader
 
 
 class Classifier:
@@ -166,15 +182,14 @@ class Classifier:
         self.naming = Naming.from_json(config)
         self.quantities = tuple(config["quantities"])
         self.layouts = {name: SlideLayout.from_json(name, layout) for name, layout in config["sensors"].items()}
-        if isinstance(self.params, Estimator):
-            fitted = self._estimators(files[ESTIMATORS], ESTIMATORS, self.params)
-            self.readers: dict[str, Reader] = {
-                name: EstimatorReader(estimator, self.classes) for name, estimator in fitted.items()
-            }
-        else:
-            self.readers = self._readers(files[WEIGHTS], WEIGHTS)
-        self.last = self._readers(files[LAST], LAST) if LAST in files else {}
-        self.baselines = self._baselines(files) if BASELINES in files else {}
+        stored = StoredClassifier(files, config, self.layouts, self.classes)
+        self.readers: dict[str, Reader] = self.params.readers(stored)
+        self.last: dict[str, Reader] = (
+            self.params.readers(dataclasses.replace(stored, weights=LAST)) if LAST in files else {}
+        )
+        self.baselines: dict[str, dict[str, Baseline]] = {}
+        if BASELINES in files:
+            self.baselines = {MEAN_LEVEL: stored.baseline(MEAN_LEVEL, Level), **self.params.read_baselines(stored)}
         # Sensor -> calibration; empty unless `tacpipe calibrate` wrote the model
         self.calibrations = (
             unpack_calibrations(files[CALIBRATION_FILE], self.layouts) if CALIBRATION_FILE in files else {}
@@ -337,56 +352,69 @@ class Classifier:
         partner: str = names[(names.index(sensor) + 1) % len(names)]
         return partner
 
-    def _readers(self, content: bytes, file: str) -> dict[str, Reader]:
-        if self.architecture in READOUTS:
-            arrays, kind = model_files.arrays(content, file, but=CHOSEN), READOUTS[self.architecture]
-            return {
-                name: ReadoutReader(kind.from_tensors(tensors_under(f"{name}.", arrays)), self.classes)
-                for name in self.layouts
-            }
-        if self.architecture == SPECTRA:
-            arrays, stored = model_files.arrays(content, file), self.config["spectra"]
-            bands = Bands(stored["way_m"], np.array(stored["edges_per_m"]))
-            return {
-                name: SpectraReader(
-                    bands,
-                    layout.rate_hz,
-                    stored["speed_m_s"][name],
-                    Transfer.from_tensors(tensors_under(f"{name}.", arrays)),
-                    self.classes,
-                )
-                for name, layout in self.layouts.items()
-            }
-        tensors = model_files.tensors(content, file)
+
+@dataclass(frozen=True)
+class StoredClassifier:
+    """The files of a classifier, and the ways to read them that the task offers to architectures."""
+
+    files: Mapping[str, bytes]
+    config: Config
+    layouts: Mapping[str, SlideLayout]
+    classes: tuple[int, ...]
+    weights: str = WEIGHTS  # name of the file that `networks` and readouts are read from
+
+    def readouts(self, kind: type[ReadoutModel]) -> dict[str, Reader]:
+        """Return features with a linear readout by sensor."""
+        arrays = model_files.arrays(self.files[self.weights], self.weights, but=CHOSEN)
+        return {
+            name: ReadoutReader(kind.from_tensors(tensors_under(f"{name}.", arrays)), self.classes)
+            for name in self.layouts
+        }
+
+    def spectra(self) -> dict[str, Reader]:
+        """Return spectra over spatial frequency by sensor."""
+        arrays, stored = model_files.arrays(self.files[self.weights], self.weights), self.config["spectra"]
+        bands = Bands(stored["way_m"], np.array(stored["edges_per_m"]))
+        return {
+            name: SpectraReader(
+                bands,
+                layout.rate_hz,
+                stored["speed_m_s"][name],
+                Transfer.from_tensors(tensors_under(f"{name}.", arrays)),
+                self.classes,
+            )
+            for name, layout in self.layouts.items()
+        }
+
+    def networks(self, params: Params) -> dict[str, Reader]:
+        """Return the networks that ``params`` build by sensor."""
+        tensors = model_files.tensors(self.files[self.weights], self.weights)
         readers: dict[str, Reader] = {}
         for name in self.layouts:
             shape = AutoencoderShape(**self.config["shapes"][name])
             weights = tensors_under(f"{name}.", tensors)
-            network = model_files.filled(functools.partial(estimators.build_network, self.params, shape), weights)
+            network = model_files.filled(functools.partial(estimators.build_network, params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
-    def _estimators(self, content: bytes, file: str, params: Estimator) -> dict[str, FittedEstimator]:
-        fitted = estimators.unpacked(content, file, params)
-        return {name: fitted[name] for name in self.layouts}
+    def estimators(self, params: Estimator) -> dict[str, Reader]:
+        """Return the fitted estimators by sensor."""
+        fitted = self._estimators(params, ESTIMATORS)
+        return {name: EstimatorReader(estimator, self.classes) for name, estimator in fitted.items()}
 
-    def _baselines(self, files: Mapping[str, bytes]) -> dict[str, dict[str, Baseline]]:
-        """Return the baselines by name and sensor."""
-        arrays = model_files.arrays(files[BASELINES], BASELINES, but=CHOSEN)
-        kinds: dict[str, type[Level | ReadoutModel]] = {MEAN_LEVEL: Level}
-        shuffled: dict[str, FittedEstimator] = {}
-        if isinstance(self.params, Estimator):
-            shuffled = self._estimators(files[SHUFFLED_ESTIMATORS], SHUFFLED_ESTIMATORS, self.params)
-        else:
-            kinds[PERMUTED_LABELS] = READOUTS.get(self.architecture, Level)
-        if self.architecture == STATISTICS:
-            kinds |= dict.fromkeys(LEVEL_VIEWS, StatisticsClassifier)
-        baselines: dict[str, dict[str, Baseline]] = {
-            kind: {name: cls.from_tensors(tensors_under(f"{kind}.{name}.", arrays)) for name in self.layouts}
-            for kind, cls in kinds.items()
-        }
-        return {**baselines, PERMUTED_LABELS: {**shuffled}} if shuffled else baselines
+    def shuffled_estimators(self, params: Estimator) -> dict[str, Baseline]:
+        """Return the estimators that were fitted to shuffled labels by sensor."""
+        return {**self._estimators(params, SHUFFLED_ESTIMATORS)}
+
+    def baseline(self, name: str, kind: type[Level | ReadoutModel]) -> dict[str, Baseline]:
+        """Return a stored baseline by sensor."""
+        arrays = model_files.arrays(self.files[BASELINES], BASELINES, but=CHOSEN)
+        return {sensor: kind.from_tensors(tensors_under(f"{name}.{sensor}.", arrays)) for sensor in self.layouts}
+
+    def _estimators(self, params: Estimator, file: str) -> dict[str, FittedEstimator]:
+        fitted = estimators.unpacked(self.files[file], file, params)
+        return {name: fitted[name] for name in self.layouts}
 
 
 def spread(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:

@@ -21,9 +21,9 @@ from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material.calibration import Answers
-from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
+from tacpipe.tasks.material.classifier import CONFIG, Classifier, ReaderOutput
 from tacpipe.tasks.material.network_training import HISTORY
-from tacpipe.tasks.material.params import XLSTM, Raec
+from tacpipe.tasks.material.params import MEAN_LEVEL
 from tacpipe.tasks.material.slides import Slides
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
     params = classifier.params
-    mapped = isinstance(params, Raec) and bool(params.frozen_sensor)  # all have the frozen sensor's classifier already
+    mapped = bool(params.aligned_sensor)  # all have the frozen sensor's classifier already
     if classifier.config.get("joint") and output.latents is not None and not mapped:
         predicted[SWAPPED] = _exchanged(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
@@ -206,8 +206,8 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
     counted = np.ones(len(slides), bool)
-    if isinstance(params, Raec | XLSTM) and params.drop_last:
-        counted[len(slides) // params.batch * params.batch or len(slides) :] = False  # fewer than one batch count all
+    if batch := params.dropped_beyond:
+        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
     evaluated = Evaluated(
         slides,
         np.array([digest in trained_on for digest in slides.digests], bool),
@@ -245,11 +245,7 @@ def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s
 
 
 def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> Float32s:
-    reader, partner_reader = classifier.readers[sensor], classifier.readers[classifier.partner(sensor)]
-    if isinstance(reader, SpectraReader):
-        return reader.expected(latents)
-    assert isinstance(partner_reader, NetworkReader)
-    return partner_reader.scores_of(latents)
+    return classifier.readers[sensor].scores_by(classifier.readers[classifier.partner(sensor)], latents)
 
 
 def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]) -> tuple[Int64s, Int64s]:

@@ -359,11 +359,8 @@ class JointWork:
                 reconstruction += float(nn.functional.mse_loss(output.frames, frames)) * len(batch)
         count = len(labelled) or math.nan
         measures = {"accuracy": right / count, "classification": loss / count}
-        return (
-            measures
-            if isinstance(network, RecurrentClassifier)
-            else {**measures, "reconstruction": reconstruction / count}
-        )
+        decodes = getattr(network, "DECODES", True)
+        return {**measures, "reconstruction": reconstruction / count} if decodes else measures
 
     def ranks(self, line: Line) -> dict[str, tuple[float, ...]]:
         """Return the error rate on validation slides, of equals the later epoch being better."""

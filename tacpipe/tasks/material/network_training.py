@@ -28,8 +28,6 @@ from tacpipe.tasks.material.classifier import (
     BASELINES,
     CONFIG,
     LAST,
-    MEAN_LEVEL,
-    PERMUTED_LABELS,
     TASK,
     WEIGHTS,
     Classifier,
@@ -39,6 +37,8 @@ from tacpipe.tasks.material.classifier import (
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import NONE, BatchPairs, JointWork, ScaledSlides, permuted_classes
 from tacpipe.tasks.material.params import (
+    MEAN_LEVEL,
+    PERMUTED_LABELS,
     Estimator,
     Minirocket,
     Params,

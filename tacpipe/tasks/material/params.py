@@ -32,10 +32,14 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tacpipe.arrays import Float32s
+    from tacpipe.models.readout import View
     from tacpipe.models.recurrent_autoencoder import AutoencoderShape
+    from tacpipe.tasks.material.classifier import Baseline, Reader, StoredClassifier
     from tacpipe.tasks.material.losses import Weights
     from tacpipe.tasks.material.network_training import TrainingSlides
 
+MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of every architecture
+LEVEL_VIEWS: Mapping[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # baselines of statistics
 KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -53,6 +57,7 @@ class MaterialModelParams(ABC):
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # read where the param ``quantities`` is empty
     ALIGNS_SENSORS: ClassVar[bool] = False  # True: networks can be aligned to the frozen one of the model of --init
+    IS_READOUT: ClassVar[bool] = False  # True: one linear readout per sensor, fitted in closed form
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
     # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)
@@ -93,6 +98,21 @@ class MaterialModelParams(ABC):
         `Estimator` and `NetworkParams` implement it for the estimators and networks that an architecture builds.
         """
 
+    @property
+    def dropped_beyond(self) -> int:
+        """The size of a batch if slides beyond the last full one are left out in evaluation, too; else 0."""
+        return 0
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return the model of each sensor that ``fit`` stored: networks, if an architecture states nothing else."""
+        return stored.networks(self)
+
+    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
+        """Return the stored baselines by name and sensor, apart from that by the mean level."""
+        from tacpipe.models.readout import Level
+
+        return {PERMUTED_LABELS: stored.baseline(PERMUTED_LABELS, Level)}
+
 
 @dataclass(frozen=True)
 class Minirocket(MaterialModelParams):
@@ -101,6 +121,7 @@ class Minirocket(MaterialModelParams):
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
     TITLE: ClassVar[str] = "MiniRocket"
+    IS_READOUT: ClassVar[bool] = True
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     features: Annotated[int, Range(84)] = 10_000  # features of each sensor
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
@@ -110,6 +131,18 @@ class Minirocket(MaterialModelParams):
         """Return the files of random convolutions and a readout for each sensor."""
         return slides.fit_rockets(self)
 
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return random convolutions and a readout by sensor."""
+        from tacpipe.models.minirocket import MinirocketClassifier
+
+        return stored.readouts(MinirocketClassifier)
+
+    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
+        """Return the same model, fitted to shuffled labels."""
+        from tacpipe.models.minirocket import MinirocketClassifier
+
+        return {PERMUTED_LABELS: stored.baseline(PERMUTED_LABELS, MinirocketClassifier)}
+
 
 @dataclass(frozen=True)
 class Statistics(MaterialModelParams):
@@ -117,12 +150,26 @@ class Statistics(MaterialModelParams):
 
     # statistics: statistics of each channel and a linear readout, for few slides
     architecture: Literal["statistics"] = "statistics"
+    IS_READOUT: ClassVar[bool] = True
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of statistics and a readout for each sensor."""
         return slides.fit_statistics(self)
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return statistics and a readout by sensor."""
+        from tacpipe.models.readout import StatisticsClassifier
+
+        return stored.readouts(StatisticsClassifier)
+
+    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
+        """Return the same model, fitted to shuffled labels, to the level only and to what remains without it."""
+        from tacpipe.models.readout import StatisticsClassifier
+
+        names = (PERMUTED_LABELS, *LEVEL_VIEWS)
+        return {name: stored.baseline(name, StatisticsClassifier) for name in names}
 
 
 @dataclass(frozen=True)
@@ -140,6 +187,10 @@ class Spectra(MaterialModelParams):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of spectra, by which sensors learn materials from one another."""
         return slides.fit_spectra(self)
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return spectra by sensor."""
+        return stored.spectra()
 
 
 @dataclass(frozen=True)
@@ -161,6 +212,14 @@ class Estimator(MaterialModelParams, ABC):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of one fitted estimator per sensor."""
         return slides.fit_estimators(self)
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return the fitted estimators by sensor."""
+        return stored.estimators(self)
+
+    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
+        """Return estimators that were fitted to shuffled labels."""
+        return {PERMUTED_LABELS: stored.shuffled_estimators(self)}
 
     @abstractmethod
     def build(self, seed: int) -> Any:
@@ -207,6 +266,11 @@ class NetworkParams(MaterialModelParams, ABC):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of one network per sensor, trained by the shared loop."""
         return slides.train_networks(self)
+
+    @property
+    def dropped_beyond(self) -> int:
+        """The size of a batch if slides beyond the last full one are left out in evaluation, too; else 0."""
+        return self.batch if self.drop_last else 0
 
     @property
     def learns_jointly(self) -> bool:

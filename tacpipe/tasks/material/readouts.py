@@ -18,9 +18,6 @@ from tacpipe.tasks.material.classifier import (
     BASELINES,
     CONFIG,
     ESTIMATORS,
-    LEVEL_VIEWS,
-    MEAN_LEVEL,
-    PERMUTED_LABELS,
     SHUFFLED_ESTIMATORS,
     WEIGHTS,
     Config,
@@ -29,7 +26,16 @@ from tacpipe.tasks.material.classifier import (
 from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.estimators import packed as packed_estimators
 from tacpipe.tasks.material.headline import Naming
-from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra, Statistics
+from tacpipe.tasks.material.params import (
+    LEVEL_VIEWS,
+    MEAN_LEVEL,
+    PERMUTED_LABELS,
+    Estimator,
+    Minirocket,
+    Params,
+    Spectra,
+    Statistics,
+)
 from tacpipe.tasks.material.slides import BySensor, Slides
 
 Arrays = dict[str, np.ndarray]

@@ -70,6 +70,10 @@ class CloudInputs:
         """Numbers of the grasp: none, both contact points, or these and the wrist's rotation."""
         return 15 if self.posed else 6 if self.mode.endswith("cont") else 0
 
+    def sources(self, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]) -> CloudSources:
+        """Return clouds and grasps to draw from. Raises `TacpipeError` if one lacks what is read."""
+        return CloudSources(self, names, clouds, grasps)
+
 
 class CloudSources:
     """Clouds and grasps to draw from."""
@@ -174,6 +178,10 @@ class PatchOptions:
     def grasp_numbers(self) -> int:
         """Numbers of the grasp: its opening, and where it is: both points, approach and closing."""
         return 13 if self.placed else 1
+
+    def sources(self, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]) -> PatchSources:
+        """Return clouds and grasps to draw patches from. Raises `TacpipeError` if colours are read and one has none."""
+        return PatchSources(self, names, clouds, grasps)
 
 
 class PatchSources:

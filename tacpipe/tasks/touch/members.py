@@ -20,9 +20,9 @@ from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.models.point_networks import PointNetworkShape
-from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.inputs import Arrays, CloudInputs, CloudSources, PatchOptions, PatchSources, require_colours
+from tacpipe.tasks.touch.inputs import Arrays, require_colours
+from tacpipe.tasks.touch.params import PointNetwork
 from tacpipe.training.following import Line, Validated
 from tacpipe.training.scaling import Affine
 
@@ -33,7 +33,7 @@ SEEDS = 2**62
 
 
 class Drawn(Protocol):
-    """A source of drawn points: `inputs.CloudSources` or `patches.PatchSources`."""
+    """A source of drawn points: `CloudSources` or `PatchSources` of `tacpipe.tasks.touch.inputs`."""
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
         """Return points and the grasps' numbers, drawn anew."""
@@ -132,7 +132,6 @@ def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Flo
     return torch.cat(rows).cpu().numpy()
 
 
-NetworkParams = params_of.Patches | params_of.Pointnet
 MAX_POINTS = 100_000  # points of a cloud, and times that they are drawn
 
 
@@ -175,7 +174,7 @@ class NetworkMember:
     targets: tuple[str, ...]
     network: nn.Module
     scale: Affine
-    params: NetworkParams
+    params: PointNetwork
 
     def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
@@ -208,10 +207,10 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
     return unit
 
 
-def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
+def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network for params and targets. Raises `TacpipeError` if params build something else."""
     values = sum(biotac_sp.width(target) for target in targets)
-    read = inputs(params) if isinstance(params, params_of.Pointnet) else patches(params)
+    read = params.point_inputs
     built = params.build(PointNetworkShape(read.channels, read.grasp_numbers, values))
     if not isinstance(built, nn.Module):
         raise TacpipeError(
@@ -220,30 +219,13 @@ def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
     return built
 
 
-def checked(params: NetworkParams) -> None:
+def checked(params: PointNetwork) -> None:
     """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
     for name, value in (("draws", params.draws), ("points", params.points)):
         if not 0 < value <= MAX_POINTS:
             raise ValueError(f"{name} is {value}")
 
 
-def inputs(params: params_of.Pointnet) -> CloudInputs:
-    """Return what a PointNet reads."""
-    return CloudInputs(params.inputs, params.points, params.normalisation, params.rotation_deg, params.wrist)
-
-
-def patches(params: params_of.Patches) -> PatchOptions:
-    """Return what a patch network reads."""
-    return PatchOptions(params.points, params.radius_mm / 1000, coloured(params), params.place)
-
-
-def coloured(params: params_of.Trees | NetworkParams) -> bool:
-    """Return whether colours are read."""
-    return params.inputs.startswith("rgb")
-
-
-def sources(params: NetworkParams, grasps: Grasps) -> Drawn:
+def sources(params: PointNetwork, grasps: Grasps) -> Drawn:
     """Return where a network's points are drawn from. Raises `TacpipeError` if a grasp lacks what it reads."""
-    if isinstance(params, params_of.Pointnet):
-        return CloudSources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
-    return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)
+    return params.point_inputs.sources(grasps.names, grasps.clouds, grasps.grasps)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tacpipe.models.point_networks import PointNetworkShape
+    from tacpipe.tasks.touch.inputs import CloudInputs, PatchOptions
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
 Presets = Mapping[str, Mapping[str, object]]
@@ -101,6 +102,16 @@ class Trees(TouchModelParams):
     shrink_novel: bool = added(False)
     PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
 
+    @property
+    def coloured(self) -> bool:
+        """True if colours are read."""
+        return self.inputs == "rgb"
+
+    @property
+    def adds_joint_forest(self) -> bool:
+        """True if one forest of all targets is averaged with the forests of single ones."""
+        return self.architecture == "tree-ensemble"
+
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
         """Add one forest per target and, in a tree-ensemble, one of all targets."""
         grasps.grow_forests(self, model)
@@ -132,6 +143,11 @@ class PointNetwork(TouchModelParams, ABC):
     def chooses_by_validation(self) -> bool:
         """True if validation grasps choose the epoch of a network, or when its training ends."""
         return self.select == "best" or bool(self.patience)
+
+    @property
+    @abstractmethod
+    def point_inputs(self) -> CloudInputs | PatchOptions:
+        """What the network reads of a cloud; `Patches` and `Pointnet` state it."""
 
     @abstractmethod
     def build(self, shape: PointNetworkShape) -> nn.Module:
@@ -167,6 +183,13 @@ class Patches(PointNetwork):
     hidden: Annotated[int, Range(2)] = 256  # units of the first layer behind the points
     dropout: Dropout = 0.3  # fraction of these left out of each training step
     PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
+
+    @property
+    def point_inputs(self) -> PatchOptions:
+        """Points about both contacts."""
+        from tacpipe.tasks.touch.inputs import PatchOptions
+
+        return PatchOptions(self.points, self.radius_mm / 1000, self.inputs == "rgb", self.place)
 
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
         """Add networks that the shared loop trains: one for all targets or one for each."""
@@ -220,6 +243,13 @@ class Pointnet(PointNetwork):
         "quick": {"networks": 1, "epochs": 10, "points": 64},
     }
 
+    @property
+    def point_inputs(self) -> CloudInputs:
+        """The whole cloud, with contact points and wrist as ``inputs`` states."""
+        from tacpipe.tasks.touch.inputs import CloudInputs
+
+        return CloudInputs(self.inputs, self.points, self.normalisation, self.rotation_deg, self.wrist)
+
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
         """Add networks that the shared loop trains: one for all targets or one for each."""
         grasps.train_networks(self, model)
@@ -232,3 +262,5 @@ class Pointnet(PointNetwork):
 
 
 Params = TouchModelParams  # params of any architecture
+DEFAULT = TouchModelParams.architecture  # the architecture that is trained if none is named
+PAPER = Pointnet.architecture  # the architecture of the paper

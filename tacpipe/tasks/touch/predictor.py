@@ -30,7 +30,7 @@ from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
-from tacpipe.tasks.touch.params import Params
+from tacpipe.tasks.touch.params import Params, PointNetwork
 from tacpipe.tasks.touch.quantiles import FILE as QUANTILES
 from tacpipe.tasks.touch.quantiles import ReadingQuantiles
 from tacpipe.training import devices
@@ -304,7 +304,7 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
     scale = Affine.from_tensors({name: value.numpy() for name, value in tensors_under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):
         raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
-    if not isinstance(params, members.NetworkParams):
+    if not isinstance(params, PointNetwork):
         raise ValueError(f"the architecture {params.architecture} has a network")
     network = model_files.filled(lambda: members.network(params, targets), tensors_under("network.", tensors))
     members.checked(params)

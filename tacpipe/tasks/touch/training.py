@@ -27,8 +27,8 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members, predictor
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import require_colours
-from tacpipe.tasks.touch.members import Drawn, NetworkParams, ScaledGrasps, TouchWork
-from tacpipe.tasks.touch.params import Params, Trees
+from tacpipe.tasks.touch.members import Drawn, ScaledGrasps, TouchWork
+from tacpipe.tasks.touch.params import Params, PointNetwork, Trees
 from tacpipe.tasks.touch.predictor import (
     BASELINES,
     CONFIG,
@@ -65,7 +65,7 @@ class TrainingGrasps:
         """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets."""
         _grow_forests(params, self, model)
 
-    def train_networks(self, params: NetworkParams, model: FittedModel) -> None:
+    def train_networks(self, params: PointNetwork, model: FittedModel) -> None:
         """Add networks to ``model`` that the shared loop trains."""
         _train_networks(params, self, model)
 
@@ -141,17 +141,16 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
     Each has the leaves of the least out-of-bag error.
     """
     training, targets = grasps.training, grasps.targets
-    coloured = members.coloured(params)
-    if coloured:
+    if params.coloured:
         require_colours(training.names, training.clouds)
-    rows, names = geometry.table(training.clouds, training.grasps, coloured=coloured, placed=params.place)
+    rows, names = geometry.table(training.clouds, training.grasps, coloured=params.coloured, placed=params.place)
     readings = {target: training.readings[target] for target in targets}
     groups: list[tuple[str, ...]] = [(target,) for target in targets]
-    if params.architecture == "tree-ensemble" and len(targets) > 1:
+    if params.adds_joint_forest and len(targets) > 1:
         groups.append(tuple(targets))
     forests, leaves = _forests(params, rows, readings, groups)
     description: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": [*map(list, groups)]}
-    description |= {"features": list(names), "coloured": coloured, "placed": params.place, "leaves": leaves}
+    description |= {"features": list(names), "coloured": params.coloured, "placed": params.place, "leaves": leaves}
     forest_tensors: dict[str, Tensor] = {}
     for number, (_, forest) in enumerate(forests):
         forest_tensors |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
@@ -194,7 +193,7 @@ def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
     return fitting[int(np.argmin(errors))]
 
 
-def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: FittedModel) -> None:
+def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedModel) -> None:
     """Add networks to ``model``: one for all targets or one for each, and as many of each as ``networks`` is."""
     training, validation, targets = grasps.training, grasps.validation, grasps.targets
     if validation is None and params.chooses_by_validation:
@@ -241,7 +240,7 @@ def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: Fitted
 
 
 def _work(
-    params: NetworkParams, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
+    params: PointNetwork, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
 ) -> TouchWork:
     """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
     training, watched = (
@@ -251,11 +250,11 @@ def _work(
     return TouchWork(training, watched, params.batch, params.loss, _weights(group).to(device))
 
 
-def _built(params: NetworkParams, targets: Sequence[str], device: str) -> nn.Module:
+def _built(params: PointNetwork, targets: Sequence[str], device: str) -> nn.Module:
     return members.network(params, targets).to(device)
 
 
-def _weights_learned(params: NetworkParams, targets: Sequence[str]) -> int:
+def _weights_learned(params: PointNetwork, targets: Sequence[str]) -> int:
     """Return how many numbers a network learns; the running means of batches are none of them."""
     with torch.device("meta"):  # shapes alone
         return sum(weight.numel() for weight in members.network(params, targets).parameters())

@@ -214,7 +214,7 @@ def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(t
     latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
     for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
         at = [i for i, sensor_name in enumerate(rows["sensor"]) if sensor_name == sensor]
-        best_classes = loaded.best_classes(loaded.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
+        best_classes = loaded.best_classes(loaded.readers[sensor].scores_by(loaded.readers[partner], latents[at]))
         original = (
             {partner_class: first_class for first_class, partner_class in partners.items()}
             if sensor == "biotac"

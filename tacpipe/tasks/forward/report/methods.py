@@ -17,6 +17,7 @@ from tacpipe.report import context
 from tacpipe.report.context import Tree, drop_duplicates
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
+from tacpipe.tasks.forward.params import PAPER
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -192,7 +193,7 @@ def main_timeline(runs: Sequence[ForwardResult]) -> str:
 
 def is_recurrent(method: Method) -> bool:
     """Return whether a method is the paper's encoder and decoder, with the plan."""
-    return method.settings["actions"] == "planned" and method.family.startswith("recurrent")
+    return method.settings["actions"] == "planned" and method.family.startswith(PAPER)
 
 
 def paper_method(methods: Sequence[Method]) -> Method | None:

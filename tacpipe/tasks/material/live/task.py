@@ -60,7 +60,7 @@ class MaterialLive(LiveTask):
         Raises `UsageError` if it is not stated which of the model's sensors the rig has, `TacpipeError` if the rig
         has not the channels that the model reads, or the model was trained behind a stage that has no causal rule.
         """
-        from tacpipe.tasks.material.classifier import Classifier, NetworkReader, SpectraReader
+        from tacpipe.tasks.material.classifier import Classifier
         from tacpipe.tasks.material.live.engine import MaterialEngine, find_finger
         from tacpipe.tasks.material.live.slide import SlideSoFar, slide_params
 
@@ -82,9 +82,7 @@ class MaterialLive(LiveTask):
                 f"stream but {finger}. Add the arm, or train on `segment slides --trigger load`, whose slides end when "
                 f"nothing is touched."
             )
-        has_probabilities = classifier.calibrations or isinstance(
-            classifier.readers[sensor], NetworkReader | SpectraReader
-        )
+        has_probabilities = classifier.calibrations or classifier.readers[sensor].GIVES_LIKELIHOODS
         about = MaterialDescription(
             classifier.names,
             sensor,

@@ -44,12 +44,6 @@ _PLAIN = {
 }
 # In these, runs of one method may differ; run_label and quantities are shown as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
-_CLOSED = {  # all that has an effect on what is fitted in closed form
-    "minirocket": ("features", "use_validation", "labels"),
-    "statistics": ("use_validation", "labels"),
-    "spectra": ("speeds", "use_validation", "labels", "hold_out"),
-}
-_RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # params without effect on X-LSTM
 _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without effect where sensors learn alone
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
@@ -80,11 +74,8 @@ class MaterialResult(context.ReportResult):
     def learned(self) -> Mapping[str, int]:
         """The number of slides that the model learned from, by sensor: a readout also learns from those of validation."""
         params = self.params
-        if (
-            self.architecture in ("minirocket", "statistics")
-            and params.get("use_validation")
-            and params.get("labels") != "permuted"
-        ):
+        is_readout = getattr(architectures.find(MaterialModelParams, self.architecture), "IS_READOUT", False)
+        if is_readout and params.get("use_validation") and params.get("labels") != "permuted":
             watched = self.config["counts"].get("val", {})
             return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
         batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
@@ -200,7 +191,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
         name = "mapping to known space"
     elif settings["joint"]:
         name += " joint"
-    elif architecture == "raec":
+    elif getattr(architectures.find(MaterialModelParams, architecture), "ALIGNS_SENSORS", False):
         name += " independent"
     if not variants:
         return name
@@ -223,21 +214,13 @@ def _settings(run: MaterialResult) -> dict[str, Any]:
     """Return all that makes a method but the number of its slides; what is of no effect is left out."""
     config, params, architecture = run.config, run.params, run.architecture
     frozen = str(params.get("frozen_sensor", ""))
-    joint = bool(config.get("joint", architecture == "raec" and params.get("joint", False)))
-    closed = _CLOSED.get(architecture)
-    ratio = 100 if closed else int(params.get("subsample_percent", 100))
+    joint = bool(config.get("joint", params.get("joint", False)))
+    ratio = int(params.get("subsample_percent", 100))
     shortened = run.epochs_of_paper if run.published else ""
-    idle = {
-        *_NO_METHOD,
-        *(["epochs"] if shortened else []),
-        "features",
-        "use_validation",
-        "speeds",
-        *((_RAECS + _PAIRS) if architecture == "x-lstm" else () if joint or frozen else _PAIRS),
-    }
+    idle = {*_NO_METHOD, *(["epochs"] if shortened else []), *(() if joint or frozen else _PAIRS)}
     split, layout = run.place
     return {
-        **{name: value for name, value in params.items() if (name in closed if closed else name not in idle)},
+        **{name: value for name, value in params.items() if name not in idle},
         "architecture": architecture,
         "joint": joint,
         "frozen_sensor": bool(frozen),  # each run reports on the sensor that was mapped, so both are one method
@@ -245,7 +228,7 @@ def _settings(run: MaterialResult) -> dict[str, Any]:
         "labels": str(params.get("labels", "true")),
         "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",
         "subsample_percent": ratio if params.get("subsample_sensor") else 100,
-        "hold_out": "" if architecture in ("minirocket", "statistics") else str(params.get("hold_out", "")),
+        "hold_out": str(params.get("hold_out", "")),
         "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(","))
         and "vibration" not in config.get("absent", ()),
         "layout": layout,

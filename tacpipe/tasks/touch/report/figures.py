@@ -20,9 +20,9 @@ from tacpipe.report import blocks, charts, context
 from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL
+from tacpipe.tasks.touch.params import PAPER
 from tacpipe.tasks.touch.report import methods, paper, predictions
 from tacpipe.tasks.touch.report.methods import (
-    PAPERS,
     TouchResult,
     describe_training,
     one_per_architecture,
@@ -276,7 +276,7 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
         (method, target)
         for method in methods
         for target in (paper.TARGET, ALL)
-        if method.settings["architecture"] == PAPERS and _loss_curves(method, target, "train_loss")
+        if method.settings["architecture"] == PAPER and _loss_curves(method, target, "train_loss")
     ]
     if not candidates:
         return []

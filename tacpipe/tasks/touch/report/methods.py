@@ -20,7 +20,7 @@ from tacpipe.report import blocks, context
 from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
-from tacpipe.tasks.touch.params import TouchModelParams
+from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchModelParams
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-PAPERS = "pointnet"  # the architecture of the paper
-DEFAULT = "tree-ensemble"  # the one that is trained where none is named
 USUAL = ("split", "simulated")  # settings that no name states: parts of questions
 _NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
@@ -67,7 +65,7 @@ class TouchResult(context.ReportResult):
     def settings(self) -> dict[str, Any]:
         """All that makes its method: params but the seed, the split of its grasps, and whether these were simulated."""
         params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
-        if self.architecture != PAPERS:  # the others take nothing more from it
+        if self.architecture != PAPER:  # the others take nothing more from it
             params["colour"] = str(params.pop("inputs", "")).startswith("rgb")
         if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
             params.pop("wrist", None)  # nothing reads it
@@ -257,7 +255,7 @@ def describe_schedule(run: TouchResult) -> str:
     params = run.params
     epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
     described = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
-    if run.architecture != PAPERS or not run.published:
+    if run.architecture != PAPER or not run.published:
         return described
     if (batch, rate) == (BATCH, LEARNING_RATE) and int(epochs or 0) >= EPOCHS:
         return f"paper schedule ({described})"

@@ -12,11 +12,10 @@ from tacpipe.report.blocks import NONE, Block, Cell, Chart, SmallPrint, Table
 from tacpipe.report.charts import Dot
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.headline import MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.params import DEFAULT, PAPER
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.methods import (
     BASELINES,
-    DEFAULT,
-    PAPERS,
     baseline_name,
     caution,
     describe_training,
@@ -253,7 +252,7 @@ def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Meth
     alike: dict[str, dict[object, Method]] = {}
     for method in methods:
         value = method.settings.get(form.setting)
-        if method.settings["architecture"] == PAPERS and value in form.names and score_on_target(method):
+        if method.settings["architecture"] == PAPER and value in form.names and score_on_target(method):
             alike.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
 
     def place(by_value: Mapping[object, Method]) -> tuple[int, int]:
@@ -329,7 +328,7 @@ PARTS = ("RMSE over runs", "R²", "skill")
 def generalisation_tables(methods: Sequence[Method]) -> list[Block]:
     """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
     described = []
-    for architecture in (PAPERS, DEFAULT):
+    for architecture in (PAPER, DEFAULT):
         pairs = _pairs([block for block in methods if block.settings["architecture"] == architecture])
         described.append(max(pairs, key=_pair_order, default=None))
     return [block for pair in described if pair for block in _generalisation_table(*pair)]
