@@ -20,15 +20,15 @@ import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import timing
 
 from tacpipe.datasets import directory
-from tacpipe.datasets.manifest import NAME, Entry, find
+from tacpipe.datasets.manifest import NAME, InputDataset, find
 from tacpipe.engine import keys
 from tacpipe.io import parquet
 from tacpipe.io.hashing import digest
+from tacpipe.store.records import Content, Record, RecordingEntry, Shard
 from tacpipe.store.store import Store
 
 COUNTS = (10_000, 100_000)
@@ -63,7 +63,7 @@ class Lab:
         self._template = replace(seed, recordings={})
         self.count = 0
         self._listed = "", ""  # digests of the dataset and of its manifest, that was listed last
-        self.entries: dict[str, Entry] = {}
+        self.entries: dict[str, RecordingEntry] = {}
         self.add(1)
         timing.run(f"tacpipe {HIT}", folder)
         synced = find(folder / "synced").manifest
@@ -86,9 +86,10 @@ class Lab:
             for number, task in enumerate(
                 keys.shard_tasks(self.store, replace(self._template, recordings=new), self._step, ())
             ):
-                shards = {"": {**result["recordings"][""]["shards"][""], **self._put_numbered(self._synced, number)}}
-                commit_result = {"recordings": {"": {**result["recordings"][""], "shards": shards}}, "files": {}}
-                self.store.commit(task.identity, commit_result, provenance)
+                entry = result["recordings"][""]
+                shard: Shard = {**entry["shards"][""], **self._put_numbered(self._synced, number)}
+                numbered: RecordingEntry = {**entry, "shards": {"": shard}}
+                self.store.commit(task.identity, {"recordings": {"": numbered}, "files": {}}, provenance)
         manifest = replace(self._template, recordings=self.entries)
         manifest.keep(self.store)
         directory.publish(self.store, manifest, self.folder / "recordings")
@@ -98,11 +99,11 @@ class Lab:
         for place in ("recordings", "synced"):
             manifest = find(self.folder / place).manifest
             (entry,) = manifest.recordings.values()
-            entries = {
+            entries: dict[str, RecordingEntry] = {
                 f"trial-{number:07d}": {**entry, "attributes": {**entry["attributes"], "trial": number}}
                 for number in range(count)
             }
-            inputs = (
+            inputs: dict[str, list[InputDataset]] = (
                 {}
                 if place == "recordings"
                 else {"datasets": [{"dataset": self._listed[0], "manifest": self._listed[1]}]}
@@ -112,21 +113,20 @@ class Lab:
             self.store.roots.set(self.folder / place, self._listed[1])
             (self.folder / place / NAME).write_bytes(listed.content)
 
-    def _entry(self, number: int) -> Entry:
-        attributes = {"material": f"m{number % 20}", "sensor": "xela-uskin", "trial": number}
+    def _entry(self, number: int) -> RecordingEntry:
         return {
-            "attributes": attributes,
+            "attributes": {"material": f"m{number % 20}", "sensor": "xela-uskin", "trial": number},
             "shards": {STREAM: {**self._put_numbered(self._raw, number), "rows": self._rows}},
         }
 
-    def _record(self, entries: dict[str, Entry]) -> dict[str, Any]:
+    def _record(self, entries: dict[str, RecordingEntry]) -> Record:
         (task,) = keys.shard_tasks(self.store, replace(self._template, recordings=entries), self._step, ())
         return self.store.read_record(digest(task.identity))
 
-    def _put_numbered(self, content: bytes, number: int) -> dict[str, Any]:
+    def _put_numbered(self, content: bytes, number: int) -> Content:
         """Store a Parquet file with a number before its footer, where no reader looks."""
         footer = int.from_bytes(content[-8:-4], "little") + 8
-        return vars(self.store.put(content[:-footer] + number.to_bytes(8, "little") + content[-footer:]))
+        return self.store.put(content[:-footer] + number.to_bytes(8, "little") + content[-footer:]).to_json()
 
 
 STEPS = {  # Steps run in this order; those that change the dataset come last.

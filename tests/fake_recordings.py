@@ -16,6 +16,7 @@ from tacpipe.datasets.manifest import Manifest
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import ParquetTable, to_parquet
+from tacpipe.store.records import RecordingEntry
 from tacpipe.store.store import Store
 
 
@@ -81,11 +82,11 @@ def publish_dataset(
 ) -> None:
     """Publish recordings by name and stream as a result of the stage scale, each label a list of one value per recording."""
     store.prepare()
-    entries = {
+    entries: dict[str, RecordingEntry] = {
         name: {
             "attributes": {label: values[place] for label, values in labels.items() if values[place] is not None},
             "shards": {
-                stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
+                stream: {**store.put(to_parquet(table)).to_json(), "rows": table.num_rows}
                 for stream, table in streams.items()
             },
         }

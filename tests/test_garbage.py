@@ -236,7 +236,8 @@ def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: La
     Path("data/s").rename("elsewhere")
     age(lab)
     collect_garbage(lab)
-    root = lab.store.roots.get(lab.folder / "data/s") or {}
+    root = lab.store.roots.get(lab.folder / "data/s")
+    assert root is not None
     lab.store.roots.write({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400})
     Path("elsewhere").rename("data/s")
     collect_garbage(lab)

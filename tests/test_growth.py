@@ -11,6 +11,7 @@ import pytest
 import tacpipe
 from tacpipe.datasets import directory, manifest, pages
 from tacpipe.errors import DamagedError
+from tacpipe.store.records import Record, summary
 from tacpipe.store.store import Store
 from tests.conftest import Lab
 
@@ -23,7 +24,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], dict[str, 
     calls = {"records": 0, "placed": 0}
     read, place = Store.read_record, directory.place
 
-    def reading(self: Store, key: str) -> dict[str, Any]:
+    def reading(self: Store, key: str) -> Record:
         calls["records"] += 1
         return read(self, key)
 
@@ -116,7 +117,7 @@ def test_the_provenance_of_a_group_keeps_what_its_stage_noted(lab: Lab) -> None:
     (group,) = [record for _, record in store.records() if "group" in record["identity"]]
     singles = [record for _, record in store.records() if record["identity"].get("stage") == "scale"]
 
-    assert group["provenance"]["code"] == {"scale": {singles[0]["provenance"]["code"]: 3}}
+    assert summary(group)["code"] == {"scale": {singles[0]["provenance"]["code"]: 3}}
     assert set(group["result"]["recordings"]) == {"trial-000", "trial-001", "trial-002"}
 
 

@@ -21,6 +21,7 @@ from tacpipe.io.hashing import canonical, digest
 from tacpipe.plugins import given_params
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, stage
+from tacpipe.store.records import RecordingEntry, Shard, Step
 from tests.conftest import Lab, write_source
 
 numbers = st.integers(-(2**80), 2**80) | st.floats(allow_nan=False, allow_infinity=False)
@@ -297,7 +298,7 @@ def test_a_number_of_numpy_gives_the_key_of_the_number(value: np.float64) -> Non
 
 @given(entries, st.data())
 def test_a_recordings_key_rests_on_its_streams_and_on_the_attributes_that_are_declared(
-    entry: dict[str, Any], data: st.DataObject
+    entry: RecordingEntry, data: st.DataObject
 ) -> None:
     reads = tuple(data.draw(st.lists(names, max_size=3)))
     changed = data.draw(attributes)
@@ -311,12 +312,12 @@ def test_a_recordings_key_rests_on_its_streams_and_on_the_attributes_that_are_de
 
 @given(entries, entries)
 def test_streams_their_names_and_their_digests_count_and_rows_and_bytes_do_not(
-    first: dict[str, Any], second: dict[str, Any]
+    first: RecordingEntry, second: RecordingEntry
 ) -> None:
     streams = [{name: shard["digest"] for name, shard in entry["shards"].items()} for entry in (first, second)]
     first_key, right = (keys.of_recording(entry, ()) for entry in (first, second))
     assert (digest(first_key) == digest(right)) == (streams[0] == streams[1])
-    counted = {name: {**shard, "rows": 7, "bytes": 8} for name, shard in first["shards"].items()}
+    counted: dict[str, Shard] = {name: {**shard, "rows": 7, "bytes": 8} for name, shard in first["shards"].items()}
     assert digest(keys.of_recording({**first, "shards": counted}, ())) == digest(first_key)
 
 
@@ -357,8 +358,8 @@ def test_stage_version_params_and_inputs_each_change_the_key() -> None:
 
 @given(st.lists(names, min_size=2, max_size=2, unique=True))
 def test_what_lies_behind_a_dataset_counts_where_the_whole_of_it_is_read(stages: list[str]) -> None:
-    step = {"stage": stages[0], "version": 1, "params": {"factor": 2}, "fitted": None}
-    other_steps = [
+    step: Step = {"stage": stages[0], "version": 1, "params": {"factor": 2}, "fitted": None}
+    other_steps: list[Step] = [
         {**step, "stage": stages[1]},
         {**step, "version": 2},
         {**step, "params": {"factor": 3}},

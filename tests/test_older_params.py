@@ -10,6 +10,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.store.records import Step
 from tacpipe.tasks.touch.params import Trees
 from tests.stage_params import build_params
 
@@ -82,9 +83,9 @@ def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     from tacpipe.tasks import recordings as opened
 
     stored = params_of.to_json(build_params("compress.pca", components=3, representation="increments"))
-    step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
+    step: Step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
     assert opened._command(step) == "compress pca --components 3 --representation increments"
-    renamed_step = {**step, "params": {**stored, "of": "levels"}}
+    renamed_step: Step = {**step, "params": {**stored, "of": "levels"}}
     assert "representation" in chain_difference([step], [renamed_step])
     assert params_of.with_current_names("no.such.stage", {"of": "levels"}) == {"of": "levels"}
 

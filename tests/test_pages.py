@@ -22,6 +22,7 @@ from tacpipe.datasets.pages import Item, Page, Pages
 from tacpipe.engine import keys
 from tacpipe.errors import DAMAGED, DamagedError, TacpipeError
 from tacpipe.io import hashing
+from tacpipe.store.records import Content, RecordingEntry, Shard
 from tests.conftest import Lab
 from tests.promises.test_hostile_manifest import HOSTILE
 
@@ -39,7 +40,7 @@ ENTRIES = st.fixed_dictionaries(
 LABELS = st.none() | st.dictionaries(st.text(max_size=3), VALUES, min_size=1, max_size=2)
 ITEMS = st.builds(Item, ENTRIES, LABELS, st.none() | st.just({"raw": "0" * 64}))
 MANY = st.dictionaries(NAMES, ITEMS, min_size=2, max_size=12)
-FILES = {"a": {"digest": "0" * 64, "bytes": 1}}
+FILES: dict[str, Content] = {"a": {"digest": "0" * 64, "bytes": 1}}
 
 
 def of_items(items: dict[str, Item]) -> Manifest:
@@ -91,7 +92,7 @@ def divide_into_pages(grouped: int) -> Iterator[None]:
 
 
 def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had() -> None:
-    entry = {"attributes": {}, "shards": {"": {"digest": "0" * 64, "rows": 1, "bytes": 1}}}
+    entry: RecordingEntry = {"attributes": {}, "shards": {"": {"digest": "0" * 64, "rows": 1, "bytes": 1}}}
     thousand, thousand_and_one = ({f"r{number:05d}": entry for number in range(count)} for count in (1000, 1001))
 
     value = json.loads(Manifest("stage", 1, recordings=thousand).content)
@@ -159,7 +160,7 @@ def test_a_key_over_a_dataset_in_pages_is_that_of_its_recordings(items: dict[str
 
 def test_one_changed_recording_reads_and_writes_one_page(few_are_many: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "GROUPED", 16)
-    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    shard: Shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
     full_manifest = of_items(
         {f"r{number:04d}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(400)}
     )
@@ -189,7 +190,7 @@ ROOT_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
 
 @pytest.mark.parametrize("change", ROOT_CHANGES)
 def test_a_root_that_none_can_be_is_refused_before_a_page_is_read(few_are_many: None, change: str) -> None:
-    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    shard: Shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
     full_manifest = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
     root = json.loads(full_manifest.content)
     ROOT_CHANGES[change](root)
@@ -218,10 +219,10 @@ def test_a_page_that_holds_what_no_manifest_can_is_refused_when_it_is_read(few_a
 
 @pytest.mark.parametrize("field", ["first", "content", "recordings", "rows", "shard_bytes", "labelled", "excluded"])
 def test_a_page_that_is_not_what_its_root_states_is_refused(few_are_many: None, field: str) -> None:
-    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    shard: Shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
     full_manifest = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
     assert full_manifest.pages is not None
-    value = full_manifest.pages.pages[0].to_json()
+    value: Any = full_manifest.pages.pages[0].to_json()
     value[field] = value.get(field, 0) + 1 if field not in ("first", "content") else "a" * 64
     changed_pages = Pages([Page.from_json(value)], Objects(dict(full_manifest.pages.fresh)), {})
     with pytest.raises(DamagedError):

@@ -15,7 +15,7 @@ from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import provenance
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
-from tacpipe.store.records import digests
+from tacpipe.store.records import RecordingEntry, digests
 from tests.conftest import Lab, write_source
 
 
@@ -29,8 +29,11 @@ def replace_stream(lab: Lab, path: str, recording: str, stream: str, table: pa.T
     manifest = lab.manifest(path)
     entry = manifest.recordings[recording]
     stored = lab.store.put(to_parquet(table))
-    shards = {**entry["shards"], stream: {**vars(stored), "rows": table.num_rows}}
-    recordings = {**manifest.recordings, recording: {**entry, "shards": shards}}
+    changed_entry: RecordingEntry = {
+        **entry,
+        "shards": {**entry["shards"], stream: {**stored.to_json(), "rows": table.num_rows}},
+    }
+    recordings = {**manifest.recordings, recording: changed_entry}
     changed = Manifest(manifest.stage, manifest.version, manifest.params, recordings=recordings)
     lab.store.put(changed.content)
     directory.publish(lab.store, changed, lab.folder / path)

@@ -17,7 +17,7 @@ from tacpipe.datasets import manifest, pages
 from tacpipe.engine.previous import Previous, Reusable
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
-from tacpipe.store import presence
+from tacpipe.store import presence, records
 from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.test_presence import DAY_NS, FAULTS
@@ -184,12 +184,8 @@ def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_r
 
     def run_provenance() -> Any:
         manifest_digest = file_digest(lab.folder / "data/s/manifest.json")
-        (run,) = [
-            record
-            for _, record in lab.store.records()
-            if record["result"]["files"].get("manifest.json", {}).get("digest") == manifest_digest
-        ]
-        return {name: run["provenance"][name] for name in ("code", "notes")}
+        (run,) = [record for _, record in lab.store.records() if manifest_digest in records.digests(record["result"])]
+        return {"code": records.summary(run)["code"], "notes": records.summary(run)["notes"]}
 
     by_taking = run_provenance()
     shutil.rmtree(lab.folder / ".tacpipe/presence")

@@ -10,6 +10,7 @@ import pytest
 
 from tacpipe.engine import provenance
 from tacpipe.errors import UsageError
+from tacpipe.store.records import Provenance
 from tests.conftest import run_python
 
 CPUINFO = """processor\t: 0
@@ -44,8 +45,8 @@ def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
     program = (
-        "from tacpipe.engine import processor; before = processor.threads(); import torch;"
-        "print(before, processor.threads())"
+        "from tacpipe.engine import provenance; before = provenance.threads(); import torch;"
+        "print(before, provenance.threads())"
     )
     ran = run_python(Path(), "-c", program, environment={"OMP_NUM_THREADS": str(threads)}, check=True)
     assert ran.stdout.split() == [str(threads)] * 2
@@ -54,7 +55,7 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
     stored = provenance.describe_provenance(1.0)
     assert provenance.unlike(stored, provenance.describe_provenance(2.0)) == []
-    other_computer = {
+    other_computer: Provenance = {
         **stored,
         "device": "cuda",
         "processor": {**stored["processor"], "instructions": ["sve"], "threads": 977},
@@ -75,7 +76,7 @@ def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.Mo
 
 
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
-    assert provenance.unlike({"threads": 2}, provenance.describe_provenance(0.0)) == []
+    assert provenance.unlike({}, provenance.describe_provenance(0.0)) == []
 
 
 def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(

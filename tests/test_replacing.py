@@ -443,7 +443,9 @@ def test_a_hundred_reruns_leave_a_short_history_and_one_loss_stays_in_it(lab: La
     lab.run("simulate toy -o data/r --trials 1 --rows 3 --replace")
     for offset in range(1, 101):
         lab.store.roots.set(lab.folder / "data/r", f"{offset:064x}")
-    history = (lab.store.roots.get(lab.folder / "data/r") or {})["history"]
+    last_root = lab.store.roots.get(lab.folder / "data/r")
+    assert last_root is not None
+    history = last_root["history"]
     assert len(history) == 21 and [entry["manifest"] for entry in history if entry["lasting"]] == [root["manifest"]]
 
 

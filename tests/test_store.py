@@ -14,11 +14,12 @@ from tacpipe.errors import LockedError, TacpipeError, UsageError
 from tacpipe.io.files import Draft
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store.location import locate, project
+from tacpipe.store.records import StageIdentity, StoredResult
 from tacpipe.store.store import MissingError, Store
 from tests.conftest import Lab, Ran
 
-IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
-EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}
+IDENTITY: StageIdentity = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
+EMPTY: StoredResult = {"recordings": {}, "files": {}}
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from tacpipe import printable
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
+from tacpipe.store.records import RecordingEntry
 from tests.conftest import Lab
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202etxt.exe\x7f\r\nforged: line"
@@ -47,7 +48,10 @@ def hostile(lab: Lab) -> Lab:
     lab.run("simulate toy -o data/r --trials 2")
     manifest = lab.manifest("data/r")
     first, second = manifest.recordings
-    entry = {**manifest.recordings[first], "attributes": {HOSTILE.replace("\n", ""): HOSTILE, "excluded": HOSTILE}}
+    entry: RecordingEntry = {
+        **manifest.recordings[first],
+        "attributes": {HOSTILE.replace("\n", ""): HOSTILE, "excluded": HOSTILE},
+    }
     forged = replace(
         manifest,
         recordings={"a\x9b31m\u202eb": manifest.recordings[second], first: entry},

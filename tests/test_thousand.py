@@ -8,6 +8,7 @@ import pytest
 import tacpipe
 from tacpipe.datasets import directory
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.store.records import RecordingEntry
 from tacpipe.store.store import Store
 from tests.conftest import tacpipe as command
 
@@ -46,7 +47,7 @@ def lab(recordings: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def record_anew(folder: Path, name: str, entry: dict[str, object]) -> None:
+def record_anew(folder: Path, name: str, entry: RecordingEntry) -> None:
     """Give one recording other streams, and the dataset's directory with it."""
     before = tacpipe.open(folder / "data/recordings").source
     changed = Manifest(before.stage, before.version, before.params, recordings={**before.recordings, name: entry})
@@ -59,7 +60,7 @@ def test_one_changed_recording_costs_one_shard_in_every_stage(lab: Path, recordi
     split = tacpipe.open(lab / "data/split").to_pandas()
     name = str(split["recording"][split["role"] == "test"].iloc[0])
     entry = tacpipe.open(lab / "data/other").source.recordings["trial-000"]
-    record_anew(lab, name, dict(entry))
+    record_anew(lab, name, entry)
     for stage, words in STAGES.items():
         assert outcome(lab, words) == (1, recordings - 1), stage
 

@@ -55,7 +55,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     """Return the overview of a result: the model against its baselines, the evaluated data and their role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
-    identity = identities_of_manifests(store).get(found.digest, {})
+    identity = identities_of_manifests(store).get(found.digest)
     return {
         **_architecture(config),
         "headline": None if headlines is None else [entry.to_json() for entry in headlines],
@@ -64,8 +64,8 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
         "by_part": {
             name: part["counts"] for name, part in metrics.items() if isinstance(part, dict) and "counts" in part
         },
-        "fold": identity.get("fold"),
-        "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
+        "fold": None if identity is None else identity.get("fold"),
+        "role": ((identity and identity.get("role")) or "test") if "split" in opened.source.inputs else None,
         "trained_on": _learned(config)["trained_on"],
         "params": params_of.with_current_names(f"train.{config.get('task')}", config.get("params", {})),
         "inputs": _inputs(opened.source.inputs, store),

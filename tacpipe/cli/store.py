@@ -73,11 +73,11 @@ def status(as_json: AsJson = False) -> None:
     if store.distant:
         from tacpipe.maintenance import cache
 
-        value = cache.status(cache.distant(store))
-        _print(value, as_json=as_json, text=cache.status_text(value))
+        bucket_status = cache.status(cache.distant(store))
+        _print(bucket_status, as_json=as_json, text=cache.status_text(bucket_status))
         return
-    value = upkeep.status(store)
-    _print(value, as_json=as_json, text=upkeep.status_text(value))
+    status = upkeep.status(store)
+    _print(status, as_json=as_json, text=upkeep.status_text(status))
 
 
 def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
@@ -91,7 +91,8 @@ def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
     from tacpipe.maintenance import checkout as checkouts
 
     listed = checkouts.known(cache.behind(locate()) if store is None else transfer.remote_store(store))
-    _print(checkouts.to_json(listed), as_json=as_json, text=checkouts.to_text(listed))
+    value = {"schema_version": 1, "manifests": [asdict(entry) for entry in listed]}
+    _print(value, as_json=as_json, text=checkouts.to_text(listed))
 
 
 def checkout(

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
 from tacpipe.datasets import pages
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest, ManifestJson
 from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, suggestion
+from tacpipe.store.records import Content, RecordingEntry
 
 if TYPE_CHECKING:
     import duckdb
@@ -38,7 +39,7 @@ _NAMED = 5  # recordings that an error names
 class Recording:
     """One recording of a dataset: its attributes, and its tables when asked for."""
 
-    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader, dataset: Dataset | None = None) -> None:
+    def __init__(self, name: str, entry: RecordingEntry, read: Reader, dataset: Dataset | None = None) -> None:
         self.name = name
         self.attributes: Mapping[str, Attribute] = MappingProxyType(dict(entry["attributes"]))
         self._entry = entry
@@ -159,7 +160,7 @@ class Recording:
 class LazyFiles(Mapping[str, bytes]):
     """The files of a dataset by name; their content is read and verified when asked for."""
 
-    def __init__(self, files: Mapping[str, Any], read: Reader) -> None:
+    def __init__(self, files: Mapping[str, Content], read: Reader) -> None:
         self._files, self._read = files, read
 
     def __getitem__(self, name: str) -> bytes:
@@ -279,12 +280,16 @@ class Dataset:
         return self._opener(path)
 
     @property
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> ManifestJson:
         """The manifest as plain values, the recordings of all pages included."""
-        value: dict[str, Any] = json.loads(self.source.content)
+        value: ManifestJson = json.loads(self.source.content)
         value.pop("pages", None)
-        per_recording = ("recordings", "labels", "sources")
-        return {**value, **{name: dict(getattr(self.source, name)) for name in per_recording}}
+        recordings, labels, sources = (
+            dict(self.source.recordings),
+            dict(self.source.labels),
+            dict(self.source.sources),
+        )
+        return {**value, "recordings": recordings, "labels": labels, "sources": sources}
 
     @property
     def digest(self) -> str:
@@ -440,10 +445,10 @@ class _Recordings(Mapping[str, Recording]):
     """Recordings by name, in the order of names, each made when it is asked for."""
 
     def __init__(
-        self, dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Iterable[str] | None
+        self, dataset: Dataset, entries: Mapping[str, RecordingEntry], read: Reader, names: Iterable[str] | None
     ) -> None:
         self._dataset, self._entries, self._read = dataset, entries, read
-        self._names: Mapping[str, object] = entries
+        self._names: Collection[str] = entries
         if names is not None or not isinstance(entries, pages.Recordings):
             self._names = dict.fromkeys(sorted(entries if names is None else names))
         for name in names or ():

@@ -8,10 +8,10 @@ import re
 import shutil
 import stat
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.delivery import deliver
@@ -22,6 +22,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.store import layout
+from tacpipe.store.records import Content
 from tacpipe.store.store import MissingError, Store
 
 _DRAFT = ".draft"
@@ -134,7 +135,8 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
         if before is not None and lasting:
             _adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        key = (store.roots.get(directory) or {}).get("key", "") if relabelled else planned.key
+        root = store.roots.get(directory) if relabelled else None
+        key = planned.key if not relabelled else "" if root is None else root.get("key", "")
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
         sweep(directory, shards=any("/" in path for path in stale), deep=manifest.exported)
@@ -181,7 +183,7 @@ def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Itera
     for path in paths:
         with regular.opened(directory / path) as file:
             stored = store.put_written(lambda draft, file=file: shutil.copyfileobj(file, draft), durable=True)  # type: ignore[misc]
-        files[path] = vars(stored)
+        files[path] = stored.to_json()
     before = _current_manifest(directory) or manifest
     edited = replace(before, files=dict(sorted({**before.files, **files}.items())))
     edited.keep(store, durable=True)
@@ -285,7 +287,7 @@ def _pages_compared(current: Manifest | None, manifest: Manifest, directory: Pat
     return {path: page.digest for path, page in now.items() if path not in lies}, before.keys() - now.keys()
 
 
-def _same(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> bool:
+def _same(before: Content | None, now: Content) -> bool:
     return before is not None and before["digest"] == now["digest"]
 
 

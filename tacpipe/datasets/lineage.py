@@ -5,25 +5,60 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict, TypeVar, final
 
 from tacpipe import printable
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import InputDataset, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import listed
 from tacpipe.store import records
 from tacpipe.store.location import locate
+from tacpipe.store.records import Provenance, RecordingEntry, RunIdentity
+from tacpipe.store.roots import Root
 from tacpipe.store.store import Store
 
+V = TypeVar("V")
 _SHOWN = 5  # names listed before the rest is counted
 
 
-def trace(path: Path) -> dict[str, Any]:
+@final
+class LostNode(TypedDict):
+    """A dataset of a lineage whose manifest cannot be read."""
+
+    manifest: str  # digest
+    digest: str
+    lost: str  # why it cannot be read
+
+
+@final
+class LineageNode(TypedDict):
+    """A dataset of a lineage, and those that it was made from."""
+
+    stage: str
+    version: int
+    params: Values
+    digest: str
+    manifest: str  # digest
+    path: str | None  # where it lies now
+    recordings: int
+    rows: int
+    files: dict[str, str]  # digests
+    files_bytes: int
+    labels: dict[str, dict[str, Attribute]]  # labels set by hand, by recording
+    skipped: dict[str, str]  # reasons by recording
+    sources: dict[str, dict[str, str]]  # digests of raw files by recording
+    inputs: dict[str, list[LineageNode | LostNode]]  # by name of the argument
+    provenance: NotRequired[Provenance | None]  # of the dataset that is traced only
+    changes: NotRequired[list[str] | None]  # since its previous run; None if there was none
+
+
+def trace(path: Path) -> LineageNode:
     """Return the lineage of the dataset (or report) at ``path`` as a tree, with the changes since the previous run."""
     store = locate(path if path.is_dir() else path.absolute().parent)
     root = store.roots.get((path.parent if path.name == manifest_of.NAME else path).absolute())
@@ -41,8 +76,8 @@ def trace(path: Path) -> dict[str, Any]:
     return {**tree, "provenance": provenance, "changes": changed}
 
 
-def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:
-    inputs: dict[str, list[dict[str, Any]]] = {}
+def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> LineageNode:
+    inputs: dict[str, list[LineageNode | LostNode]] = {}
     for argument, datasets in manifest.inputs.items():
         inputs[argument] = []
         for dataset in datasets:
@@ -73,7 +108,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
     }
 
 
-def _provenance(store: Store, manifest: str, written_s: int, key: str) -> dict[str, Any] | None:
+def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Provenance | None:
     """Return how a manifest was made, which was written at its path at ``written_s``, or None if no record states it.
 
     ``key`` names the run that made it or what it was labelled in, if its root states that: then no other record is read.
@@ -82,16 +117,17 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> dict[s
     for record in records.naming(store, manifest, written_s) if of_run is None else [of_run]:
         file = record["result"]["files"].get(manifest_of.NAME)
         if file is not None and file["digest"] == manifest:
-            return dict(record["provenance"])
+            return record["provenance"]
     return None
 
 
-def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[str] | None:
+def _changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None:
     """Return in words what is other than in the run before; None if there was none."""
-    if root is None or root.get("previous") is None:
+    previous = None if root is None else root.get("previous")
+    if previous is None:
         return None
     try:
-        before = manifest_of.stored(store, root["previous"], "the manifest before")
+        before = manifest_of.stored(store, previous, "the manifest before")
     except StorageError:
         raise
     except TacpipeError:
@@ -129,7 +165,9 @@ def _alike(before: Manifest, now: Manifest) -> bool:
     return before.files == now.files and all(old == new for _, old, new in entries)
 
 
-def _input_changes(store: Store, argument: str, before: list[dict[str, str]], now: list[dict[str, str]]) -> list[str]:
+def _input_changes(
+    store: Store, argument: str, before: Sequence[InputDataset], now: Sequence[InputDataset]
+) -> list[str]:
     if [dataset["dataset"] for dataset in before] == [dataset["dataset"] for dataset in now]:
         return []
     try:
@@ -148,31 +186,33 @@ def _input_changes(store: Store, argument: str, before: list[dict[str, str]], no
     return [*lines, *_compared(f"inputs.{argument}.files", *files)]
 
 
-def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, Entry]:
+def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, RecordingEntry]:
     if len(manifests) == 1:
         return manifests[0].recordings
     return {name: entry for manifest in manifests for name, entry in manifest.recordings.items()}
 
 
-def _recordings_compared(subject: str, before: Mapping[str, Entry], now: Mapping[str, Entry]) -> list[str]:
+def _recordings_compared(
+    subject: str, before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
+) -> list[str]:
     """Describe in which recordings two datasets differ; recordings in shared pages are equal."""
     new: list[str] = []
     removed: list[str] = []
-    changed: dict[str, list[str]] = {"shards": [], "attributes": []}
+    shards: list[str] = []
+    attributes: list[str] = []
     for name, old, entry in pages.compared(*pages.differing(before, now)):
         if old is None or entry is None:
             (new if old is None else removed).append(name)
             continue
-        for part, names in changed.items():
-            names += [name] if old[part] != entry[part] else []
-    shards = {"new": new, "gone": removed, "other": changed["shards"]}
+        shards += [name] if old["shards"] != entry["shards"] else []
+        attributes += [name] if old["attributes"] != entry["attributes"] else []
     return [
-        *_counted(f"{subject}.shards", shards),
-        *_counted(f"{subject}.attributes", {"other": changed["attributes"]}),
+        *_counted(f"{subject}.shards", {"new": new, "gone": removed, "other": shards}),
+        *_counted(f"{subject}.attributes", {"other": attributes}),
     ]
 
 
-def _compared(subject: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def _compared(subject: str, before: Mapping[str, V], now: Mapping[str, V]) -> list[str]:
     groups = {
         "new": sorted(set(now) - set(before)),
         "gone": sorted(set(before) - set(now)),
@@ -185,14 +225,14 @@ def _counted(subject: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"{subject}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
 
 
-def to_text(tree: dict[str, Any]) -> str:
+def to_text(tree: LineageNode) -> str:
     """Return the tree as indented lines, after the changes."""
     lines = []
-    if tree["changes"] is None:
+    changes, provenance = tree.get("changes"), tree.get("provenance")
+    if changes is None:
         lines.append("First run here: there is nothing to compare with.")
     else:
-        lines.append("Against the last run: " + ("; ".join(tree["changes"]) or "nothing changed."))
-    provenance = tree["provenance"]
+        lines.append("Against the last run: " + ("; ".join(changes) or "nothing changed."))
     if provenance:
         libraries = ", ".join(f"{name} {version}" for name, version in provenance["libraries"].items())
         commit = f" at commit {provenance['git_commit'][:10]}" if provenance["git_commit"] else ""
@@ -200,7 +240,7 @@ def to_text(tree: dict[str, Any]) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
-def _nested(value: Any) -> Mapping[str, Any] | None:
+def _nested(value: Any) -> Values | None:
     """Return a param that has parts, such as a layout, which is stored as JSON; None for a plain value."""
     if isinstance(value, str) and value.startswith("{"):
         try:
@@ -210,12 +250,12 @@ def _nested(value: Any) -> Mapping[str, Any] | None:
     return value if isinstance(value, Mapping) else None
 
 
-def _rows(value: Any) -> list[Mapping[str, Any]]:
+def _rows(value: Any) -> list[Values]:
     """Return the rows of a list of mappings; nothing for any other value."""
     return value if isinstance(value, list) and all(isinstance(row, Mapping) for row in value) else []
 
 
-def _leaves(params: Mapping[str, Any]) -> dict[str, Any]:
+def _leaves(params: Values) -> Values:
     """Return plain values by dotted name.
 
     >>> _leaves({"gap_ms": 50, "layout": '{"time": {"unit": "ns"}, "columns": [{"match": "x"}]}'})
@@ -228,7 +268,7 @@ def _leaves(params: Mapping[str, Any]) -> dict[str, Any]:
     return leaves
 
 
-def _nested_lines(name: str, tree: Mapping[str, Any]) -> list[str]:
+def _nested_lines(name: str, tree: Values) -> list[str]:
     """Return the lines of a param with parts: plain values on one line, lists of columns as a table.
 
     >>> _nested_lines("layout", {"unit": "ns", "columns": [{"match": "x", "unit": "N"}, {"match": "dx"}]})
@@ -247,7 +287,7 @@ def _nested_lines(name: str, tree: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _files(node: dict[str, Any]) -> str:
+def _files(node: LineageNode) -> str:
     """Return the names of a few files, or how many there are with the first of them."""
     names = list(node["files"])
     if len(names) <= _SHOWN:
@@ -255,7 +295,7 @@ def _files(node: dict[str, Any]) -> str:
     return f"{len(names)} files, {node['files_bytes'] / 1e6:.1f} MB: {listed(names, _SHOWN)}"
 
 
-def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str = "") -> list[str]:
+def _lines(node: LineageNode | LostNode, depth: int, described: set[str], argument: str = "") -> list[str]:
     """Return the lines of a node and its ancestors; nodes already ``described`` are only named."""
     pad = "  " * depth
     label = f"{argument}: " if argument else ""
@@ -295,11 +335,11 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
     return lines
 
 
-def identities_of_manifests(store: Store) -> dict[str, Mapping[str, Any]]:
+def identities_of_manifests(store: Store) -> dict[str, RunIdentity]:
     """Return the identity of each recorded run by the digest of the manifest that the run wrote."""
-    identities: dict[str, Mapping[str, Any]] = {}
+    identities: dict[str, RunIdentity] = {}
     for _, record in store.records():
-        file = record["result"]["files"].get(manifest_of.NAME)
-        if file is not None:
-            identities[file["digest"]] = record["identity"]
+        identity, file = record["identity"], record["result"]["files"].get(manifest_of.NAME)
+        if file is not None and "run" in identity:
+            identities[file["digest"]] = identity
     return identities

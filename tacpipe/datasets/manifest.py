@@ -7,19 +7,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict, TypeVar
 
 from tacpipe.datasets import pages as pages_of
 from tacpipe.datasets import paths
-from tacpipe.datasets.pages import Item, ObjectReader, Page, PageReader, Pages, StoredPages
+from tacpipe.datasets.pages import Item, ObjectReader, Page, PageJson, PageReader, Pages, StoredPages
 from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.io import files as files_of
 from tacpipe.io import regular
 from tacpipe.io.files import unread
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
-from tacpipe.plugins.stage import Attribute
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import excerpt, plain
+from tacpipe.store.records import Content, RecordingEntry, Step
 from tacpipe.store.store import Object, Store
 
 FORMAT, PAGED_FORMAT = 1, 2  # 1: the manifest holds its recordings; 2: it lists pages of them
@@ -27,10 +28,35 @@ NAME = MANIFEST
 VALUES = "{values}"  # Name for the digest of a source's other values, such as labels
 EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
-Entry = pages_of.Entry
+V = TypeVar("V")
 _REMEMBERED = 3
 _PER_RECORDING = ("recordings", "labels", "sources")  # fields that pages hold
 _parsed: dict[tuple[str, str], Manifest] = {}  # keys: digest, place of pages; the last verified ones
+
+
+class InputDataset(TypedDict):
+    """A dataset that a stage read."""
+
+    dataset: str  # digest of its content
+    manifest: str  # digest of its manifest
+
+
+class ManifestJson(TypedDict):
+    """A manifest as ``manifest.json`` states it; the fields are those of `Manifest`."""
+
+    format: int
+    digest: str
+    stage: str
+    version: int
+    params: Values
+    inputs: dict[str, list[InputDataset]]
+    chain: list[Step]
+    recordings: NotRequired[dict[str, RecordingEntry]]
+    pages: NotRequired[list[PageJson]]  # instead of recordings, labels and sources
+    files: dict[str, Content]
+    skipped: dict[str, str]
+    sources: NotRequired[dict[str, Mapping[str, str]]]
+    labels: NotRequired[dict[str, Mapping[str, Attribute]]]
 
 
 @dataclass(frozen=True)
@@ -39,13 +65,13 @@ class Manifest:
 
     stage: str
     version: int
-    params: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Any] = field(default_factory=dict)
-    chain: Sequence[Mapping[str, Any]] = ()
-    recordings: Mapping[str, Entry] = field(default_factory=dict)
-    files: Mapping[str, Any] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
-    sources: Mapping[str, Any] = field(default_factory=dict)
+    params: Values = field(default_factory=dict)
+    inputs: Mapping[str, Sequence[InputDataset]] = field(default_factory=dict)  # by name of the argument
+    chain: Sequence[Step] = ()
+    recordings: Mapping[str, RecordingEntry] = field(default_factory=dict)
+    files: Mapping[str, Content] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons by name of recording
+    sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # digests of raw files by recording
     labels: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @cached_property
@@ -114,7 +140,7 @@ class Manifest:
         return self.recorded or self.exported
 
     @cached_property
-    def included(self) -> Mapping[str, Entry]:
+    def included(self) -> Mapping[str, RecordingEntry]:
         """The recordings that nobody excluded."""
         excluded = self.excluded
         if not excluded:
@@ -127,7 +153,7 @@ class Manifest:
     def excluded(self) -> Mapping[str, Attribute]:
         """Reasons for exclusion by name of recording."""
         recordings = self.recordings
-        parts: Iterable[Mapping[str, Entry]] = [recordings]
+        parts: Iterable[Mapping[str, RecordingEntry]] = [recordings]
         if isinstance(recordings, pages_of.Recordings):
             pages = recordings.pages
             parts = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
@@ -136,24 +162,20 @@ class Manifest:
 
     def with_recordings(self, items: Mapping[str, Item | None]) -> Manifest:
         """Return the manifest with recordings added or replaced; None leaves one out."""
-        recordings: Mapping[str, Entry]
-        sources: Mapping[str, Any]
-        labels: Mapping[str, Any]
         if isinstance(self.recordings, pages_of.Recordings) and self.pages is not None:
             pages = self.pages.changed(items)
-            recordings = pages_of.Recordings(pages)
-            sources, labels = pages_of.SourceDigests(pages), pages_of.Labels(pages)
-        else:
-            fields: list[dict[str, Any]] = [{**self.recordings}, {**self.sources}, {**self.labels}]
-            for name, item in items.items():
-                values = (None, None, None) if item is None else (item.entry, item.sources, item.labels)
-                for field_values, value in zip(fields, values, strict=True):
-                    if value is not None:
-                        field_values[name] = value
-                    else:
-                        field_values.pop(name, None)
-            recordings, sources, labels = (dict(sorted(field_values.items())) for field_values in fields)
-        return replace(self, recordings=recordings, sources=sources, labels=labels)
+            return replace(
+                self,
+                recordings=pages_of.Recordings(pages),
+                sources=pages_of.SourceDigests(pages),
+                labels=pages_of.Labels(pages),
+            )
+        return replace(
+            self,
+            recordings=_changed(self.recordings, {name: item and item.entry for name, item in items.items()}),
+            sources=_changed(self.sources, {name: item and item.sources for name, item in items.items()}),
+            labels=_changed(self.labels, {name: item and item.labels for name, item in items.items()}),
+        )
 
     def item(self, name: str) -> Item:
         """Return a recording with its labels and raw files."""
@@ -212,11 +234,10 @@ class Manifest:
             reached |= {page.digest, *walked.get(page.digest, ())}
         return reached
 
-    def at(self, path: str) -> Mapping[str, Any] | None:
+    def at(self, path: str) -> Content | None:
         """Return digest and size of the page, shard or file at ``path``, or None if there is none."""
         if path in self.files:
-            file: Mapping[str, Any] = self.files[path]
-            return file
+            return self.files[path]
         if self.pages is not None and path.startswith(pages_of.PAGE):
             page = next((page for page in self.pages.pages if page.path == path), None)
             if page is not None:
@@ -248,12 +269,17 @@ class Manifest:
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
 
-def _same_pages(view: Mapping[str, Any], pages: Pages, count: str) -> bool:
+def _changed(before: Mapping[str, V], changes: Mapping[str, V | None]) -> dict[str, V]:
+    """Return values by name, in the order of names, with some added or replaced; None leaves one out."""
+    return {name: value for name, value in sorted({**before, **changes}.items()) if value is not None}
+
+
+def _same_pages(view: Mapping[str, Mapping[str, Attribute]], pages: Pages, count: str) -> bool:
     """Return whether labels or sources are those that pages hold."""
     return getattr(view, "pages", None) is pages or (not view and not pages.total(count))
 
 
-def _indented(value: Mapping[str, Any]) -> str:
+def _indented(value: Values) -> str:
     return json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 

@@ -86,7 +86,7 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     return content
 
 
-def to_json(tree: Mapping[str, Any]) -> bytes:
+def to_json(tree: Mapping[str, object]) -> bytes:
     r"""Return the text of a JSON file of a model or a result: keys sorted, one per line.
 
     >>> to_json({"b": [1], "a": None})

@@ -11,10 +11,10 @@ import json
 import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, NotRequired, Protocol, TypedDict, TypeVar, cast
 
 from tacpipe.datasets import paths
 from tacpipe.errors import DamagedError, TacpipeError
@@ -23,9 +23,10 @@ from tacpipe.io.hashing import DIGEST, Written, bytes_digest, canonical, digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.store.location import locate, opened
+from tacpipe.store.records import Content, RecordingEntry, Shard
 from tacpipe.store.store import MissingError, Store
 
-Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+V = TypeVar("V", bound=Mapping[str, Any])
 INLINE = 1000  # recordings up to which a manifest holds them itself
 GROUPED = 256  # recordings per page, in the mean
 PAGE = "page-"  # begins the name of every page's file in the directory of a dataset
@@ -33,16 +34,36 @@ BEGINS = b'{"labels":'  # begins the object of every page
 EXCLUDED = "excluded"  # the attribute of recordings that stages leave out
 _PARSED = 256  # pages that stay parsed: some 80 MB
 _WRITTEN_BYTES = 1 << 25  # JSON of a key that is kept
-_COUNTS = ("bytes", "recordings", "rows", "shard_bytes", "labelled", "sourced", "excluded")
+_OPTIONAL: tuple[Literal["labelled", "sourced", "excluded"], ...] = (
+    "labelled",
+    "sourced",
+    "excluded",
+)  # counts, often 0
+_COUNTS = ("bytes", "recordings", "rows", "shard_bytes", *_OPTIONAL)
 _ATTRIBUTES = frozenset((str, int, float, bool, type(None)))
 
 
 class Item(NamedTuple):
     """A recording of a dataset: its entry, the labels that were set by hand, and the digests of its raw files by name."""
 
-    entry: Entry
+    entry: RecordingEntry
     labels: Mapping[str, Attribute] | None = None
     sources: Mapping[str, str] | None = None
+
+
+class PageJson(TypedDict):
+    """A page as a root states it; the fields are those of `Page`."""
+
+    first: str
+    digest: str
+    bytes: int
+    content: str
+    recordings: int
+    rows: int
+    shard_bytes: int
+    labelled: NotRequired[int]
+    sourced: NotRequired[int]
+    excluded: NotRequired[int]
 
 
 @dataclass(frozen=True)
@@ -61,7 +82,7 @@ class Page:
     excluded: int = 0
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Page:
+    def from_json(cls, value: PageJson) -> Page:
         """Return a page from a root. Raises `ValueError`, `TypeError` or `KeyError` for what no root holds."""
         page = cls(**value)
         if type(page.first) is not str or page.recordings < 1:
@@ -74,10 +95,13 @@ class Page:
                 raise ValueError(f"{str(count)[:80]!r} is not a count")
         return page
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> PageJson:
         """Return the page as a root states it, without counts that are 0."""
-        optional = {field.name for field in fields(self) if field.default == 0}
-        return {name: value for name, value in asdict(self).items() if value or name not in optional}
+        value = cast("PageJson", asdict(self))
+        for name in _OPTIONAL:
+            if not value[name]:
+                del value[name]
+        return value
 
     @property
     def path(self) -> str:
@@ -89,7 +113,7 @@ class Page:
 class PageContent:
     """The recordings of a page, in the order of names, with hand-set labels and raw files of those that have them."""
 
-    recordings: dict[str, Entry]
+    recordings: dict[str, RecordingEntry]
     labels: dict[str, Mapping[str, Attribute]]
     sources: dict[str, Mapping[str, str]]
 
@@ -369,7 +393,7 @@ class Pages:
                 store.put(self.object(page), durable=durable)
 
 
-class _View(Mapping[str, Any]):
+class _View(Mapping[str, V]):
     """A part of what pages hold of recordings, by name."""
 
     part: str  # field of `PageContent`
@@ -378,13 +402,14 @@ class _View(Mapping[str, Any]):
     def __init__(self, pages: Pages) -> None:
         self.pages = pages
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> V:
         if not self.pages.pages:
             raise KeyError(name)
         number = self.pages.number(name)
         if not getattr(self.pages.pages[number], self.count):
             raise KeyError(name)
-        return getattr(self.pages.load(number), self.part)[name]
+        part: Mapping[str, V] = getattr(self.pages.load(number), self.part)
+        return part[name]
 
     def __iter__(self) -> Iterator[str]:
         for part in self.parts():
@@ -396,26 +421,26 @@ class _View(Mapping[str, Any]):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.pages,)
 
-    def parts(self) -> Iterator[Mapping[str, Any]]:
+    def parts(self) -> Iterator[Mapping[str, V]]:
         """Yield the content page by page."""
         for number, page in enumerate(self.pages.pages):
             if getattr(page, self.count):
                 yield getattr(self.pages.load(number), self.part)
 
 
-class Recordings(_View):
+class Recordings(_View[RecordingEntry]):
     """The recordings of a dataset in pages."""
 
     part, count = "recordings", "recordings"
 
 
-class Labels(_View):
+class Labels(_View[Mapping[str, Attribute]]):
     """The labels set by hand on recordings of a dataset in pages."""
 
     part, count = "labels", "labelled"
 
 
-class SourceDigests(_View):
+class SourceDigests(_View[Mapping[str, str]]):
     """The digests of the raw files of recordings of a dataset in pages."""
 
     part, count = "sources", "sourced"
@@ -429,10 +454,10 @@ class KeyRecordings(Recordings, Written):
         self._json_by_page: dict[int, bytes] = {}  # JSON by number of the page, up to `_WRITTEN_BYTES`
         self._written_bytes = 0
 
-    def __getitem__(self, name: str) -> Entry:
+    def __getitem__(self, name: str) -> RecordingEntry:
         return key_entry(super().__getitem__(name))
 
-    def parts(self) -> Iterator[Mapping[str, Entry]]:
+    def parts(self) -> Iterator[Mapping[str, RecordingEntry]]:
         """Yield the recordings page by page."""
         for part in super().parts():
             yield {name: key_entry(entry) for name, entry in part.items()}
@@ -456,7 +481,7 @@ class RecordGroup(NamedTuple):
     """Recordings that follow each other in the order of names, whose results have one record together."""
 
     page: str  # digest of the page that holds exactly these, or empty if recordings are not in pages
-    entries: Callable[[], Mapping[str, Entry]]
+    entries: Callable[[], Mapping[str, RecordingEntry]]
 
 
 def begins(name: str) -> bool:
@@ -485,7 +510,7 @@ def group_names(names: Iterable[str]) -> Iterator[list[str]]:
         yield group
 
 
-def groups(recordings: Mapping[str, Entry]) -> Iterator[RecordGroup]:
+def groups(recordings: Mapping[str, RecordingEntry]) -> Iterator[RecordGroup]:
     """Yield the groups of recordings; of a dataset in pages none is read yet."""
     if isinstance(recordings, Recordings):
         pages = recordings.pages
@@ -496,7 +521,7 @@ def groups(recordings: Mapping[str, Entry]) -> Iterator[RecordGroup]:
         yield RecordGroup("", lambda names=names: {name: recordings[name] for name in names})  # type: ignore[misc]
 
 
-def parts(recordings: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def parts(recordings: Mapping[str, V]) -> Iterator[Mapping[str, V]]:
     """Yield what is known of recordings by name: a page at a time, or all at once where they are not in pages."""
     if isinstance(recordings, _View):
         yield from recordings.parts()
@@ -504,14 +529,16 @@ def parts(recordings: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         yield recordings
 
 
-def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def differing(before: Mapping[str, V], now: Mapping[str, V]) -> tuple[Mapping[str, V], Mapping[str, V]]:
     """Return what is known of those recordings of two datasets that are not on a page which both have."""
     if isinstance(before, _View) and isinstance(now, _View):
         return type(before)(before.pages.differing(now.pages)), type(now)(now.pages.differing(before.pages))
     return before, now
 
 
-def compared(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
+def compared(
+    before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
+) -> Iterator[tuple[str, RecordingEntry | None, RecordingEntry | None]]:
     """Yield name, entry before and entry now of all recordings of two datasets, in the order of names."""
     before_items, now_items = (iter(_in_order(recordings)) for recordings in (before, now))
     old, new = next(before_items, None), next(now_items, None)
@@ -528,11 +555,18 @@ def compared(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[
             old, new = next(before_items, None), next(now_items, None)
 
 
-def _in_order(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
+def _in_order(recordings: Mapping[str, RecordingEntry]) -> Iterator[tuple[str, RecordingEntry]]:
     return ((name, entry) for part in parts(recordings) for name, entry in sorted(part.items()))
 
 
-def described(recordings: Mapping[str, Entry]) -> dict[str, Any]:
+class DescribedEntry(TypedDict):
+    """The part of a recording that the digest of a dataset is made of."""
+
+    attributes: Mapping[str, Attribute]
+    shards: dict[str, str]  # digest by stream
+
+
+def described(recordings: Mapping[str, RecordingEntry]) -> dict[str, DescribedEntry]:
     """Return the part of recordings that the digest of a dataset is made of."""
     return {
         name: {
@@ -543,13 +577,13 @@ def described(recordings: Mapping[str, Entry]) -> dict[str, Any]:
     }
 
 
-def key_entry(entry: Entry) -> Entry:
+def key_entry(entry: RecordingEntry) -> RecordingEntry:
     """Return the part of a recording that a key holds: attributes, and the digests of streams."""
-    shards = {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()}
+    shards: dict[str, Shard] = {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()}
     return {"attributes": entry["attributes"], "shards": shards}
 
 
-def check_entries(recordings: Mapping[str, Entry]) -> list[str]:
+def check_entries(recordings: Mapping[str, RecordingEntry]) -> list[str]:
     """Return the paths of all shards. Raises `ValueError`, `TypeError` or `KeyError` for an entry that none can be."""
     for entry in recordings.values():
         if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
@@ -562,13 +596,13 @@ def check_entries(recordings: Mapping[str, Entry]) -> list[str]:
     return places
 
 
-def _refuse_attributes(attributes: Mapping[str, Any]) -> None:
+def _refuse_attributes(attributes: Mapping[str, Attribute]) -> None:
     for name, value in attributes.items():
         if not isinstance(value, str | int | float | None):
             raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
 
 
-def check_contents(contents: Iterable[Mapping[str, Any]]) -> None:
+def check_contents(contents: Iterable[Content]) -> None:
     """Raise `ValueError`, `TypeError` or `KeyError` if shards or files have no digest, or no size in bytes."""
     contents = list(contents)
     check_counts([content["bytes"] for content in contents])

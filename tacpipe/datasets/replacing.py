@@ -25,6 +25,7 @@ from tacpipe.datasets.paths import folded_name
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import files, regular
 from tacpipe.io.hashing import digest
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import listed, plain
 from tacpipe.store import layout
 from tacpipe.store.store import Store
@@ -51,8 +52,8 @@ class ResultPlan:
 
     stage: str
     version: int
-    params: Mapping[str, Any] = field(default_factory=dict)
-    sources: Mapping[str, Any] = field(default_factory=dict)  # Sources of ingest: recording to file to digest
+    params: Values = field(default_factory=dict)
+    sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # Digests of raw files by recording
 
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
@@ -169,7 +170,7 @@ def _is_gone(name: str, before: Manifest, after: Manifest) -> bool:
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
 
 
-def _raw(source: Mapping[str, Any]) -> dict[str, Any]:
+def _raw(source: Mapping[str, str]) -> dict[str, str]:
     """Return the digests of a recording's raw files, without the digest of its labels."""
     return {file: digest for file, digest in source.items() if file != VALUES}
 
@@ -266,7 +267,7 @@ def appended(before: Manifest, ingested: Manifest) -> Manifest:
 
 def returning_labels(
     store: Store, output: Path, before: Manifest | None, result: Manifest
-) -> dict[str, Mapping[str, Any]]:
+) -> dict[str, Mapping[str, Attribute]]:
     """Return the hand-set labels of recordings that return to ``output``: they were there earlier, but not in ``before``.
 
     A recording returns if it has the same content or raw files; it gets the labels that it had last.
@@ -281,7 +282,7 @@ def returning_labels(
         return {}
     # The successor of a manifest that is not lasting holds the same recordings
     names = [root["manifest"], *(version["manifest"] for version in root.get("history", []) if version["lasting"])]
-    labels: dict[str, Mapping[str, Any]] = {}
+    labels: dict[str, Mapping[str, Attribute]] = {}
     for name in names if before is None else [name for name in names if name != before.content_digest]:
         try:
             former_manifest = manifest_of.stored(store, name, "the stored manifest")
@@ -329,5 +330,5 @@ def _described(manifest: Manifest) -> str:
     return f"{recordings} written by {manifest.stage}{labels}"
 
 
-def _params(params: Mapping[str, Any]) -> str:
+def _params(params: Values) -> str:
     return ", ".join(f"{name} {value}" for name, value in params.items()) or "no params"

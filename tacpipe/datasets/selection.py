@@ -11,10 +11,11 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.streams import TRUTH
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain, suggestion
+from tacpipe.store.records import Content, RecordingEntry, Step
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Wanted
@@ -27,8 +28,7 @@ def split_digest(manifest: Manifest, place: str) -> str:
     """Return the digest of the table of a split. Raises `UsageError`, which names ``place``, for any other dataset."""
     if set(manifest.recordings) != {_RECORDING}:
         raise UsageError(f"{place} is not a split; make one with `tacpipe split`.")
-    shard_digest: str = manifest.recordings[_RECORDING]["shards"][""]["digest"]
-    return shard_digest
+    return manifest.recordings[_RECORDING]["shards"][""]["digest"]
 
 
 def read_roles(content: bytes) -> dict[tuple[str, int], str]:
@@ -169,8 +169,8 @@ def merge_manifests(manifests: Sequence[Manifest]) -> Manifest:
     """
     if len(manifests) == 1:
         return manifests[0]
-    recordings: dict[str, Entry] = {}
-    files: dict[str, Any] = {}
+    recordings: dict[str, RecordingEntry] = {}
+    files: dict[str, Content] = {}
     for manifest in manifests:
         shared = next((name for name in manifest.recordings if name in recordings), None)
         if shared is not None:
@@ -188,7 +188,7 @@ def merge_manifests(manifests: Sequence[Manifest]) -> Manifest:
     return Manifest(first.stage, first.version, first.params, {}, first.chain, recordings, files)
 
 
-def chain_difference(expected: Sequence[Mapping[str, Any]], chain: Sequence[Mapping[str, Any]]) -> str:
+def chain_difference(expected: Sequence[Step], chain: Sequence[Step]) -> str:
     """Describe the first difference between two chains of stages.
 
     >>> step = {"stage": "synchronize", "version": 1, "params": {"rate_hz": 50.0}, "fitted": None}

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -146,7 +146,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         lengths = f"context={self.context}, horizon={self.horizon}, stride={self.stride}"
         return f"Windows of {len(self._names)} recordings ({lengths}, {self.dtype})"
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> object:
         return {**vars(self), "_cache": OrderedDict()}
 
     @property

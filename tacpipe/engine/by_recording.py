@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from tacpipe.datasets import pages, selection
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.local import ChosenExecutor
@@ -23,17 +22,18 @@ from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.plugins import registry
 from tacpipe.store import records
 from tacpipe.store.location import locate
+from tacpipe.store.records import ComputedResult, GroupIdentity, RecordingEntry, Step, StoredResult
 from tacpipe.store.store import Store
 
-Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
+Answer = Mapping[str, RecordingEntry] | pages.Pages  # results of a group of recordings
 
 
 @dataclass(frozen=True)
 class _RecordingGroup:
     """A group of recordings, and the identity whose digest is its key."""
 
-    identity: Mapping[str, Any]
-    entries: Mapping[str, Entry]
+    identity: GroupIdentity
+    entries: Mapping[str, RecordingEntry]
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ByRecording:
     chosen: ChosenExecutor
     previous: Previous | None = None  # Earlier run whose unchanged results are reused
 
-    def run_step(self, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> Mapping[str, Entry]:
+    def run_step(self, source: Manifest, step: Step, dataset_dirs: tuple[str, ...]) -> Mapping[str, RecordingEntry]:
         """Return the result of a map stage, one link of a chain, for each recording of ``source``; raises as `run`.
 
         Each group of recordings has a record in addition to the records of its recordings. If one recording changed,
@@ -56,7 +56,7 @@ class ByRecording:
         entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
         answered: list[Answer | _RecordingGroup] = []
         missing: list[WorkerTask] = []
-        stored: dict[str, Mapping[str, Any]] = {}  # records of incomplete groups, by recording
+        stored: dict[str, ComputedResult] = {}  # records of incomplete groups, by recording
         reusable = None if self.previous is None else self.previous.reusable(entries, step)
         reusable_pages: Mapping[str, pages.Pages] = {}
         if reusable is not None:
@@ -67,7 +67,7 @@ class ByRecording:
             self.store.expect(digest(keys.of_group(step, stage, group.entries())) for group in pages.groups(entries))
         is_paged = len(entries) > pages.INLINE
 
-        def answer(results: Mapping[str, Entry]) -> Answer:
+        def answer(results: Mapping[str, RecordingEntry]) -> Answer:
             return (
                 pages.Pages.from_items((recording, Item(entry)) for recording, entry in results.items())
                 if is_paged
@@ -108,17 +108,16 @@ class ByRecording:
             return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
         return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
 
-    def _of_group(self, group: _RecordingGroup) -> Mapping[str, Entry] | None:
+    def _of_group(self, group: _RecordingGroup) -> Mapping[str, RecordingEntry] | None:
         """Return the entries in a group's record, or None if there is no record or an object is missing."""
         record = self.store.record(digest(group.identity))
         if record is None or not records.complete(self.store, record):
             return None
         self.outcome.reused += len(group.entries)
-        self.outcome.add_group(record["provenance"])
-        entries: Mapping[str, Entry] = record["result"]["recordings"]
-        return entries
+        self.outcome.add_group(records.summary(record))
+        return record["result"]["recordings"]
 
-    def run(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Entry]:
+    def run(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, RecordingEntry]:
         """Return the result of each task of stage ``name`` as an entry, by recording.
 
         Raises `TacpipeError` if recordings could not be read, and `WouldChangeError` if ``--check`` is set and the
@@ -128,21 +127,21 @@ class ByRecording:
             {recording: result["recordings"][""] for recording, result in self.results(name, tasks).items()}, {}
         )
 
-    def results(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Mapping[str, Any]]:
+    def results(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, StoredResult]:
         """Return the ``result`` in each task's record, by recording. Raises the errors of `run`."""
         return {recording: record["result"] for recording, record in self._records(name, tasks).items()}
 
     def _reruns(self, name: str) -> bool:
         return self.request.rerun and registry.stage_name(name) == self.request.name
 
-    def _records(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, Mapping[str, Any]]:
+    def _records(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, ComputedResult]:
         """Return the record of each task, by recording."""
         stored, missing = self._stored(name, tasks)
         return self._computed(name, missing, stored, len(tasks))
 
-    def _stored(self, name: str, tasks: Sequence[WorkerTask]) -> tuple[dict[str, Mapping[str, Any]], list[WorkerTask]]:
+    def _stored(self, name: str, tasks: Sequence[WorkerTask]) -> tuple[dict[str, ComputedResult], list[WorkerTask]]:
         """Return the stored records by recording, and the tasks that must be computed."""
-        stored: dict[str, Mapping[str, Any]] = {}
+        stored: dict[str, ComputedResult] = {}
         missing: list[WorkerTask] = []
         rerun = self._reruns(name)
         self.store.expect(digest(task.identity) for task in tasks)
@@ -159,8 +158,8 @@ class ByRecording:
         return stored, missing
 
     def _computed(
-        self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]], count: int
-    ) -> dict[str, Mapping[str, Any]]:
+        self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, ComputedResult], count: int
+    ) -> dict[str, ComputedResult]:
         """Compute the ``missing`` tasks and return their records with the ``stored`` ones; ``count`` is the total."""
         if missing and self.request.check:
             raise WouldChangeError(f"{registry.stage_name(name)} would run for {len(missing)} of {count} recordings.")
@@ -171,15 +170,15 @@ class ByRecording:
         return complete
 
     def _remember_group(
-        self, name: str, group: _RecordingGroup, records_by_name: Mapping[str, Mapping[str, Any]]
-    ) -> dict[str, Entry]:
+        self, name: str, group: _RecordingGroup, records_by_name: Mapping[str, ComputedResult]
+    ) -> dict[str, RecordingEntry]:
         """Return the entries of a group's recordings. If the group is complete, store them under its key."""
         result = {recording: record["result"]["recordings"][""] for recording, record in records_by_name.items()}
         if self.store.run and len(group.entries) > 1 and len(records_by_name) == len(group.entries):
             summary = Outcome(self.outcome.output)
             for recording, record in records_by_name.items():
                 summary.add_record(name, recording, record)
-            made_by = {**provenance.describe_provenance(0.0), **summary.of_results()}
+            made_by = provenance.describe_run(summary.of_results())
             self.store.commit(group.identity, {"recordings": result, "files": {}}, made_by, replace=True)
         return result
 
@@ -211,10 +210,10 @@ class ByRecording:
         return source
 
     def _compute(
-        self, name: str, tasks: Sequence[WorkerTask], stored: Mapping[str, Mapping[str, Any]]
-    ) -> dict[str, Mapping[str, Any]]:
+        self, name: str, tasks: Sequence[WorkerTask], stored: Mapping[str, ComputedResult]
+    ) -> dict[str, ComputedResult]:
         """Compute tasks and return their records. With ``--recompute-and-compare``, compare them with ``stored``."""
-        computed: dict[str, Mapping[str, Any]] = {}
+        computed: dict[str, ComputedResult] = {}
         if not tasks:
             return computed
         bad: dict[str, Done] = {}
@@ -233,7 +232,11 @@ class ByRecording:
                 made_by = result.record["provenance"]
                 computed[result.recording] = {  # only the necessary fields, because there may be a million
                     "result": result.record["result"],
-                    "provenance": {name: made_by[name] for name in ("notes", "code", "packages") if name in made_by},
+                    "provenance": {
+                        "notes": made_by.get("notes", []),
+                        "code": made_by.get("code"),
+                        "packages": made_by.get("packages", {}),
+                    },
                 }
                 if self.request.compare and result.recording in stored:
                     self.outcome.compare(stored[result.recording], result.record, result.recording)
@@ -263,7 +266,7 @@ class ByRecording:
         )
 
 
-def _after(results: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[str, Entry]:
+def _after(results: Mapping[str, RecordingEntry], entries: Mapping[str, RecordingEntry]) -> dict[str, RecordingEntry]:
     """Return results ordered by name, each with the attributes of its entry in ``entries`` first."""
     return {
         name: {

@@ -16,11 +16,11 @@ from typing import Any
 
 from tacpipe.errors import UsageError
 from tacpipe.io import config_text, regular
+from tacpipe.plugins.stage import Values
 from tacpipe.printable import excerpt, listed, plain
 
 _FIELD = re.compile(r"(?<!\\)\$\{(?P<name>.*?)\}")
 _PART = re.compile(r"[^.\[\]]+")
-Values = Mapping[str, Any]
 
 
 def fill_template(value: Any, values: Values, place: str) -> Any:
@@ -45,7 +45,7 @@ def fill_template(value: Any, values: Values, place: str) -> Any:
     return text.replace(r"\${", "${")
 
 
-def expand(definition: Mapping[str, Any], values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
+def expand(definition: Values, values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
     """Yield the stages of a definition: the part of the name after ``@``, the template and its values.
 
     A definition without ``foreach`` and ``matrix`` is one stage with an empty part. Raises `UsageError` if ``foreach``
@@ -207,7 +207,7 @@ def _stages(file: Path) -> Iterator[ChainStage]:
             yield _stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
 
 
-def _check(content: Mapping[str, Any], schema: Mapping[str, Any], place: str) -> None:
+def _check(content: Values, schema: Values, place: str) -> None:
     """Raise `UsageError` for an unknown key in a part of the file, and for a value that does not match the schema."""
     for key, value in content.items():
         if key not in schema:
@@ -232,7 +232,7 @@ def _fits(value: Any, schema: Any) -> bool:
     return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
-def _stage(name: str, definition: Mapping[str, Any], values: Values, file: Path, place: str) -> ChainStage:
+def _stage(name: str, definition: Values, values: Values, file: Path, place: str) -> ChainStage:
     values = _values(file, definition.get("vars", []), values, place)
     used = {key: definition[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in definition}
     resolved = fill_template(used, values, place)
@@ -278,7 +278,7 @@ def _is_within(path: str, folder: str) -> bool:
 
 def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> Values:
     """Return the values available to texts: those of ``before``, overridden by those of ``vars``."""
-    values = dict(before)
+    values = before
     for entry in entries:
         if isinstance(entry, str) and entry.endswith((".yaml", ".yml")):
             entry = _mapping(file.with_name(entry))
@@ -288,7 +288,7 @@ def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> V
     return values
 
 
-def _merged(before: Values, over: Values) -> dict[str, Any]:
+def _merged(before: Values, over: Values) -> Values:
     merged = {
         key: _merged(before[key], value)
         if isinstance(value, Mapping) and isinstance(before.get(key), Mapping)
@@ -298,7 +298,7 @@ def _merged(before: Values, over: Values) -> dict[str, Any]:
     return {**before, **merged}
 
 
-def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
+def _mapping(file: Path, *, missing: bool = False) -> Values:
     """Return the contents of a YAML file; an empty mapping if the file does not exist and may be ``missing``."""
     try:
         value = config_text.load_yaml(regular.content(file, config_text.MAX_CHARACTERS))

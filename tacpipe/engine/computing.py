@@ -9,10 +9,10 @@ import contextlib
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.datasets.manifest import VALUES, Manifest
 from tacpipe.engine import execution, provenance
@@ -24,6 +24,7 @@ from tacpipe.plugins import registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.store import records
 from tacpipe.store.location import opened
+from tacpipe.store.records import Provenance, StoredResult
 from tacpipe.store.store import Store
 from tacpipe.training import devices
 
@@ -124,8 +125,8 @@ def _failed(task: WorkerTask, store: Store, error: TacpipeError) -> Done:
 class _Made:
     """A stage's result whose content is stored, before its record is written."""
 
-    result: Mapping[str, Any]
-    provenance: Mapping[str, Any]
+    result: StoredResult
+    provenance: Provenance
     replace: bool  # whether an existing record refers to missing objects
     durable: bool
 
@@ -170,17 +171,22 @@ def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Do
         stage = registry.load_step(task.name)
         code = provenance.code(stage)  # read first, because the file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
-    origin = {**provenance.describe_provenance(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-    origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
+    origin: Provenance = {
+        **provenance.describe_provenance(round(time.perf_counter() - started, 4)),
+        "irreplaceable": stage.source,
+        "code": code,
+        "packages": provenance.code_of_packages(task.identity, packages),
+        "notes": notes,
+    }
     if stage.source:  # until a dataset's manifest exists, only the record marks this as a recording
         _manifest_of(task, stage, result).keep(store, durable=True)
     return _Made(result, origin, replace, stage.source)
 
 
-def _manifest_of(task: WorkerTask, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
+def _manifest_of(task: WorkerTask, stage: AnyStage, result: StoredResult) -> Manifest:
     """Return a manifest with one recording that was read from published files."""
     (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
-    files, values = inputs[stage.argument("Files")], inputs.get(stage.argument("Values"))
+    files, values = inputs[stage.argument("Files") or ""], inputs.get(stage.argument("Values") or "")
     return Manifest(
         task.name,
         stage.version,

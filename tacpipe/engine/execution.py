@@ -18,7 +18,7 @@ from tacpipe.datasets.dataset import Dataset, Reader, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import provenance
-from tacpipe.engine.keys import WorkerTask
+from tacpipe.engine.keys import DatasetIdentity, RolesIdentity, WorkerTask
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_input_error
 from tacpipe.io import files, memory, regular
 from tacpipe.io.files import Draft, Hashed, move, present, write_whole
@@ -28,6 +28,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.location import opened
+from tacpipe.store.records import Provenance, RecordingEntry, Shard, StageIdentity, StoredResult
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
 
@@ -83,7 +84,7 @@ class ScratchStore:
 
 def execute(
     task: WorkerTask, store: Store, sink: Store | ScratchStore, *, followed: bool = True
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[StoredResult, list[str]]:
     """Call the stage for a task, put its content into ``sink``, and return the ``result`` of the record, and notes.
 
     With ``followed``, the progress of a training is reported to trackers and the display.
@@ -111,19 +112,19 @@ def _result(name: str, stage: AnyStage, returned: Any) -> Result:
     return Result(recordings={"": _recording(name, returned)}) if stage.mapped else _files(name, returned)
 
 
-def _stored(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
+def _stored(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> StoredResult:
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
-    files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
-    files |= {name: vars(sink.put_written(returned.written[name])) for name in sorted(returned.written)}
+    files = {name: sink.put(returned.files[name]).to_json() for name in sorted(returned.files)}
+    files |= {name: sink.put_written(returned.written[name]).to_json() for name in sorted(returned.written)}
     return {"recordings": recordings, "files": files}
 
 
-def differences(stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> list[str]:
+def differences(stored: StoredResult, recomputed: StoredResult, name: str) -> list[str]:
     """Return the paths of shards and files whose content differs. ``name`` is the recording of a map stage."""
 
-    def contents(result: Mapping[str, Any]) -> dict[str, str]:
+    def contents(result: StoredResult) -> dict[str, str]:
         shards = {
             shard_path(recording or name, stream): shard["digest"]
             for recording, entry in result["recordings"].items()
@@ -239,36 +240,34 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
 
 
 _remaking: set[str] = set()  # keys that this process is recomputing, possibly as inputs of one another
-_makers_by_object: dict[
-    str, dict[str, list[tuple[Any, Any]]]
-] = {}  # identities and provenance of the results with an object, by store and digest
+_Maker = tuple[StageIdentity, Provenance]
+_makers_by_object: dict[str, dict[str, list[_Maker]]] = {}  # makers of the results with an object, by store and digest
 
 
-def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
+def _makers(store: Store, name: str) -> list[_Maker]:
     """Return identity and provenance of the records that name an object. Reads all records once for many objects."""
     root = str(store.root)
     if name not in _makers_by_object.get(root, {}):
         _makers_by_object[root] = {}
         for _, record in store.records():
-            if "stage" in record["identity"]:
+            identity = record["identity"]
+            if "stage" in identity:
                 for object_name in set(records.digests(record["result"])):
-                    _makers_by_object[root].setdefault(object_name, []).append(
-                        (record["identity"], record["provenance"])
-                    )
+                    _makers_by_object[root].setdefault(object_name, []).append((identity, record["provenance"]))
     return _makers_by_object[root].get(name, [])
 
 
 @contextmanager
-def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict[str, Any]]:
+def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict[str, object]]:
     """Yield the stage's arguments by name, prepared from the identity."""
     read = reader(store, task.dataset_dirs)
     inputs = task.identity["inputs"]
-    arguments: dict[str, Any] = {}
+    arguments: dict[str, object] = {}
     for name, kind in stage.arguments.items():
         if kind == "Recording":
             arguments[name] = Recording(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model", "Parts"):
-            store.fetch(_digests(inputs[name] or {}))
+            store.fetch(_digests(inputs[name]) if inputs[name] is not None else ())
             arguments[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
             store.fetch(name for value in inputs[name] for name in _digests(value))
@@ -287,11 +286,11 @@ def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict
             arguments[name] = _begun_workspace(store, digest(task.identity))
     yield arguments
     for file, path in (task.files or {}).items():
-        if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
+        if remembered_file_digest(path) != inputs[stage.argument("Files") or ""][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
 
 
-def _roles(identity: str | Mapping[str, Any] | None, read: Reader) -> dict[tuple[str, int], str]:
+def _roles(identity: str | RolesIdentity | None, read: Reader) -> dict[tuple[str, int], str]:
     """Return the role by (recording, fold) in a split, given by its digest, or in one of its folds."""
     if identity is None:
         return {}
@@ -362,13 +361,13 @@ def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
         yield (*following.trackers(), *displays)
 
 
-def _digests(value: Mapping[str, Any]) -> Iterator[str]:
+def _digests(value: DatasetIdentity) -> Iterator[str]:
     """Yield the digests of the shards and files of a dataset in an identity."""
-    yield from (shard["digest"] for entry in value.get("recordings", {}).values() for shard in entry["shards"].values())
-    yield from value.get("files", {}).values()
+    yield from (shard["digest"] for entry in value["recordings"].values() for shard in entry["shards"].values())
+    yield from value["files"].values()
 
 
-def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
+def _dataset(value: DatasetIdentity, read: Callable[[str, str], bytes]) -> Dataset:
     lineage = value["lineage"]
     manifest = Manifest(
         stage=lineage["stage"],
@@ -395,17 +394,17 @@ def _files(name: str, returned: Any) -> Result:
     raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a Result or files by name.")
 
 
-def _entry(recording: RecordingOutput, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
+def _entry(recording: RecordingOutput, sink: Store | ScratchStore, *, durable: bool) -> RecordingEntry:
     shards = {stream: _shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
 
 
-def _shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> dict[str, Any]:
+def _shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> Shard:
     """Store a table, or batches as they arrive, as a shard."""
     from tacpipe.io import parquet
 
     if hasattr(table, "num_rows"):
-        return {**vars(sink.put(parquet.to_parquet(table), durable=durable)), "rows": table.num_rows}
+        return {**sink.put(parquet.to_parquet(table), durable=durable).to_json(), "rows": table.num_rows}
     rows: list[int] = []
     stored = sink.put_written(lambda file: rows.append(parquet.write(table, file)), durable=durable)
-    return {**vars(stored), "rows": rows[0]}
+    return {**stored.to_json(), "rows": rows[0]}

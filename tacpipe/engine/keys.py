@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 from tacpipe.datasets import pages
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import ALL, AnyStage, Source
+from tacpipe.plugins.stage import ALL, AnyStage, Source, Values
+from tacpipe.store.records import ComputedResult, Content, GroupIdentity, RecordingEntry, StageIdentity, Step
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
 
@@ -25,7 +26,7 @@ class WorkerTask:
 
     store: str  # path or address of the store
     name: str  # name of the stage
-    identity: Mapping[str, Any]
+    identity: StageIdentity
     recording: str = ""
     files: Mapping[str, str] | None = None  # paths of the files of a published source, by name
     dataset_dirs: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
@@ -41,7 +42,7 @@ class Done:
     """Outcome of a task: a record, or the error of the recording."""
 
     recording: str
-    record: Mapping[str, Any] | None
+    record: ComputedResult | None
     error: str = ""
     exit_code: int = 0
     is_new: bool = True  # False if another process finished first
@@ -50,13 +51,37 @@ class Done:
     )
 
 
-def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
+class DatasetLineage(TypedDict):
+    """How a dataset was made, as far as a key depends on it."""
+
+    stage: str
+    version: int
+    params: Values
+    chain: Sequence[Step]
+
+
+class DatasetIdentity(TypedDict):
+    """What a key holds of a dataset."""
+
+    lineage: DatasetLineage
+    recordings: Mapping[str, RecordingEntry]
+    files: Mapping[str, str]  # digests
+
+
+class RolesIdentity(TypedDict):
+    """What a key holds of the roles in one fold of a split."""
+
+    roles: str  # digest of the table of the split
+    fold: int
+
+
+def identity(name: str, version: int, params: Any, inputs: Values) -> StageIdentity:
     """Return the identity of a result, whose digest is the key. ``params`` is a stage's dataclass, or its values by name."""
     values = params if isinstance(params, Mapping) else params_of.to_json(params)
     return {"stage": name, "version": version, "params": values, "inputs": inputs}
 
 
-def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
+def of_recording(entry: RecordingEntry, reads: tuple[str, ...] | None) -> RecordingEntry:
     """Return a recording's part of a key: the digests of its streams, and the attributes in ``reads`` (None for all)."""
     attributes = entry["attributes"]
     if reads is not None and reads != ALL:
@@ -64,9 +89,11 @@ def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
     return {**pages.key_entry(entry), "attributes": attributes}
 
 
-def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
+def of_dataset(
+    manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, RecordingEntry]
+) -> DatasetIdentity:
     """Return a dataset's part of a key: names, attributes and digests of the ``chosen`` recordings, chain, files."""
-    recordings: Mapping[str, Entry]
+    recordings: Mapping[str, RecordingEntry]
     if isinstance(chosen, pages.Recordings) and reads in (None, ALL):
         recordings = pages.KeyRecordings(chosen.pages)
     else:
@@ -83,28 +110,26 @@ def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mappin
     }
 
 
-def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any] | None) -> dict[str, Any]:
+def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Content] | None) -> Step:
     """Return the link of a chain that a map stage adds."""
     files = {file: value["digest"] for file, value in fitted.items()} if fitted is not None else None
     return {"stage": name, "version": stage.version, "params": params_of.to_json(params), "fitted": files}
 
 
-def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:
+def of_group(step: Step, stage: AnyStage, entries: Mapping[str, RecordingEntry]) -> GroupIdentity:
     """Return the identity of a map stage's results for a group, which covers the keys of all its recordings."""
     recordings_digest = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
     return {"group": step["stage"], "step": step, "recordings": recordings_digest}
 
 
-def shard_tasks(
-    store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]
-) -> list[WorkerTask]:
+def shard_tasks(store: Store, source: Manifest, step: Step, dataset_dirs: tuple[str, ...]) -> list[WorkerTask]:
     """Return one task per included recording of ``source`` for the stage ``step`` of a chain."""
     stage = registry.load_step(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
     name_argument = stage.argument("RecordingName")
 
-    def task(name: str, entry: Entry) -> WorkerTask:
+    def task(name: str, entry: RecordingEntry) -> WorkerTask:
         inputs = {
             recording: of_recording(entry, stage.reads or ()),
             **fitted,
@@ -129,7 +154,7 @@ def source_tasks(
     assert argument is not None
 
     def task(recording: str, source: Source) -> WorkerTask:
-        inputs: dict[str, Any] = {argument: {file: digests[recording][file] for file in source.files}}
+        inputs: dict[str, object] = {argument: {file: digests[recording][file] for file in source.files}}
         if values is not None:
             inputs[values] = dict(source.values)
         if called is not None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from tacpipe.engine import execution, provenance
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.printable import listed
+from tacpipe.store.records import ComputedResult, Summary
 
 _NAMED = 5  # maximum number of recordings that a note names
 _FROM_RECORDS = (
@@ -46,37 +46,35 @@ class Outcome:
         self.ran = self.reused = 0
         self.restore({})
 
-    def add_record(self, stage: str, recording: str, record: Mapping[str, Any]) -> None:
+    def add_record(self, stage: str, recording: str, record: ComputedResult) -> None:
         """Add the notes of a record and the code that computed it."""
-        provenance_of_record = record["provenance"]
-        for note in provenance_of_record.get("notes") or ():
+        made_by = record["provenance"]
+        for note in made_by.get("notes") or ():
             self.recordings_by_note.setdefault(note, []).append(recording)
-        if provenance_of_record.get("code"):
-            _add_counts(self.code, {stage: {provenance_of_record["code"]: 1}})
-        _add_counts(
-            self.packages,
-            {package: {code: 1} for package, code in (provenance_of_record.get("packages") or {}).items()},
-        )
+        if code := made_by.get("code"):
+            _add_counts(self.code, {stage: {code: 1}})
+        packages = made_by.get("packages") or {}
+        _add_counts(self.packages, {package: {code: 1} for package, code in packages.items()})
 
-    def add_group(self, summary: Mapping[str, Any]) -> None:
+    def add_group(self, summary: Summary) -> None:
         """Add the summary that `of_results` returned for a group of recordings."""
         for note, recordings in (summary.get("notes") or {}).items():
             self.recordings_by_note.setdefault(note, []).extend(recordings)
         _add_counts(self.code, summary.get("code") or {})
         _add_counts(self.packages, summary.get("packages") or {})
 
-    def compare(self, stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> None:
+    def compare(self, stored: ComputedResult, recomputed: ComputedResult, name: str) -> None:
         """Add the differences between two records of one result; ``name`` is the stage or the recording."""
         differs = execution.differences(stored["result"], recomputed["result"], name)
         self.differs += differs
         unlike = provenance.unlike(stored["provenance"], recomputed["provenance"]) if differs else []
         self.unlike += [difference for difference in unlike if difference not in self.unlike]
 
-    def of_results(self) -> dict[str, Any]:
+    def of_results(self) -> Summary:
         """Return the summary of all added records, to be stored in the record of a run."""
         return {"code": self.code, "packages": self.packages, "notes": self.recordings_by_note}
 
-    def restore(self, summary: Mapping[str, Any]) -> None:
+    def restore(self, summary: Summary) -> None:
         """Restore a summary that `of_results` returned; older records contain none."""
         self.code, self.packages = summary.get("code") or {}, summary.get("packages") or {}
         self.recordings_by_note = summary.get("notes") or {}
@@ -99,7 +97,7 @@ class Outcome:
         described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
         return [*lines, *stages.values(), *(line for name, line in packages.items() if name not in described)]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the outcome as JSON for the command's output."""
         value = {name: value for name, value in vars(self).items() if name not in _FROM_RECORDS}
         return {**value, "output": str(self.output)}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 from tacpipe.datasets import directory, pages, replacing
 from tacpipe.datasets import manifest as manifest_of
@@ -21,6 +21,7 @@ from tacpipe.io.hashing import file_digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.store import presence
 from tacpipe.store.presence import Head, Look, Note
+from tacpipe.store.roots import Root
 from tacpipe.store.store import MissingError, Store
 
 
@@ -137,7 +138,7 @@ class _Place(ABC):
         self.store, self.request, self.path = store, request, request.output.absolute()
 
     @property
-    def root(self) -> dict[str, Any] | None:
+    def root(self) -> Root | None:
         """The root in the store: the last dataset written to this output."""
         return self.store.roots.get(self.path)
 

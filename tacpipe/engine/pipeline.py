@@ -12,7 +12,7 @@ from typing import Any
 
 from tacpipe.datasets import manifest, replacing, selection
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
@@ -27,15 +27,19 @@ from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ORIGINALS, ROLES
+from tacpipe.plugins.stage import ORIGINALS, ROLES, Values
 from tacpipe.store import records
 from tacpipe.store.location import locate
+from tacpipe.store.records import Content, RecordingEntry, RunIdentity, StageIdentity, Step, StoredResult
 from tacpipe.store.store import MissingError, Store
 from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracker
 from tacpipe.training import following
 
-_NOTHING: Entry = {"attributes": {}, "shards": {}}  # entry of a recording whose part of the stage returns only files
+_NOTHING: RecordingEntry = {
+    "attributes": {},
+    "shards": {},
+}  # entry of a recording whose part of the stage returns only files
 
 
 def open_dataset(path: Path | str) -> Dataset:
@@ -118,7 +122,7 @@ class _RequestRun:
     """Produces the result of a request from the store, or by computing what is missing."""
 
     def __init__(
-        self, request: Request, store: Store, inputs: RequestInputs, identity: Mapping[str, Any], chosen: ChosenExecutor
+        self, request: Request, store: Store, inputs: RequestInputs, identity: RunIdentity, chosen: ChosenExecutor
     ) -> None:
         self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
@@ -141,7 +145,7 @@ class _RequestRun:
         if record is None or record["result"]["files"][manifest.NAME]["digest"] != manifest_digest:
             return False
         self.outcome.begin()
-        self.outcome.restore(record["provenance"])
+        self.outcome.restore(records.summary(record))
         self.outcome.reused = reused
         return True
 
@@ -164,7 +168,7 @@ class _RequestRun:
         self.store.announce(name for name, _ in sizes)
         if not all(self.store.has(name, size) for name, size in sizes):
             return None
-        self.outcome.restore(record["provenance"])
+        self.outcome.restore(records.summary(record))
         self.outcome.reused = self.count(stored_manifest)
         return stored_manifest
 
@@ -207,8 +211,8 @@ class _RequestRun:
             result = self._run_whole(request.name, identity)
             return replace(empty, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
-        chain: Sequence[Mapping[str, Any]] = ()
-        recordings: Mapping[str, Entry] = {}
+        chain: Sequence[Step] = ()
+        recordings: Mapping[str, RecordingEntry] = {}
         if stage.argument("Recording"):
             source = self.inputs.merged
             step = keys.chain_step(request.name, stage, request.params, fitted)
@@ -246,7 +250,7 @@ class _RequestRun:
     def _by_recording(self) -> ByRecording:
         return ByRecording(self.store, self.request, self.outcome, self.chosen, self.previous)
 
-    def _chain(self) -> Sequence[Mapping[str, Any]]:
+    def _chain(self) -> Sequence[Step]:
         if "model" in self.inputs.named_datasets:
             return self.inputs.model.chain
         chains = [dataset.manifest.chain for dataset in self.inputs.datasets]
@@ -282,12 +286,13 @@ class _RequestRun:
         files = {file: stored for result in results.values() for file, stored in result["files"].items()}
         return Manifest(name, self.stage.part.version, step["params"], recordings=recordings, files=files)
 
-    def _originals(self) -> dict[str, Any]:
+    def _originals(self) -> dict[str, Content]:
         """Return the input shards that become files of the result, if the stage requests them."""
         folder = self.stage.originals(self.request.params) if self.stage.originals is not None else ""
         if not folder:
             return {}
-        source, originals = self.inputs.merged, {}
+        source = self.inputs.merged
+        originals: dict[str, Content] = {}
         read = execution.reader(self.store, self.inputs.dataset_dirs, dict(source.sizes()))
         for recording, entry in source.included.items():
             for stream, shard in entry["shards"].items():
@@ -297,7 +302,7 @@ class _RequestRun:
                 originals[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
         return originals
 
-    def _whole_inputs(self) -> dict[str, Any]:
+    def _whole_inputs(self) -> Values:
         return {
             name: self._whole_input(name, kind) for name, kind in self.stage.arguments.items() if kind != "Workspace"
         }
@@ -349,7 +354,7 @@ class _RequestRun:
             raise UsageError(f"No recording of the dataset has a role in {dataset.directory}. Split this dataset.")
         return {"roles": table, "fold": fold}
 
-    def _run_whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
+    def _run_whole(self, name: str, identity: StageIdentity, *, counted: bool = True) -> StoredResult:
         """Return the result of a key over whole datasets, from the store or by running the stage."""
         self.store.expect([digest(identity)])
         record = self.store.record(digest(identity))
@@ -357,8 +362,7 @@ class _RequestRun:
         if record is not None and is_stored and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
             self.outcome.add_record(name, "", record)
-            result: Mapping[str, Any] = record["result"]
-            return result
+            return record["result"]
         if self.request.check:
             raise WouldChangeError(f"{name} would run: there is no result for these inputs and params.")
         task = WorkerTask(
@@ -376,22 +380,22 @@ class _RequestRun:
         if computed.record is None:
             raise by_recording.error(computed.exit_code, computed.error)
         self.outcome.add_record(name, "", computed.record)
-        result_of_task: Mapping[str, Any] = computed.record["result"]
+        result: StoredResult = computed.record["result"]
         if self.request.compare and is_stored and record is not None:
             self.outcome.compare(record, computed.record, name)
-            result_of_task = record["result"]  # later steps were computed from the stored result
+            result = record["result"]  # later steps were computed from the stored result
         elif self.request.compare and not counted:
             raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
         self.outcome.ran += computed.is_new and counted
         self.outcome.reused += counted and not computed.is_new
-        return result_of_task
+        return result
 
-    def _fit(self) -> dict[str, Any]:
+    def _fit(self) -> dict[str, Content]:
         """Return the files that the stage fitted to the training recordings, or those of ``--codec``."""
         codec, name, fit = self.inputs.named_datasets.get("codec"), self.request.name, self.stage.fit
         if codec is not None:
-            step = codec.manifest.chain[-1] if codec.manifest.chain else {}
-            if step.get("stage") != name:
+            chain = codec.manifest.chain
+            if not chain or chain[-1]["stage"] != name:
                 raise UsageError(f"{codec.directory} was not made by {name}, so it holds no codec of its kind.")
             return dict(codec.manifest.files)
         assert fit is not None
@@ -404,8 +408,8 @@ class _RequestRun:
 
     def _remember(self, result_manifest: Manifest) -> None:
         """Store the manifest and, if every recording was valid, the run, so that a rerun is a cache hit."""
-        stored = vars(result_manifest.keep(self.store, durable=result_manifest.recorded))
+        stored = result_manifest.keep(self.store, durable=result_manifest.recorded).to_json()
         if not self.outcome.bad:
-            result = {"recordings": {}, "files": {manifest.NAME: stored}}
-            made_by = {**provenance.describe_provenance(0.0), **self.outcome.of_results()}
+            result: StoredResult = {"recordings": {}, "files": {manifest.NAME: stored}}
+            made_by = provenance.describe_run(self.outcome.of_results())
             self.store.commit(self.identity, result, made_by, replace=True)

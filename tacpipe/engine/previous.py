@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import Pages
 from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.hashing import digest
+from tacpipe.store import records
 from tacpipe.store.presence import Head, Look, Note
+from tacpipe.store.records import RecordingEntry, RunIdentity, Step, Summary
 from tacpipe.store.store import Store
 
 
@@ -28,7 +29,7 @@ class Reusable:
     """Reusable results: result pages by the digest of their input page, and the summary of their records."""
 
     pages: Mapping[str, Pages]
-    summary: Mapping[str, Any]  # argument of `Outcome.add_group`
+    summary: Summary  # argument of `Outcome.add_group`
 
     @property
     def count(self) -> int:
@@ -44,11 +45,12 @@ class Previous:
     directory: Path
     note: Note
     look: Look
-    record: Mapping[str, Any]
+    identity: RunIdentity
+    summary: Summary
     source: Manifest  # input
     result: Manifest  # output
 
-    def reusable(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Reusable | None:
+    def reusable(self, entries: Mapping[str, RecordingEntry], step: Step) -> Reusable | None:
         """Return the reusable results of one stage of a chain for ``entries``, or None if there are none."""
         before, results = self.source.included, self.result.pages
         if results is None or not (isinstance(entries, pages.Recordings) and isinstance(before, pages.Recordings)):
@@ -98,27 +100,28 @@ class Previous:
         files = [(path, file["digest"], file["bytes"]) for path, file in published.files.items()]
         return self.look.succeed(self.note, head, [*removed, *self.result.files], [*placed, *files])
 
-    def _is_same_step(self, step: Mapping[str, Any]) -> bool:
+    def _is_same_step(self, step: Step) -> bool:
         result = self.result
         input_digests = [dataset["manifest"] for dataset in result.inputs.get("datasets", ())]
         return (
-            result.stage == self.record["identity"]["run"] == step["stage"]
+            result.stage == self.identity["run"] == step["stage"]
             and input_digests == [self.source.content_digest]
             and bool(result.chain)
             and digest(result.chain[-1]) == digest(step)
         )
 
-    def _summary(self, stage: str, replaced_names: set[str], count: int) -> Mapping[str, Any] | None:
+    def _summary(self, stage: str, replaced_names: set[str], count: int) -> Summary | None:
         """Return the summary of all results except ``replaced_names``, or None if it is unknown."""
-        provenance = self.record["provenance"]
-        codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
-        packages: Mapping[str, Mapping[str, int]] = provenance.get("packages") or {}
+        summary = self.summary
+        codes, packages = (summary.get("code") or {}).get(stage) or {}, summary.get("packages") or {}
         for counts in filter(None, (codes, *packages.values())):
             if [*counts.values()] != [len(self.result.recordings)]:  # the code that computed each result is unknown
                 return None
         excluded = {*replaced_names, ""}  # the empty name is a stage over a whole dataset, which runs again
-        notes_of_run: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
-        notes = {note: [name for name in names if name not in excluded] for note, names in notes_of_run.items()}
+        notes = {
+            note: [name for name in names if name not in excluded]
+            for note, names in (summary.get("notes") or {}).items()
+        }
         return {
             "code": {stage: dict.fromkeys(codes, count)} if codes and count else {},
             "packages": {name: dict.fromkeys(counts, count) for name, counts in packages.items() if count},
@@ -129,7 +132,7 @@ class Previous:
 def inputs(store: Store, note: Note) -> Sequence[str]:
     """Return the digests of the manifests read by the run that a note describes."""
     record = store.record(note.head.key)
-    return [] if record is None else list(record["identity"].get("datasets", ()))
+    return [] if record is None or "run" not in (identity := record["identity"]) else identity["datasets"]
 
 
 def find(store: Store, directory: Path, note: Note) -> Previous | None:
@@ -138,9 +141,9 @@ def find(store: Store, directory: Path, note: Note) -> Previous | None:
     Its objects must already be announced, so that they are protected from collection until the new result is published.
     """
     record = None if store.distant else store.record(note.head.key)
-    if record is None or "run" not in record["identity"]:
+    if record is None or "run" not in (identity := record["identity"]):
         return None
-    input_digests, result_file = record["identity"].get("datasets", ()), record["result"]["files"].get(manifest_of.NAME)
+    input_digests, result_file = identity["datasets"], record["result"]["files"].get(manifest_of.NAME)
     if len(input_digests) != 1 or result_file is None or result_file["digest"] != note.head.manifest:
         return None
     look = Look(store, directory)
@@ -150,7 +153,7 @@ def find(store: Store, directory: Path, note: Note) -> Previous | None:
         result, source = manifest_of.stored(store, note.head.manifest), manifest_of.stored(store, input_digests[0])
         if manifest_of.find(directory).digest != note.head.manifest or source.pages is None:
             return None
-        return Previous(store, directory, note, look, record, source, result)
+        return Previous(store, directory, note, look, identity, records.summary(record), source, result)
     except StorageError:
         raise
     except TacpipeError:

@@ -20,6 +20,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import architectures, registry
 from tacpipe.plugins.stage import AnyStage
+from tacpipe.store.records import Environment, Processor, Provenance, RunProvenance, StageIdentity, Summary
 from tacpipe.training import devices
 
 _CPUINFO = Path("/proc/cpuinfo")
@@ -31,7 +32,7 @@ JOBS = "TACPIPE_JOBS"  # number of processes of a command without --jobs, or wit
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def describe_processor() -> dict[str, Any]:
+def describe_processor() -> Processor:
     """Return the processor's ``model``, vector ``instructions``, kernels ``chosen`` by variables, and ``threads``."""
     chosen = {name: os.environ[name] for name in _CHOSEN if name in os.environ}
     return {**_processor(), "chosen": chosen, "threads": threads()}
@@ -94,7 +95,7 @@ def usable_cores() -> int:
 
 
 @functools.cache
-def _processor() -> dict[str, Any]:
+def _processor() -> Processor:
     values: dict[str, str] = {}  # values for the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
@@ -117,7 +118,7 @@ _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
 
 @functools.cache
-def _environment() -> dict[str, Any]:
+def _environment() -> Provenance:
     import subprocess
     from importlib.metadata import PackageNotFoundError, version
 
@@ -140,15 +141,21 @@ def _environment() -> dict[str, Any]:
     }
 
 
-def describe_provenance(seconds: float) -> dict[str, Any]:
+def describe_provenance(seconds: float) -> Provenance:
     """Return libraries, git commit, host, device, processor and worker of this process, and a duration in ``seconds``."""
-    environment = {
+    environment: Provenance = {
         **_environment(),
         "device": devices.kind(),
         "processor": describe_processor(),
         "seconds": seconds,
     }
     return {**environment, "worker": _worker.get()} if _worker.get() else environment
+
+
+def describe_run(summary: Summary) -> RunProvenance:
+    """Return how the results of a command or of a group of recordings were computed; ``summary`` is what it adds up to."""
+    environment: Environment = describe_provenance(0.0)
+    return {**environment, **summary}
 
 
 @contextlib.contextmanager
@@ -161,7 +168,7 @@ def worker(name: str) -> Iterator[None]:
         _worker.reset(token)
 
 
-def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def unlike(stored: Environment, now: Environment) -> list[str]:
     """Return the differences between two computers that affect rounding; empty if ``stored`` does not record them.
 
     >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
@@ -200,7 +207,7 @@ def code(stage: AnyStage) -> str | None:
         return None
 
 
-def code_of_packages(identity: Mapping[str, Any], used: Iterable[str] = ()) -> dict[str, str]:
+def code_of_packages(identity: StageIdentity, used: Iterable[str] = ()) -> dict[str, str]:
     """Return the code digest of each plug-in package that takes part in a result, by package name.
 
     These are the packages ``used`` by the stage and those of the architectures named in its ``identity``.

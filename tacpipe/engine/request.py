@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tacpipe.datasets import manifest, paths, selection
-from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
+from tacpipe.datasets.manifest import VALUES, Found, InputDataset, Manifest
 from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
@@ -20,6 +20,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage, Source
+from tacpipe.store.records import RecordingEntry, RunIdentity
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
 
@@ -98,7 +99,7 @@ class RequestInputs:
         self.sources = _discover(self.stage, request)
         self.source_digests = _hash(self.sources)
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> RunIdentity:
         """Return the identity of the run: manifests, params, versions.
 
         A rerun is answered from it without opening a shard.
@@ -133,7 +134,7 @@ class RequestInputs:
             self.request.name, self.stage.version, params_of.to_json(self.request.params), dict(self.source_digests)
         )
 
-    def lineage(self) -> dict[str, list[dict[str, str]]]:
+    def lineage(self) -> dict[str, list[InputDataset]]:
         """Return the inputs as a manifest lists them."""
         inputs = {"datasets": self.datasets, **{name: [dataset] for name, dataset in self.named_datasets.items()}}
         return {
@@ -180,7 +181,7 @@ class RequestInputs:
         )
         return selection.roles_in_fold(selection.read_roles(content), self.request.fold, split_path)
 
-    def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
+    def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, RecordingEntry]:
         """Return the recordings of ``source`` with this role. Raises `UsageError` if there are none, unless ``may_lack``."""
         chosen = {name: entry for name, entry in source.included.items() if self.roles.get(name) == role}
         unknown = sorted(set(source.included) - set(self.roles))

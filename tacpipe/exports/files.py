@@ -125,9 +125,11 @@ def loss_notes(recordings: Dataset, contents: Contents) -> list[str]:
 def provenance(recordings: Dataset) -> str:
     """Return the section that names the stages behind the recordings and their digest."""
     source = recordings.source
-    steps = [step for step in source.chain if step["stage"] != source.stage]
-    steps.append({"stage": source.stage, "version": source.version, "params": source.params})
-    rows = [f"| `{stage['stage']}` | {stage['version']} | {_params(stage['params'])} |" for stage in steps]
+    stages = [
+        (step["stage"], step["version"], step["params"]) for step in source.chain if step["stage"] != source.stage
+    ]
+    stages.append((source.stage, source.version, source.params))
+    rows = [f"| `{stage}` | {version} | {_params(params)} |" for stage, version, params in stages]
     return "\n".join(
         [
             "## Where it comes from",

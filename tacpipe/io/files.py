@@ -10,10 +10,8 @@ import re
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import StorageError, UsageError
-from tacpipe.io import regular
 
 _READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
@@ -139,15 +137,6 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
         if error.errno != errno.ELOOP:
             raise
         return False
-
-
-def read_json(path: Path, max_bytes: int = regular.JSON_BYTES) -> dict[str, Any] | None:
-    """Return the mapping in a file of a store; None if it is missing, holds none, or has more than ``max_bytes`` bytes."""
-    try:
-        value = regular.json_value(path, max_bytes)
-    except (FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
-        return None
-    return value if isinstance(value, dict) else None
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from tacpipe import printable
 from tacpipe.datasets import manifest
@@ -16,10 +16,11 @@ from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import garbage, pushed, remote_upkeep, repair
 from tacpipe.maintenance.garbage import Collected
 from tacpipe.maintenance.pushed import AnyStore
-from tacpipe.maintenance.repair import Soundness
+from tacpipe.maintenance.repair import FolderSize, Soundness, StoreStatus
 from tacpipe.store import layout, projects
 from tacpipe.store.backend import Entry
 from tacpipe.store.cached import CachedStore
+from tacpipe.store.roots import Root
 from tacpipe.store.store import Store
 
 
@@ -34,20 +35,44 @@ def distant(store: Store) -> CachedStore:
     return store
 
 
-def status(store: CachedStore) -> dict[str, Any]:
+class CacheSize(TypedDict):
+    """The path of the folder in front of a bucket, and what lies in it."""
+
+    path: str
+    objects: FolderSize
+    records: FolderSize
+    checkpoints: FolderSize
+
+
+class BucketStatus(StoreStatus):
+    """The status of a store in a bucket."""
+
+    cache: CacheSize
+
+
+def status(store: CachedStore) -> BucketStatus:
     """Return the status of the bucket as `repair.status` does, and the path and sizes of the folder in front."""
     bucket = store.bucket
-    exists = bucket.check()
-    measured = {name: _measured(bucket.files.list(name)) for name in ("objects", "records", "tmp")}
     all_roots = bucket.roots.all()
-    roots = [{**root, "path": pushed.label(root, all_roots), "reachable": True} for root in all_roots]
-    folder_status = repair.status(store)
-    cache = {"path": str(store.root), **{name: folder_status[name] for name in ("objects", "records", "checkpoints")}}
-    running = [run.note for _, run in bucket.runs().values()]
-    return {"store": store.place, "there": exists, **measured, "roots": roots, "running": running, "cache": cache}
+    folder = repair.status(store)
+    return {
+        "store": store.place,
+        "there": bucket.check(),
+        "objects": _measured(bucket.files.list("objects")),
+        "records": _measured(bucket.files.list("records")),
+        "tmp": _measured(bucket.files.list("tmp")),
+        "roots": [{**root, "path": pushed.label(root, all_roots), "reachable": True} for root in all_roots],
+        "running": [run.note for _, run in bucket.runs().values()],
+        "cache": {
+            "path": str(store.root),
+            "objects": folder["objects"],
+            "records": folder["records"],
+            "checkpoints": folder["checkpoints"],
+        },
+    }
 
 
-def _measured(entries: Iterable[Entry]) -> dict[str, int]:
+def _measured(entries: Iterable[Entry]) -> FolderSize:
     sizes = [entry.bytes for entry in entries]
     return {"files": len(sizes), "bytes": sum(sizes)}
 
@@ -121,7 +146,7 @@ def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: 
     return remote_upkeep.collect(store.bucket, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
-def _expired_roots(store: CachedStore, grace_days: float) -> list[dict[str, Any]]:
+def _expired_roots(store: CachedStore, grace_days: float) -> list[Root]:
     expired = []
     for root in store.roots.all():
         content, reached = garbage.content(Path(root["path"]))
@@ -157,16 +182,17 @@ def clear(store: CachedStore, *, dry_run: bool) -> Collected:
     return collected
 
 
-def status_text(value: dict[str, Any]) -> str:
+def status_text(value: BucketStatus) -> str:
     """Return the status in words."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
-    lines += [_line(name, value[name]) for name in ("objects", "records", "tmp")]
+    lines += [_line("objects", value["objects"]), _line("records", value["records"]), _line("tmp", value["tmp"])]
     lines += [f"  root  {root['manifest'][:12]}  {root['path']}" for root in value["roots"]]
     lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
-    lines += [f"in front of it: {value['cache']['path']}"]
-    lines += [_line(name, value["cache"][name]) for name in ("objects", "records", "checkpoints")]
+    cache = value["cache"]
+    lines += [f"in front of it: {cache['path']}", _line("objects", cache["objects"])]
+    lines += [_line("records", cache["records"]), _line("checkpoints", cache["checkpoints"])]
     return printable.lines(lines)
 
 
-def _line(name: str, measured: dict[str, int]) -> str:
+def _line(name: str, measured: FolderSize) -> str:
     return f"  {name:<12} {measured['files']:>8} files {measured['bytes'] / 1e6:>10.1f} MB"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tacpipe import printable
 from tacpipe.datasets import directory as directory_of
@@ -23,7 +22,7 @@ from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import projects
 from tacpipe.store.location import locate
-from tacpipe.store.roots import PUSHED
+from tacpipe.store.roots import PUSHED, Root, WrittenManifest
 from tacpipe.store.store import MissingError
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
@@ -53,7 +52,8 @@ def known(store: AnyStore) -> list[Known]:
     roots = store.roots.all()
     for root in roots:
         root_label = pushed.label(root, roots)
-        for entry in [root, *root.get("history", [])]:
+        written: list[WrittenManifest] = [root, *root.get("history", [])]
+        for entry in written:
             name, path = entry["manifest"], str(root["path"])
             try:
                 manifest = manifest_of.stored(store, name)
@@ -78,7 +78,7 @@ def known(store: AnyStore) -> list[Known]:
     return sorted(by_label.values(), key=lambda listing: (-listing.written_s, listing.path))
 
 
-def _state(root: dict[str, Any], name: str) -> str:
+def _state(root: Root, name: str) -> str:
     """Return what became of the manifest that was written last at the path of ``root``."""
     if root["kind"] == PUSHED:
         return IN_STORE
@@ -92,11 +92,6 @@ def _state(root: dict[str, Any], name: str) -> str:
     except (OSError, StorageError):
         return UNREAD
     return SHOWN if current_digest == name else REPLACED
-
-
-def to_json(listed: list[Known]) -> dict[str, Any]:
-    """Return the list as one object."""
-    return {"schema_version": 1, "manifests": [asdict(entry) for entry in listed]}
 
 
 def to_text(listed: list[Known]) -> str:

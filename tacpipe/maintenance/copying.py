@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Manifest
@@ -15,6 +14,7 @@ from tacpipe.maintenance import garbage
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import layout, records
+from tacpipe.store.records import Record
 from tacpipe.store.remote import RemoteStore
 from tacpipe.store.store import MissingError
 
@@ -166,7 +166,7 @@ def _copy_records(
     """Copy the records of what was copied, and note in ``target`` which those are."""
     noted_keys = target.noted(dataset.digest) | (target.noted(before) if before else set())
 
-    def commit(keyed_record: tuple[str, dict[str, Any]]) -> str:
+    def commit(keyed_record: tuple[str, Record]) -> str:
         key, record = keyed_record
         if key not in noted_keys:
             target.commit(record["identity"], record["result"], record["provenance"])
@@ -223,8 +223,8 @@ def _expect_room(target: AnyStore, needed: int) -> None:
         )
 
 
-def _named_digests(record: Mapping[str, Any]) -> set[str]:
-    """Return the digests of what a record names, or None if it has not the form of a record: a store may hold anything."""
+def _named_digests(record: Record) -> set[str]:
+    """Return the digests of what a record names; none if it has not the form of a record: a store may hold anything."""
     identity, provenance = record["identity"], record["provenance"]
     try:
         formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)

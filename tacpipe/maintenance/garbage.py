@@ -13,7 +13,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
@@ -24,8 +23,8 @@ from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
 from tacpipe.store import layout, presence
-from tacpipe.store.records import digests
-from tacpipe.store.roots import PUSHED
+from tacpipe.store.records import Record, digests
+from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
@@ -166,7 +165,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
     return collected
 
 
-def _brief(keyed_record: tuple[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
+def _brief(keyed_record: tuple[str, Record]) -> tuple[str, str, bool]:
     """Return the key of a record, the digests that it names, and whether it marks a recording: memory holds all records."""
     key, record = keyed_record
     return key, " ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable"))
@@ -299,7 +298,7 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
     return dataset
 
 
-def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
+def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been out of reach for the whole grace.
 
     The first look that does not reach it starts the clock, and one that reaches it stops the clock.
@@ -307,9 +306,13 @@ def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reache
     now_s = int(time.time())
     since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # a clock may have been set back
     if since_s != root.get("missing_since_s") and not dry_run:
-        unmarked_root = {key: value for key, value in root.items() if key != "missing_since_s"}
+        marked: Root = {**root}
+        if since_s is None:
+            del marked["missing_since_s"]
+        else:
+            marked["missing_since_s"] = since_s
         with contextlib.suppress(TacpipeError):
-            store.roots.write(unmarked_root if since_s is None else {**unmarked_root, "missing_since_s": since_s})
+            store.roots.write(marked)
     if since_s is None:
         return False
     return grace_days <= 0 or now_s - since_s > grace_days * 86400

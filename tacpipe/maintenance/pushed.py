@@ -16,7 +16,7 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.printable import listed
 from tacpipe.store.projects import Project
 from tacpipe.store.remote import RemoteStore
-from tacpipe.store.roots import PUSHED, Root, project_id
+from tacpipe.store.roots import PUSHED, Root, WrittenManifest, project_id
 from tacpipe.store.store import Store
 
 AnyStore = Store | RemoteStore
@@ -41,7 +41,7 @@ def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
     ['aaaaaaaa:rec', 'bbbbbbbb:rec']
     """
     every = list(every)
-    ids = {project_id(root): str(root.get("project", {}).get("name", "")) for root in every}
+    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in every}
     shared = Counter(ids.values())
     names = {
         identifier: identifier[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name
@@ -70,7 +70,7 @@ def _roots_of_project(requested: str, pushed_roots: Iterable[Root]) -> list[Root
 
 def _belongs_to(project: str, root: Root) -> bool:
     by_id = len(project) >= MIN_DIGITS and project_id(root).startswith(project)
-    return by_id or root.get("project", {}).get("name") == project
+    return by_id or ("project" in root and root["project"]["name"] == project)
 
 
 def project_in(store: AnyStore, wanted: str) -> Project:
@@ -124,7 +124,7 @@ def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | N
     ]
 
 
-def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str) -> None:
+def refuse_newer(there: AnyStore, before: Root, seen: Collection[str | None], name: str) -> None:
     """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen``."""
     manifest = str(before["manifest"])
     if manifest in seen:
@@ -165,7 +165,7 @@ def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
     snapshots = {
         digest
         for root in all_roots
-        for digest in _manifests(root)
+        for digest in manifests(root)
         if len(wanted) >= MIN_DIGITS and digest.startswith(wanted)
     }
     if len(snapshots) > 1:
@@ -177,17 +177,20 @@ def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
     return bool(snapshots)
 
 
-def _manifests(root: Root) -> list[str]:
+def manifests(root: Root) -> list[str]:
     """Return the digests of a root's manifests, newest first."""
-    return [str(entry["manifest"]) for entry in (root, *root.get("history", []))]
+    return [root["manifest"], *(entry["manifest"] for entry in root.get("history", []))]
 
 
 def _remove_manifest(store: AnyStore, root: Root, manifest: str) -> None:
     """Take a manifest out of a pushed root; of those that stay the newest is what a pull takes."""
-    retained = [entry for entry in (root, *root.get("history", [])) if entry["manifest"] != manifest]
-    if retained and len(retained) <= len(root.get("history", [])):
-        newest = {key: retained[0].get(key) for key in ("manifest", "written_s")}
-        previous = retained[1]["manifest"] if len(retained) > 1 else None
-        store.roots.write({**root, **newest, "previous": previous, "history": retained[1:]})
-    if manifest in _manifests(root):
-        store.roots.remove(root)  # the root that was just written is another one
+    if manifest not in manifests(root):
+        return
+    earlier = [entry for entry in root.get("history", []) if entry["manifest"] != manifest]
+    newest: WrittenManifest | None = root
+    if root["manifest"] == manifest:
+        newest = earlier.pop(0) if earlier else None
+    if newest is not None:
+        reduced: Root = {**root, "manifest": newest["manifest"], "written_s": newest.get("written_s", 0)}
+        store.roots.write({**reduced, "previous": earlier[0]["manifest"] if earlier else None, "history": earlier})
+    store.roots.remove(root)  # the root that was just written is another one

@@ -9,7 +9,7 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypedDict
 
 from tacpipe import printable
 from tacpipe.datasets import directory as directory_of
@@ -21,12 +21,52 @@ from tacpipe.io.files import readable_errors, walk, write_whole
 from tacpipe.io.hashing import file_digest
 from tacpipe.printable import plain
 from tacpipe.store import layout
+from tacpipe.store.leases import Holder
 from tacpipe.store.location import locate
-from tacpipe.store.roots import PUSHED
+from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import AbsentError, MissingError, Store
 
 _SHOWN = 10  # foreign files listed before the rest is counted
-_COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders that the status measures
+_Measured = Literal["objects", "records", "quarantine", "tmp", "checkpoints"]
+_MEASURED: tuple[_Measured, ...] = (
+    "objects",
+    "records",
+    "quarantine",
+    "tmp",
+    "checkpoints",
+)  # as the status lists them
+
+
+class FolderSize(TypedDict):
+    """What lies beneath a folder of a store."""
+
+    files: int
+    bytes: int
+
+
+class RootStatus(Root):
+    """A root, and whether its path can be reached."""
+
+    reachable: bool
+
+
+class StoreStatus(TypedDict):
+    """Where a store is, and what lies in it."""
+
+    store: str
+    there: bool
+    objects: FolderSize
+    records: FolderSize
+    tmp: FolderSize
+    roots: list[RootStatus]
+    running: list[Holder]  # runs at work
+
+
+class FolderStatus(StoreStatus):
+    """The status of a store in a folder."""
+
+    quarantine: FolderSize
+    checkpoints: FolderSize
 
 
 @dataclass
@@ -152,7 +192,7 @@ def _rewrite_roots(store: Store) -> list[str]:
     return rewritten
 
 
-def _rewrite_manifest(store: Store, root: dict[str, Any]) -> list[str]:
+def _rewrite_manifest(store: Store, root: Root) -> list[str]:
     """Write the manifest at a root's path again where it is damaged; return its digest. What lay there goes to quarantine.
 
     Only at paths that this user's own roots name: another user's could name any file that is called so.
@@ -208,16 +248,22 @@ def link(path: Path) -> int:
     return len(stale)
 
 
-def status(store: Store) -> dict[str, Any]:
+def status(store: Store) -> FolderStatus:
     """Return where the store is, counts and bytes of what lies in it, its roots and the runs at work."""
-    exists = store.check()
-    folders = {name: _measured(store, name) for name in _COUNTED}
-    roots = [{**root, "reachable": _reachable(root)} for root in store.roots.all()]
-    running = [run.note for run in store.leases.runs()]
-    return {"store": str(store.root), "there": exists, **folders, "roots": roots, "running": running}
+    return {
+        "store": str(store.root),
+        "there": store.check(),
+        "objects": _measured(store, "objects"),
+        "records": _measured(store, "records"),
+        "quarantine": _measured(store, "quarantine"),
+        "tmp": _measured(store, "tmp"),
+        "checkpoints": _measured(store, "checkpoints"),
+        "roots": [{**root, "reachable": _reachable(root)} for root in store.roots.all()],
+        "running": [run.note for run in store.leases.runs()],
+    }
 
 
-def _measured(store: Store, name: str) -> dict[str, int]:
+def _measured(store: Store, name: _Measured) -> FolderSize:
     """Return how many files lie beneath a folder of the store, and their bytes; what vanishes meanwhile is not counted."""
     sizes = []
 
@@ -229,18 +275,18 @@ def _measured(store: Store, name: str) -> dict[str, int]:
     return {"files": len(sizes), "bytes": sum(sizes)}
 
 
-def _reachable(root: dict[str, Any]) -> bool:
+def _reachable(root: Root) -> bool:
     try:
         return root["kind"] == PUSHED or Path(root["path"]).exists()
     except OSError:  # a folder above it may not be entered
         return False
 
 
-def status_text(value: dict[str, Any]) -> str:
+def status_text(value: FolderStatus) -> str:
     """Return the status in words."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [
-        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _COUNTED
+        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _MEASURED
     ]
     lines += [
         f"  root  {root['manifest'][:12]}  {root['path']}" + ("" if root["reachable"] else "  (cannot be reached)")
@@ -250,7 +296,7 @@ def status_text(value: dict[str, Any]) -> str:
     return printable.lines(lines)
 
 
-def _find(root: dict[str, Any]) -> manifest_of.Found | None:
+def _find(root: Root) -> manifest_of.Found | None:
     """Return the manifest at a root's path, None if there is none that is sound and can be read."""
     return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
 

@@ -22,7 +22,7 @@ from tacpipe.store.bucket import Bucket
 from tacpipe.store.location import locate
 from tacpipe.store.projects import Project
 from tacpipe.store.remote import RemoteStore
-from tacpipe.store.roots import Root, project_id
+from tacpipe.store.roots import Root, RootProject, project_id
 from tacpipe.store.store import Store
 
 _LOOKS = 100  # pushes of one name that may come first
@@ -180,7 +180,7 @@ def _publish_name(
     replace: bool,
 ) -> None:
     """Have ``name`` mean what was copied. Raises as `push` does where another push came first."""
-    project = {"id": owner.id, "name": owner.name}
+    project: RootProject = {"id": owner.id, "name": owner.name}
     for _ in range(_LOOKS):
         lasting = before is not None and pushed.lasting(target, before["manifest"])
         if target.roots.push(name, project, dataset.digest, before, lasting=lasting):
@@ -198,9 +198,11 @@ def _predecessor(
     before = target.roots.pushed(name, owner.id)
     if before is None or replace:
         return before
-    local = local_store.roots.get(dataset.directory.absolute()) or {}
-    seen_manifests = {dataset.digest, local.get("manifest"), local.get("previous"), *local.get("pushed", ())}
-    seen_manifests |= {entry["manifest"] for entry in local.get("history", ())}
+    local = local_store.roots.get(dataset.directory.absolute())
+    seen_manifests: set[str | None] = {dataset.digest}
+    if local is not None:
+        seen_manifests |= {local["manifest"], local.get("previous"), *local.get("pushed", ())}
+        seen_manifests |= {entry["manifest"] for entry in local.get("history", ())}
     pushed.refuse_newer(target, before, seen_manifests, pushed.label(before, pushed.roots(target)))
     return before
 
@@ -210,8 +212,8 @@ def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> 
 
     The lease excludes that, but for file systems without locks; in a bucket it takes three pushes during one of them.
     """
-    root = target.roots.pushed(name, owner.id) or {}
-    if manifest not in (root.get("manifest"), *(entry["manifest"] for entry in root.get("history", ()))):
+    root = target.roots.pushed(name, owner.id)
+    if root is None or manifest not in pushed.manifests(root):
         raise TacpipeError(
             f"Another push of {name} to {target.place} ended at the same time and wrote over this one: there are no locks. "
             f"Run the same command again, and one push at a time."

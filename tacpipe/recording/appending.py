@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.datasets import directory, paths
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
+from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import keys, provenance
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
@@ -24,6 +24,7 @@ from tacpipe.printable import plain
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
 from tacpipe.recording.spool import Spooled
+from tacpipe.store.records import Provenance, RecordingEntry, Shard, StoredResult
 from tacpipe.store.store import Object, Store
 
 if TYPE_CHECKING:
@@ -52,16 +53,16 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     if events.num_rows:
         streams[EVENTS] = events.to_reader
     shards = {name: _shard(store, name, batches) for name, batches in sorted(streams.items())}
-    text = vars(store.put(rig.text.encode(), durable=True))
-    entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
+    text = store.put(rig.text.encode(), durable=True).to_json()
+    entry: RecordingEntry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
     files = {RIG: text}
     if any(stream.undecoded for stream in sealed.values()):  # a later driver may decode them
         with (spooled.folder / "bytes").open("rb") as spool:
             copied = functools.partial(shutil.copyfileobj, spool)
-            files[BYTES] = vars(store.put_written(copied, durable=True))
-    result = {"recordings": {"": entry}, "files": files}
+            files[BYTES] = store.put_written(copied, durable=True).to_json()
+    result: StoredResult = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
-    provenance_entry = {
+    provenance_entry: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - began_s, 4)),
         "irreplaceable": True,
     }
@@ -155,7 +156,7 @@ def _free_name(requested: str, existing_names: Iterable[str]) -> str:
     return name
 
 
-def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader]) -> dict[str, Any]:
+def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader]) -> Shard:
     from tacpipe.io import columns, parquet
 
     rows: list[int] = []
@@ -165,7 +166,7 @@ def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader
         pass  # read every block back, which compares the digest
     if not _equal_batches(parquet.stored_batches(store.object_path(stored.digest)), batches()):
         raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
-    return {"digest": stored.digest, "rows": rows[0], "bytes": stored.bytes}
+    return {**stored.to_json(), "rows": rows[0]}
 
 
 def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader) -> bool:

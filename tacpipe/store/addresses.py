@@ -53,7 +53,7 @@ class BucketAddress:
 class ClientSettings:
     """Settings of the client in addition to the address; their representation shows no credential."""
 
-    config: dict[str, Any] = field(default_factory=dict, repr=False)
+    config: dict[str, str | bool] = field(default_factory=dict, repr=False)
     provider: Any = field(default=None, repr=False)  # Provides credentials that change, such as those of roles
     plaintext: bool = False  # the server is reached without TLS
     url: str = ""  # Replaces the address if not empty
@@ -110,7 +110,9 @@ def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ
     if profile or not any(environment.get(name) for name in _OWN):
         _fill(client_settings, profile, environment)
     endpoints = (environment.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"))
-    endpoint = next((candidate for candidate in endpoints if candidate), client_settings.config.get("endpoint", ""))
+    endpoint = next(
+        (candidate for candidate in endpoints if candidate), str(client_settings.config.get("endpoint", ""))
+    )
     if endpoint:
         client_settings.config["endpoint"] = endpoint
     client_settings.plaintext = endpoint.startswith("http://")

@@ -288,16 +288,17 @@ def _connected(address: BucketAddress) -> Any:
         from obstore.store import from_url
 
     client_settings = addresses.settings(address)
-    options: dict[str, Any] = {"timeout": "120s", "connect_timeout": "5s", "allow_http": client_settings.plaintext}
-    retries: dict[str, Any] = {
-        "max_retries": RETRIES,
-        "retry_timeout": timedelta(seconds=60),
-        "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=2), "base": 2},
+    arguments: dict[str, Any] = {
+        "config": client_settings.config,
+        "client_options": {"timeout": "120s", "connect_timeout": "5s", "allow_http": client_settings.plaintext},
+        "retry_config": {
+            "max_retries": RETRIES,
+            "retry_timeout": timedelta(seconds=60),
+            "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=2), "base": 2},
+        },
     }
-    arguments: dict[str, Any] = (
-        {} if client_settings.provider is None else {"credential_provider": client_settings.provider}
-    )
-    arguments |= {"config": client_settings.config, "client_options": options, "retry_config": retries}
+    if client_settings.provider is not None:
+        arguments["credential_provider"] = client_settings.provider
     try:
         return from_url(client_settings.url or str(address), **arguments)
     except (BaseError, ValueError, TypeError):  # its text may hold a credential

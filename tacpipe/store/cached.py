@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io import terminal, threads
@@ -22,7 +21,9 @@ from tacpipe.store import addresses, layout, records
 from tacpipe.store.addresses import BucketAddress
 from tacpipe.store.backend import MAX_CONCURRENT
 from tacpipe.store.bucket import Bucket
+from tacpipe.store.records import Identity, Provenance, Record, RunProvenance, StoredResult
 from tacpipe.store.remote import RemoteStore
+from tacpipe.store.roots import RootProject
 from tacpipe.store.store import AbsentError, MissingError, Object, Store
 
 VARIABLE = "TACPIPE_CACHE"
@@ -269,7 +270,7 @@ class CachedStore(Store):
 
     # ---- records
 
-    def read_record(self, key: str) -> dict[str, Any]:
+    def read_record(self, key: str) -> Record:
         """Do as `Store.read_record`; one that is not here is brought."""
         try:
             return super().read_record(key)
@@ -281,13 +282,13 @@ class CachedStore(Store):
 
     def commit(
         self,
-        identity: Mapping[str, Any],
-        result: Mapping[str, Any],
-        provenance: Mapping[str, Any],
+        identity: Identity,
+        result: StoredResult,
+        provenance: Provenance | RunProvenance,
         *,
         replace: bool = False,
         durable: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Record:
         """Do as `Store.commit` in the bucket; the objects that the record names are uploaded first."""
         self._begin()
         self._upload([name for name in dict.fromkeys(records.digests(result)) if name in self._not_uploaded])
@@ -301,21 +302,21 @@ class CachedStore(Store):
             self.bucket.prepare()
             _stores.add(key)
 
-    def _keep_record(self, record: Mapping[str, Any], *, durable: bool = False) -> dict[str, Any]:
+    def _keep_record(self, record: Record, *, durable: bool = False) -> Record:
         """Keep a record of the bucket here, in place of any other, and return it."""
         identity, result, provenance = record["identity"], record["result"], record["provenance"]
         self._no_record.discard(digest(identity))
         self.prepare()
         return super().commit(identity, result, provenance, replace=True, durable=durable)
 
-    def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records(self) -> Iterator[tuple[str, Record]]:
         """Yield every key and its record, those of the bucket too; they are kept here."""
         keys = [Path(entry.name).stem for entry in self.bucket.files.list("records")]
         for _, record in self.bucket.records(key for key in keys if not present(self.record_path(key))):
             self._keep_record(record)
         yield from super().records()
 
-    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
         """Do as `Store.records_of`, of the records that are here: those that this computer looked for."""
         return super().records()
 
@@ -324,7 +325,7 @@ class CachedStore(Store):
     def keep(
         self,
         name: str,
-        project: Mapping[str, str],
+        project: RootProject,
         manifest: str,
         needs: Callable[[str], Mapping[str, int]],
         *,

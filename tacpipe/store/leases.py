@@ -15,11 +15,11 @@ import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, cast
 
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.io import regular, terminal
-from tacpipe.io.files import read_json, readable_errors, write_all
+from tacpipe.io.files import readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
@@ -31,12 +31,24 @@ _UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the fil
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
+class Holder(TypedDict, total=False):
+    """The process that holds a lease, as it states itself; another program may have written anything."""
+
+    host: str
+    pid: int
+    command: str
+    since_s: int  # seconds of UTC since 1970
+    what: str  # its work
+    manifests: list[str]  # digests of the manifests that it reads
+    keys: list[str]  # keys that it makes
+
+
 @dataclass
 class Run:
     """A process at work on a store, as it stated in its lease."""
 
     path: Path
-    note: dict[str, Any]
+    note: Holder
     objects: set[str] = field(default_factory=set)  # digests of what it reads, puts and reuses
 
     @property
@@ -190,10 +202,11 @@ def parsed(path: Path, content: bytes) -> Run:
     """Parse a lease: one line that describes its holder, and one line per digest that is used."""
     first, _, digests = content.decode("latin-1").partition("\n")
     try:
-        holder = json.loads(first)
+        value = json.loads(first)
     except ValueError:
-        holder = {}  # The lease is being written
-    return Run(path, holder if isinstance(holder, dict) else {}, set(digests.split()))
+        value = None  # The lease is being written
+    holder = cast("Holder", value if isinstance(value, dict) else {})
+    return Run(path, holder, set(digests.split()))
 
 
 def note(**extra: Any) -> bytes:
@@ -239,17 +252,17 @@ def _wait(path: Path, work: str, timeout_s: float) -> int:
 
 def _holder(path: Path, unknown: str = "Another process") -> str:
     """Return in words who holds a lease, and whether it is stopped."""
-    note = None
+    note: Holder = {}
     with contextlib.suppress(OSError, TacpipeError):  # The name of the holder only informs the user
-        note = read_json(path)
-    if not note or "pid" not in note:
+        note = _parsed(path).note
+    if "pid" not in note:
         return unknown
     stopped = ", which is stopped: `kill -CONT` lets it continue," if _stopped(note) else ""
     prefix = "process" if unknown[0].islower() else "Process"
     return f"{prefix} {note['pid']} on {note.get('host')} ({note.get('command')}){stopped}"
 
 
-def _stopped(note: dict[str, Any]) -> bool:
+def _stopped(note: Holder) -> bool:
     if note.get("host") != platform.node():
         return False
     try:

@@ -23,7 +23,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
@@ -96,7 +95,7 @@ def read_note(store: Store, directory: Path) -> Note | None:
     with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
         with regular.opened(file, follow=False) as reading:
             first = reading.readline(_HEAD_BYTES)
-        head: dict[str, Any] = json.loads(first)
+        head = json.loads(first)
         if head.pop("check") == digest(head) and head.pop("format") == NOTE_FORMAT:
             shelves = {shelf: tuple(values) for shelf, values in head.pop("shelves").items()}
             return Note(Head(**head), shelves, file, len(first))

@@ -1,29 +1,241 @@
-"""The ``result`` of a record: the objects that it names, and the records that name one."""
+"""The records of a store: what each states, how it is written and read, and the records that name an object."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
-from typing import Any
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast, final
 
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
+from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
-from tacpipe.store.store import Store
+
+if TYPE_CHECKING:
+    from tacpipe.plugins.stage import Attribute, Values
+    from tacpipe.store.store import Store
+
+_RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest>[0-9a-f]{64})","identity":')
+_parse_at = json.JSONDecoder().raw_decode  # maps a text and a start to the value there and its end
 
 
-def complete(store: Store, record: Mapping[str, Any]) -> bool:
+# ---- what a record holds
+
+
+class Content(TypedDict):
+    """An object: a file of a dataset. The input of a key states its digest only."""
+
+    digest: str
+    bytes: NotRequired[int]
+
+
+class Shard(Content):
+    """The object that holds a stream of a recording. The input of a key states its digest only."""
+
+    rows: NotRequired[int]
+
+
+class RecordingEntry(TypedDict):
+    """A recording in a dataset or a record."""
+
+    attributes: Mapping[str, Attribute]
+    shards: Mapping[str, Shard]  # by name of the stream
+
+
+class StoredResult(TypedDict):
+    """The ``result`` of a record. The recording of a stage that works recording by recording has the name ``""``."""
+
+    recordings: Mapping[str, RecordingEntry]
+    files: Mapping[str, Content]
+
+
+class Step(TypedDict):
+    """A stage that the recordings of a dataset went through: a link of the dataset's ``chain``."""
+
+    stage: str
+    version: int
+    params: Values
+    fitted: Mapping[str, str] | None  # digests of the files that the stage was fitted to
+
+
+@final
+class StageIdentity(TypedDict):
+    """What the key of a stage's result is the digest of."""
+
+    stage: str
+    version: int
+    params: Values
+    inputs: Values  # by name of the argument; its kind in `tacpipe.plugins.stage` decides the form
+
+
+@final
+class RunIdentity(TypedDict):
+    """What the key of a whole command is the digest of."""
+
+    run: str  # name of the stage
+    version: Sequence[int | None]  # of the stage and of its fit
+    params: Values
+    datasets: Sequence[str]  # digests of manifests
+    named: Mapping[str, str]  # digests of the manifests of models and splits, by name of the option
+    sources: Mapping[str, Mapping[str, str]]  # digests of raw files by recording
+    fold: int
+    role: str | None
+
+
+@final
+class GroupIdentity(TypedDict):
+    """What the key of the results of a group of recordings is the digest of."""
+
+    group: str  # name of the stage
+    step: Step
+    recordings: str  # digest of the inputs of all recordings
+
+
+Identity = StageIdentity | RunIdentity | GroupIdentity
+
+
+class Processor(TypedDict, total=False):
+    """The processor that computed a result."""
+
+    model: str
+    instructions: list[str]  # vector instructions that numerical kernels are chosen by
+    chosen: dict[str, str]  # environment variables that choose kernels
+    threads: int
+
+
+class Environment(TypedDict, total=False):
+    """Where and with what a result was computed. Older versions state less of it."""
+
+    libraries: dict[str, str]  # versions by name
+    git_commit: str | None
+    host: str
+    python: str
+    device: str
+    processor: Processor
+    seconds: float
+    worker: str  # of the executor
+
+
+class Provenance(Environment, total=False):
+    """How the result of a stage was computed."""
+
+    irreplaceable: bool  # no stage can compute it again
+    code: str | None  # digest of the file of the stage
+    packages: dict[str, str]  # digests of the code of plug-ins by package
+    notes: list[str]
+
+
+class Summary(TypedDict, total=False):
+    """The code that computed several results, and the notes on them."""
+
+    code: dict[str, dict[str, int]]  # number of results by stage and digest of its code
+    packages: dict[str, dict[str, int]]  # number of results by package and digest of its code
+    notes: dict[str, list[str]]  # names of recordings by note
+
+
+class RunProvenance(Environment, Summary):
+    """How the results of a command or of a group of recordings were computed."""
+
+
+class ComputedResult(TypedDict):
+    """The part of a record that a command uses after the result was computed."""
+
+    result: StoredResult
+    provenance: Provenance  # in records of a `RunIdentity` or a `GroupIdentity` a `RunProvenance`: see `summary`
+
+
+class Record(ComputedResult):
+    """A result and how it was made, stored under the digest of its identity."""
+
+    identity: Identity
+    digest: str  # of identity and result
+    check: str  # digest of the provenance
+
+
+# ---- how it is written and read
+
+
+def record_content(
+    identity: Identity, result: StoredResult, provenance: Provenance | RunProvenance
+) -> tuple[Record, bytes]:
+    """Return the record that ``identity`` gave ``result``, with digests of itself, and how it is kept."""
+    record: Record = {
+        "identity": identity,
+        "result": result,
+        "digest": digest({"identity": identity, "result": result}),
+        "provenance": cast("Provenance", provenance),
+        "check": digest(provenance),
+    }
+    return record, canonical(record)
+
+
+def summary(record: Record) -> Summary:
+    """Return the code and the notes in the record of a command or of a group of recordings; older records have none."""
+    return cast("RunProvenance", record["provenance"])
+
+
+def parse_record(content: bytes, key: str) -> Record | None:
+    """Return the record of ``key`` that JSON holds, or None if it is damaged. Raises `ValueError` if it is not JSON.
+
+    The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
+    """
+    begins = _RECORD.match(content)
+    if begins is None:  # not canonical JSON, as records of format 1 may be
+        record: Record = json.loads(content)
+        return record if _sound(record, key) else None
+    text = content.decode("ascii")
+    identity, identity_end = _parse_at(text, begins.end())
+    provenance_start = _after(text, identity_end, ',"provenance":')
+    provenance, provenance_end = _parse_at(text, provenance_start)
+    result_start = _after(text, provenance_end, ',"result":')
+    result, result_end = _parse_at(text, result_start)
+    if text[result_end:] != "}":
+        return None
+    check, digest_of_body = begins["check"].decode(), begins["digest"].decode()
+    identity_text = content[begins.end() : identity_end]
+    body = b'{"identity":%b,"result":%b}' % (identity_text, content[result_start:result_end])
+    if (
+        bytes_digest(identity_text) != key
+        or bytes_digest(body) != digest_of_body
+        or bytes_digest(content[provenance_start:provenance_end]) != check
+    ):
+        return None
+    return {"identity": identity, "result": result, "digest": digest_of_body, "provenance": provenance, "check": check}
+
+
+def _after(text: str, start: int, words: str) -> int:
+    """Return where ``text`` continues after ``words``, which must stand at ``start``. Raises `ValueError`."""
+    if not text.startswith(words, start):
+        raise ValueError(f"{words} is missing")
+    return start + len(words)
+
+
+def _sound(record: Record, key: str) -> bool:
+    """Return whether a record belongs to the key and is unchanged since it was written."""
+    identity, result = canonical(record["identity"]), canonical(record["result"])  # once: a store has many records
+    body = b'{"identity":%b,"result":%b}' % (identity, result)
+    is_valid = set(record) == {"identity", "result", "digest", "provenance", "check"}
+    is_valid = is_valid and record["check"] == digest(record["provenance"])
+    return is_valid and bytes_digest(identity) == key and bytes_digest(body) == record["digest"]
+
+
+# ---- the objects that it names
+
+
+def complete(store: Store, record: ComputedResult) -> bool:
     """Return whether the store has every object of the record in its full size; announces them first."""
     store.announce(digests(record["result"]))
     return all(store.has(content["digest"], content["bytes"]) for content in _objects(record["result"]))
 
 
-def digests(result: Mapping[str, Any]) -> Iterator[str]:
+def digests(result: StoredResult) -> Iterator[str]:
     """Yield the digests of all shards and files of a record's ``result`` (or of a manifest)."""
     return (content["digest"] for content in _objects(result))
 
 
-def naming(store: Store, name: str, written_s: float) -> Iterator[dict[str, Any]]:
+def naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
     """Yield the records that contain the digest ``name``, those written closest to ``written_s`` first.
 
     A record is written just before its result is published, so few records are read.
@@ -42,7 +254,7 @@ def naming(store: Store, name: str, written_s: float) -> Iterator[dict[str, Any]
             yield record
 
 
-def _objects(result: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def _objects(result: StoredResult) -> Iterator[Content]:
     for entry in result["recordings"].values():
         yield from entry["shards"].values()
     yield from result["files"].values()

@@ -16,7 +16,6 @@ import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular, threads
@@ -25,8 +24,17 @@ from tacpipe.printable import plain
 from tacpipe.store import layout, leases
 from tacpipe.store.backend import MAX_CONCURRENT, Backend, Entry, read_twice
 from tacpipe.store.leases import LEASE_BYTES, Run
+from tacpipe.store.records import (
+    Identity,
+    Provenance,
+    Record,
+    RunProvenance,
+    StoredResult,
+    parse_record,
+    record_content,
+)
 from tacpipe.store.remote_roots import RemoteRoots
-from tacpipe.store.store import AbsentError, MissingError, Object, parse_record, read_limit, record_content
+from tacpipe.store.store import AbsentError, MissingError, Object, read_limit
 
 SNAPSHOTS = "snapshots"  # Keys of the records of each manifest, so that a pull reads only these
 _LISTED = 12  # looks that cost as much as a list of 1,000 names, on S3
@@ -265,12 +273,12 @@ class RemoteStore:
 
     def commit(
         self,
-        identity: Mapping[str, Any],
-        result: Mapping[str, Any],
-        provenance: Mapping[str, Any],
+        identity: Identity,
+        result: StoredResult,
+        provenance: Provenance | RunProvenance,
         *,
         replace: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Record:
         """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
 
         An existing record stays valid unless it is damaged or ``replace`` is set.
@@ -288,7 +296,7 @@ class RemoteStore:
             f"Others replace the record {key[:12]} in {self.place} all the time. Run the same command again."
         )
 
-    def record(self, key: str) -> dict[str, Any] | None:
+    def record(self, key: str) -> Record | None:
         """Return the record of ``key``, or None; a damaged one counts as none."""
         return self._record(key)[1]
 
@@ -302,7 +310,7 @@ class RemoteStore:
         entries = list(self.files.list(f"{SNAPSHOTS}/{manifest}"))
         return {key for entry in entries for key in self._keys(entry.name)}
 
-    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
         """Yield the records that belong to a manifest, with their keys: as was noted, else all of the store's."""
         return self.records(self.noted(manifest) or None)
 
@@ -314,7 +322,7 @@ class RemoteStore:
                 return [key for key in keys if isinstance(key, str) and DIGEST.fullmatch(key)]
         return []
 
-    def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
         """Yield keys and their records, by default all; damaged ones count as none."""
         if keys is None:
             keys = [Path(entry.name).stem for entry in self.files.list("records")]
@@ -322,8 +330,8 @@ class RemoteStore:
             if record is not None:
                 yield key, record
 
-    def _record(self, key: str) -> tuple[str, dict[str, Any] | None]:
-        def parse(content: bytes) -> dict[str, Any] | None:
+    def _record(self, key: str) -> tuple[str, Record | None]:
+        def parse(content: bytes) -> Record | None:
             with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 regular.expect_parsed(key, len(content))
                 return parse_record(content, key)

@@ -5,17 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import threads
 from tacpipe.store.backend import MAX_CONCURRENT, Backend, read_twice
-from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, decoded, encoded, name_of, project_id, succeeding
+from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, RootProject, decoded, encoded, name_of, project_id, succeeding
 
-_OUTPUT = "output"  # Marks a root that a command wrote with the bucket as its store
-_NUMBER = "number"  # Version that a root was read from; it is not stored
 _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 
 
@@ -59,7 +56,7 @@ class RemoteRoots:
     def push(
         self,
         name: str,
-        project: Mapping[str, str],
+        project: RootProject,
         manifest: str,
         before: Root | None,
         *,
@@ -71,19 +68,18 @@ class RemoteRoots:
         Pushed versions stay in the history until they are forgotten. The ``output`` of a command is no snapshot: the next
         output replaces it, unless it is ``lasting``. Returns False without a change if another push came first.
         """
-        is_snapshot = before is not None and not before.get(_OUTPUT)  # True for a snapshot
+        is_snapshot = before is not None and not before.get("output")  # True for a snapshot
         same = before is not None and before["manifest"] == manifest and before.get("project") == project
         if same and (output or is_snapshot):
             return True
-        root = {"path": name, "kind": PUSHED, "project": dict(project)}
-        number = before.get(_NUMBER, 0) if before is not None and _name(before) == _name(root) else 0
-        succeeded = succeeding(before, manifest, lasting=lasting)
+        root = succeeding(before, name, PUSHED, manifest, lasting=lasting)
+        root["project"] = project
         if before is not None and not is_snapshot and not lasting:
-            succeeded["history"] = [
-                version for version in succeeded["history"] if version["manifest"] != before["manifest"]
-            ]
-        flags = {_OUTPUT: True} if output else {}
-        return self._succeed({**root, **succeeded, **flags, _NUMBER: number})
+            root["history"] = [version for version in root["history"] if version["manifest"] != before["manifest"]]
+        root["number"] = before.get("number", 0) if before is not None and _name(before) == _name(root) else 0
+        if output:
+            root["output"] = True
+        return self._succeed(root)
 
     def write(self, root: Root) -> None:
         """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` if another one came first."""
@@ -105,8 +101,8 @@ class RemoteRoots:
 
     def _succeed(self, root: Root) -> bool:
         name = _name(root)
-        number = root[_NUMBER] + 1
-        if not self.files.create(_version(name, number), encoded({key: root[key] for key in root if key != _NUMBER})):
+        number = root["number"] + 1
+        if not self.files.create(_version(name, number), encoded(root)):
             return False
         if number > 2:  # the version before stays, so that whoever read that one is refused this number
             self.files.delete(_version(name, number - 2))
@@ -121,7 +117,7 @@ class RemoteRoots:
         number, file = version
         with contextlib.suppress(FileNotFoundError):
             root = read_twice(self.files, file, ROOT_BYTES, _parse)
-            return None if root is None else {**root, _NUMBER: number}
+            return None if root is None else {**root, "number": number}
         return None
 
     def _versions(self, only: str = "") -> dict[str, list[tuple[int, str]]]:
@@ -142,7 +138,7 @@ def _parse(content: bytes) -> Root | None:
     return None
 
 
-def _name(root: Mapping[str, Any]) -> str:
+def _name(root: Root) -> str:
     return name_of(root["kind"], str(root["path"]), project_id(root))
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeGuard
 
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
@@ -18,14 +17,45 @@ if TYPE_CHECKING:
     from tacpipe.store.store import Store
 
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
-# {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach. "pushed" are
-# manifests of this path that went to other stores, newest first; of what was pushed here, "project" states whose it is;
-# "key" names the run that gave the manifest, or what it was labelled in
-Root = dict[str, Any]
 ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
 PUSHES = 100  # manifests of a path that are remembered as pushed
 _MAX_TIME_S = 1 << 40  # a time in a root is no later: the year 36,812
+
+
+class RootProject(TypedDict):
+    """The project that pushed a root."""
+
+    id: str
+    name: str
+
+
+class WrittenManifest(TypedDict):
+    """A manifest that a path holds or held."""
+
+    manifest: str  # digest
+    written_s: NotRequired[int]  # seconds of UTC since 1970
+
+
+class EarlierManifest(WrittenManifest):
+    """A manifest that a path held before."""
+
+    lasting: bool  # it is remembered for ever
+
+
+class Root(WrittenManifest):
+    """A path, or the name under which a project pushed, and the manifest that it holds."""
+
+    path: str
+    kind: str
+    previous: NotRequired[str | None]  # digest of the manifest before
+    history: NotRequired[list[EarlierManifest]]  # newest first
+    key: NotRequired[str]  # the run that gave the manifest, or what it was labelled in
+    pushed: NotRequired[list[str]]  # manifests of this path that went to other stores, newest first
+    project: NotRequired[RootProject]
+    missing_since_s: NotRequired[int]  # when the path was first out of reach
+    output: NotRequired[bool]  # a command wrote it, with the bucket as its store
+    number: NotRequired[int]  # version that it was read from in a store without locks; it is not stored
 
 
 class Roots:
@@ -42,9 +72,12 @@ class Roots:
         kind, name = self.kind_and_name(path)
         current = self.get(path)
         if current is None or current["manifest"] != manifest:
-            pushed = {"pushed": current["pushed"]} if current and "pushed" in current else {}
-            extra = {**pushed, **({"key": key} if key else {})}
-            self.write({"path": name, "kind": kind, **succeeding(current, manifest, lasting=lasting), **extra})
+            root = succeeding(current, name, kind, manifest, lasting=lasting)
+            if current and "pushed" in current:
+                root["pushed"] = current["pushed"]
+            if key:
+                root["key"] = key
+            self.write(root)
         if durable:
             self.store.sync(self._file(kind, name))
 
@@ -52,15 +85,14 @@ class Roots:
         """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
         return self.at(self._file(*self.kind_and_name(path)))
 
-    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
-        """Note that a project (``id`` and ``name``) pushed ``manifest`` as its dataset ``name``, after ``before``.
+    def push(self, name: str, project: RootProject, manifest: str, before: Root | None, *, lasting: bool) -> bool:
+        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``.
 
         What was pushed before it stays in the history, for ever where that is ``lasting``. Returns True: a lease sees to it
         that nobody else pushes that name at the same time.
         """
-        root = {"path": name, "kind": PUSHED, "project": dict(project)}
         if before is None or before["manifest"] != manifest or before.get("project") != project:
-            self.write({**root, **succeeding(before, manifest, lasting=lasting)})
+            self.write({**succeeding(before, name, PUSHED, manifest, lasting=lasting), "project": project})
         self.store.sync(self._file(PUSHED, name, project["id"]))
         return True
 
@@ -87,7 +119,7 @@ class Roots:
                 with readable_errors(self.store.root):
                     file.unlink(missing_ok=True)
 
-    def write(self, root: Mapping[str, Any]) -> None:
+    def write(self, root: Root) -> None:
         """Replace a root, as `all` gave it or with more to state."""
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
@@ -148,32 +180,37 @@ def name_of(kind: str, name: str, project: str = "") -> str:
     return digest(parts)
 
 
-def encoded(root: Mapping[str, Any]) -> bytes:
+def encoded(root: Root) -> bytes:
     """Return a root as it is kept, with a digest of itself."""
-    content = {key: value for key, value in root.items() if key != "check"}
+    content = {key: value for key, value in root.items() if key not in ("check", "number")}
     return json.dumps({**content, "check": digest(content)}, sort_keys=True).encode()
 
 
-def decoded(value: Any) -> Root | None:
+def decoded(value: object) -> Root | None:
     """Return the root that a JSON value holds, None for one that is damaged."""
-    root: Root = dict(value) if isinstance(value, dict) else {}
+    root = dict(value) if isinstance(value, dict) else {}
     check = root.pop("check", None)
     return root if check is not None and check == digest(root) and _formed(root) else None
 
 
-def project_id(root: Mapping[str, Any]) -> str:
+def project_id(root: Root) -> str:
     """Return the id of the project that pushed a root, or empty if none did."""
-    return str(root.get("project", {}).get("id", ""))
+    return root["project"]["id"] if "project" in root else ""
 
 
-def succeeding(current: Root | None, manifest: str, *, lasting: bool) -> Root:
-    """Return the fields of a root for ``manifest`` and its history, which begins with the manifest of ``current``."""
-    history = [] if current is None else _history(current, manifest, lasting=lasting)
-    previous = None if current is None else current["manifest"]
-    return {"manifest": manifest, "previous": previous, "written_s": int(time.time()), "history": history}
+def succeeding(current: Root | None, path: str, kind: str, manifest: str, *, lasting: bool) -> Root:
+    """Return the root for ``manifest``, whose history begins with the manifest of ``current``."""
+    return {
+        "path": path,
+        "kind": kind,
+        "manifest": manifest,
+        "previous": None if current is None else current["manifest"],
+        "written_s": int(time.time()),
+        "history": [] if current is None else _history(current, manifest, lasting=lasting),
+    }
 
 
-def _formed(root: Root) -> bool:
+def _formed(root: dict[object, Any]) -> TypeGuard[Root]:
     """Return whether the values of a root have the right types: another program may have written it."""
     project, history = root.get("project", {"id": "", "name": ""}), root.get("history", [])
     if not (
@@ -194,9 +231,13 @@ def _formed(root: Root) -> bool:
     )
 
 
-def _history(current: Root, manifest: str, *, lasting: bool) -> list[dict[str, Any]]:
+def _history(current: Root, manifest: str, *, lasting: bool) -> list[EarlierManifest]:
     """Return the versions before ``manifest``, newest first: all lasting ones and `HISTORY` others."""
-    newest = {"manifest": current["manifest"], "written_s": current.get("written_s", 0), "lasting": lasting}
+    newest: EarlierManifest = {
+        "manifest": current["manifest"],
+        "written_s": current.get("written_s", 0),
+        "lasting": lasting,
+    }
     older = [
         version for version in current.get("history", []) if version["manifest"] not in (manifest, newest["manifest"])
     ]

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
-import re
 import shutil
 import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import files, memory, regular, terminal
 from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
-from tacpipe.io.hashing import bytes_digest, canonical, digest
+from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout
 from tacpipe.store.backend import Directory
 from tacpipe.store.leases import Announcing, Leases
+from tacpipe.store.records import (
+    Content,
+    Identity,
+    Provenance,
+    Record,
+    RunProvenance,
+    StoredResult,
+    parse_record,
+    record_content,
+)
 from tacpipe.store.roots import Roots
-
-_RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest>[0-9a-f]{64})","identity":')
-_parse_at = json.JSONDecoder().raw_decode  # maps a text and a start to the value there and its end
 
 
 class MissingError(DamagedError):
@@ -43,6 +47,10 @@ class Object:
 
     digest: str
     bytes: int
+
+    def to_json(self) -> Content:
+        """Return it as records and manifests state it."""
+        return {"digest": self.digest, "bytes": self.bytes}
 
 
 class Store:
@@ -347,14 +355,14 @@ class Store:
 
     # ---- records
 
-    def record(self, key: str) -> dict[str, Any] | None:
+    def record(self, key: str) -> Record | None:
         """Return the record of ``key``, or None; a damaged one is quarantined and counts as none."""
         try:
             return self.read_record(key)
         except MissingError:
             return None
 
-    def read_record(self, key: str) -> dict[str, Any]:
+    def read_record(self, key: str) -> Record:
         """Return the record of ``key``.
 
         Raises `AbsentError` if there is none, and `MissingError` if it is damaged: it is then in ``quarantine/``.
@@ -378,13 +386,13 @@ class Store:
 
     def commit(
         self,
-        identity: Mapping[str, Any],
-        result: Mapping[str, Any],
-        provenance: Mapping[str, Any],
+        identity: Identity,
+        result: StoredResult,
+        provenance: Provenance | RunProvenance,
         *,
         replace: bool = False,
         durable: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Record:
         """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
 
         ``replace`` is for results whose old record names missing objects.
@@ -410,70 +418,16 @@ class Store:
         """Return nothing, as `note_records` notes nothing."""
         return set()
 
-    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
         """Yield records and their keys, among them all that belong to a manifest: those of the store."""
         return self.records()
 
-    def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
+    def records(self) -> Iterator[tuple[str, Record]]:
         """Yield every key and its record."""
         for key in layout.names(self.root, "records"):
             record = self.record(key)
             if record is not None:
                 yield key, record
-
-
-def record_content(
-    identity: Mapping[str, Any], result: Mapping[str, Any], provenance: Mapping[str, Any]
-) -> tuple[dict[str, Any], bytes]:
-    """Return the record that ``identity`` gave ``result``, with digests of itself, and how it is kept."""
-    body = {"identity": identity, "result": result}
-    record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
-    return record, canonical(record)
-
-
-def parse_record(content: bytes, key: str) -> dict[str, Any] | None:
-    """Return the record of ``key`` that JSON holds, or None if it is damaged. Raises `ValueError` if it is not JSON.
-
-    The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
-    """
-    begins = _RECORD.match(content)
-    if begins is None:  # not canonical JSON, as records of format 1 may be
-        record: dict[str, Any] = json.loads(content)
-        return record if sound(record, key) else None
-    text = content.decode("ascii")
-    identity, identity_end = _parse_at(text, begins.end())
-    provenance_start = _after(text, identity_end, ',"provenance":')
-    provenance, provenance_end = _parse_at(text, provenance_start)
-    result_start = _after(text, provenance_end, ',"result":')
-    result, result_end = _parse_at(text, result_start)
-    if text[result_end:] != "}":
-        return None
-    check, digest_of_body = begins["check"].decode(), begins["digest"].decode()
-    identity_text = content[begins.end() : identity_end]
-    body = b'{"identity":%b,"result":%b}' % (identity_text, content[result_start:result_end])
-    if (
-        bytes_digest(identity_text) != key
-        or bytes_digest(body) != digest_of_body
-        or bytes_digest(content[provenance_start:provenance_end]) != check
-    ):
-        return None
-    return {"identity": identity, "result": result, "digest": digest_of_body, "provenance": provenance, "check": check}
-
-
-def _after(text: str, start: int, words: str) -> int:
-    """Return where ``text`` continues after ``words``, which must stand at ``start``. Raises `ValueError`."""
-    if not text.startswith(words, start):
-        raise ValueError(f"{words} is missing")
-    return start + len(words)
-
-
-def sound(record: dict[str, Any], key: str) -> bool:
-    """Return whether a record belongs to the key and is unchanged since it was written."""
-    identity, result = canonical(record["identity"]), canonical(record["result"])  # once: a store has many records
-    body = b'{"identity":%b,"result":%b}' % (identity, result)
-    is_valid = set(record) == {"identity", "result", "digest", "provenance", "check"}
-    is_valid = is_valid and record["check"] == digest(record["provenance"])
-    return is_valid and bytes_digest(identity) == key and bytes_digest(body) == record["digest"]
 
 
 def read_limit(size: int) -> int:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.selection import chain_difference
 from tacpipe.errors import UsageError
+from tacpipe.store.records import Step
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -25,7 +26,7 @@ class OpenedChain:
     model: Dataset
 
     @property
-    def steps(self) -> Sequence[Mapping[str, Any]]:
+    def steps(self) -> Sequence[Step]:
         """The stages one by one, as manifests name them."""
         return self.model.source.chain
 
@@ -51,7 +52,7 @@ def open_for_model(recordings: Dataset | Recording, chain: OpenedChain | None) -
     return by_recording.run_chain_of_model(recordings, chain.model)
 
 
-def _check(expected: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:
+def _check(expected: Sequence[Step], recordings: Dataset) -> None:
     chain = recordings.source.chain
     if list(chain) != list(expected[: len(chain)]):
         raise UsageError(
@@ -66,7 +67,7 @@ def _check(expected: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:
         )
 
 
-def _command(step: Mapping[str, Any]) -> str:
+def _command(step: Step) -> str:
     """Return the command of a link of a chain, with the params that are not the default."""
     from tacpipe.plugins import params, registry
 

@@ -254,9 +254,10 @@ def track_stored(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
     names, identities_of = [], functools.cache(identities_of_manifests)
     for path, entry in zip(paths, stored, strict=True):
         store = locate(entry.directory)
-        identity, run_manifest = identities_of(store).get(entry.digest, {}), entry.manifest
-        params = {**run_manifest.params, "stage": run_manifest.stage, "fold": identity.get("fold", 0)}
-        name = name_of(path, digest(identity) if identity else entry.digest)
+        identity, run_manifest = identities_of(store).get(entry.digest), entry.manifest
+        fold = 0 if identity is None else identity.get("fold", 0)
+        params = {**run_manifest.params, "stage": run_manifest.stage, "fold": fold}
+        name = name_of(path, entry.digest if identity is None else digest(identity))
         Tracking(open_trackers(trackers), name, flat_params(params)).finish(path, files(run_manifest, store))
         names.append(name)
     return names

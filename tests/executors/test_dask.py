@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tacpipe.engine.executors import dask
-from tacpipe.engine.keys import WorkerTask
+from tacpipe.engine.keys import WorkerTask, identity
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Apart
 from tests.executors.test_ends import records, start_command, wait_for_one_more
@@ -99,7 +99,7 @@ def test_a_collection_beside_a_worker_takes_nothing_that_it_made(lab: Lab, sched
 
 
 def test_tasks_are_named_by_absolute_paths() -> None:
-    task = WorkerTask("store", "ingest.numbers", {}, files={"a": "raw/a.txt"})
+    task = WorkerTask("store", "ingest.numbers", identity("ingest.numbers", 1, {}, {}), files={"a": "raw/a.txt"})
     files = dask._absolute(task).files
     assert files is not None and files["a"].startswith("/") and files["a"].endswith("raw/a.txt")
 

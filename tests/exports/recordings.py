@@ -13,6 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.datasets import directory
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.io.parquet import to_parquet
+from tacpipe.store.records import RecordingEntry, Shard
 from tacpipe.store.store import Store
 
 START_NS = 1_700_000_000_123_456_789
@@ -102,10 +103,10 @@ def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -
     """Write recordings as a dataset of the project in the working directory; return its directory."""
     store = Store(Path(".tacpipe").absolute())
     store.prepare()
-    recordings = {}
+    recordings: dict[str, RecordingEntry] = {}
     for name, (tables, attributes) in given.items():
-        shards = {
-            stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
+        shards: dict[str, Shard] = {
+            stream: {**store.put(to_parquet(table)).to_json(), "rows": table.num_rows}
             for stream, table in sorted(tables.items())
         }
         recordings[name] = {"attributes": dict(sorted(attributes.items())), "shards": shards}

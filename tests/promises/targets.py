@@ -39,6 +39,7 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
 from tacpipe.recording import rig, spool, spool_folders
 from tacpipe.sensors.framing import Chunks
+from tacpipe.store.records import Content, RecordingEntry, Shard, Step
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
@@ -123,15 +124,16 @@ def _parquets() -> list[bytes]:
     return [to_parquet(pa.table(columns)), to_parquet(small), to_parquet(small.slice(0, 0)), foreign.getvalue()]
 
 
-CHAIN = [{"stage": "ingest.xela-flat", "version": 1, "params": {}, "fitted": None}]
+CHAIN: list[Step] = [{"stage": "ingest.xela-flat", "version": 1, "params": {}, "fitted": None}]
 
 
 @functools.cache
 def _manifests() -> list[bytes]:
-    shard = {"digest": digest("a"), "rows": 5, "bytes": 500}
-    entry = {"attributes": {"material": "cork", "trial": 3}, "shards": {"xela1": shard, "robot": shard}}
+    shard: Shard = {"digest": digest("a"), "rows": 5, "bytes": 500}
+    file: Content = {"digest": digest("a"), "bytes": 500}
+    entry: RecordingEntry = {"attributes": {"material": "cork", "trial": 3}, "shards": {"xela1": shard, "robot": shard}}
     full_manifest = manifest.Manifest(
-        "synchronize", 2, {"rate_hz": 50.0}, recordings={"trial-01": entry}, files={"codec.json": shard}, chain=CHAIN
+        "synchronize", 2, {"rate_hz": 50.0}, recordings={"trial-01": entry}, files={"codec.json": file}, chain=CHAIN
     )
     return [full_manifest.content, manifest.Manifest("split", 1).content]
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.recording import appending
+from tacpipe.store.records import RecordingEntry
 
-ENTRY: dict[str, Any] = {"attributes": {}, "shards": {}}
+ENTRY: RecordingEntry = {"attributes": {}, "shards": {}}
 
 
 @pytest.mark.parametrize(

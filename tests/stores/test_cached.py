@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import computing
-from tacpipe.engine.keys import Done, WorkerTask
+from tacpipe.engine.keys import Done, WorkerTask, identity
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location, records
@@ -628,11 +628,11 @@ def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_loo
 ) -> None:
     command = SIMULATE.replace("--trials 3", "--trials 12")
     computers.run("first", command)
-    tasks = {"scale": [], "simulate.toy": []}  # type: ignore[var-annotated]
+    tasks: dict[str, list[WorkerTask]] = {"scale": [], "simulate.toy": []}
     for _, record in computers.store.records():
-        identity = record["identity"]
-        if identity.get("stage") in tasks:
-            tasks[identity["stage"]].append(WorkerTask(computers.address, identity["stage"], identity))
+        key = record["identity"]
+        if "stage" in key and key["stage"] in tasks:
+            tasks[key["stage"]].append(WorkerTask(computers.address, key["stage"], key))
     computers.enter("second")
     results = list(computing.compute.compute_all(tasks["simulate.toy"]))
     assert len(results) == 12 and not any(task.is_new for task in results)
@@ -856,4 +856,4 @@ def test_a_record_that_others_replace_all_the_time_is_an_error(
 ) -> None:
     monkeypatch.setattr(files, "create", lambda name, content: False)
     with pytest.raises(TacpipeError, match="again"):
-        RemoteStore(files).commit({"stage": "x"}, {"recordings": {}, "files": {}}, {}, replace=True)
+        RemoteStore(files).commit(identity("x", 1, {}, {}), {"recordings": {}, "files": {}}, {}, replace=True)

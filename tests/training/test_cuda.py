@@ -94,6 +94,8 @@ def test_stages_of_a_chain_that_run_at_the_same_time_train_on_a_gpu_each(project
     devices = [
         record["provenance"]["device"]
         for _, record in Store(project / ".tacpipe").records()
-        if record["identity"].get("stage") == "train.forward" and record["identity"]["params"].get("seed") in (1, 2, 3)
+        if "stage" in (identity := record["identity"])
+        and identity["stage"] == "train.forward"
+        and identity["params"].get("seed") in (1, 2, 3)
     ]
     assert devices == ["cuda"] * 3
