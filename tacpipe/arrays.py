@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 AnyArray = NDArray[Any]
+ArrayType = np.dtype[Any]
 AnyFloats = NDArray[np.floating[Any]]  # any precision
 Floats = NDArray[np.float64]
 Float32s = NDArray[np.float32]

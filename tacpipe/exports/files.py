@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from tacpipe.errors import StorageError
 from tacpipe.exports.contents import Contents, stream_label
@@ -39,13 +40,13 @@ class Files(Mapping[str, bytes]):
 
 
 class Scratch(io.RawIOBase):
-    """A temporary file for HDF5, whose writes never fail: HDF5 crashes the process where one does, as on a full disk.
+    """A temporary file whose writes never fail: HDF5 crashes the process where one does, as on a full disk.
 
-    `check` raises what went wrong; nothing is written any more after that.
+    `check` raises what went wrong; nothing is written any more after that. The file is closed with the last reference to it.
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  (closed by `copied`)
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  (closed by `close`)
         self._error: OSError | None = None
 
     def write(self, content: Any) -> int:
@@ -81,17 +82,26 @@ class Scratch(io.RawIOBase):
         """Return the position."""
         return self._file.tell()
 
-    def check(self) -> IO[bytes]:
-        """Return the file. Raises `StorageError` if a write failed."""
+    def close(self) -> None:
+        """Close the file, which removes it."""
+        self._file.close()
+        super().close()
+
+    def piece(self, offset: int, size: int) -> bytes:
+        """Return a part of what was written."""
+        return os.pread(self._file.fileno(), size, offset)
+
+    def check(self) -> Self:
+        """Return the file itself. Raises `StorageError` if a write failed."""
         if self._error is not None:
             raise StorageError(
                 f"The folder of temporary files {tempfile.gettempdir()} cannot be written: {self._error.strerror}. Free "
                 f"some space or set TMPDIR to another folder, and run the same command again."
             )
-        return self._file
+        return self
 
 
-def copy_to_sink(file: IO[bytes]) -> Callable[[Any], None]:
+def copy_to_sink(file: Scratch) -> Callable[[Any], None]:
     """Return a function that copies a file to the one that it is given, and closes it."""
 
     def write(sink: Any) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray
+from tacpipe.arrays import AnyArray, ArrayType
 from tacpipe.channels.streams import GRID, TRUTH
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.exports import contents
@@ -76,14 +76,14 @@ def synchronize_stage(rate_hz: float | None, master: str) -> dict[str, dict[str,
     return {SYNCHRONIZE: {"rate_hz": rate_hz, **({"master": master} if master else {})}}
 
 
-def synchronized_table(recording: Recording) -> pa.Table:
-    """Return the table of a synchronized recording. Raises `UsageError` for one that is not."""
+def synchronized_columns(recording: Recording) -> Columns:
+    """Return the columns of a synchronized recording. Raises `UsageError` for one that is not."""
     if set(recording.streams) != {""} or GRID not in recording.attributes:
         raise UsageError(
             f"Recording {recording.name} is not synchronized, and the format has one rate for all streams. Give "
             f"--rate-hz, or the output of `tacpipe {SYNCHRONIZE}`."
         )
-    return recording.table()
+    return recording.columns()
 
 
 def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
@@ -158,30 +158,53 @@ def state_channels(all_channels: Sequence[Channel], streams: Sequence[str]) -> l
     ]
 
 
-def actions(table: pa.Table, all_channels: Sequence[Channel], stream: str) -> tuple[list[Channel], AnyArray]:
-    """Return the channels of the actions and their values (time, channel), float32.
+def action_channels(all_channels: Sequence[Channel], stream: str) -> tuple[list[Channel], bool]:
+    """Return the channels of the actions, and whether an action is their value one frame later.
 
     These are the targets that ``stream`` recorded, at the same frame; without targets its measured state one frame later,
     where the last frame repeats its own. Raises `UsageError` for a stream that is not there.
     """
     targets = [channel for channel in all_channels if channel.stream == stream and channel.quantity.startswith(TARGETS)]
-    chosen = targets or state_channels(all_channels, [stream])
-    values = matrix(table, chosen, np.dtype(np.float32))
-    return chosen, values if targets else np.concatenate([values[1:], values[-1:]])
+    return targets or state_channels(all_channels, [stream]), not targets
 
 
-def matrix(table: pa.Table, chosen: Sequence[Channel], kind: np.dtype[np.generic] | None = None) -> AnyArray:
-    """Return channels as one array (time, channel), of their common type or of ``kind``."""
-    with np.errstate(over="ignore"):
-        values = np.column_stack([table.column(channel.name).to_numpy() for channel in chosen])
-        return values if kind is None else values.astype(kind)
+def common_type(columns: Columns, chosen: Sequence[Channel]) -> ArrayType:
+    """Return the smallest type that holds every value of some channels; a missing integer is NaN, so float64 holds it."""
+    return np.result_type(*(_channel_type(columns, channel) for channel in chosen))
 
 
-def rounded_channels(table: pa.Table, chosen: Sequence[Channel]) -> list[Channel]:
+def _channel_type(columns: Columns, channel: Channel) -> ArrayType:
+    kind = np.dtype(columns.schema.field(channel.name).type.to_pandas_dtype())
+    missing = kind.kind in "iub" and columns.column(channel.name).null_count
+    return np.dtype(np.float64) if missing else kind
+
+
+def value_blocks(
+    columns: Columns, chosen: Sequence[Channel], kind: ArrayType, *, later: bool = False
+) -> Iterator[AnyArray]:
+    """Yield the values of channels (time, channel) as ``kind``, some rows at a time.
+
+    With ``later``, each row has the values of the next one, and the last row its own.
+    """
+    waiting: AnyArray | None = None
+    for table in columns.batches([channel.name for channel in chosen]):
+        with np.errstate(over="ignore"):
+            values = np.column_stack([table.column(channel.name).to_numpy() for channel in chosen]).astype(kind)
+        if not later:
+            yield values
+            continue
+        if waiting is not None:
+            yield np.concatenate([waiting[1:], values[:1]])
+        waiting = values
+    if waiting is not None:
+        yield np.concatenate([waiting[1:], waiting[-1:]])
+
+
+def rounded_channels(columns: Columns, chosen: Sequence[Channel]) -> list[Channel]:
     """Return the channels that float32 does not hold exactly."""
     lossy = []
     for channel in chosen:
-        values = table.column(channel.name).to_numpy()
+        values = columns.column(channel.name).to_numpy()
         with np.errstate(over="ignore"):
             back = values.astype(np.float32).astype(values.dtype)
         if not np.array_equal(values, back, equal_nan=values.dtype.kind == "f"):

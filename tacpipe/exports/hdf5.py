@@ -11,9 +11,9 @@ Example: tacpipe export hdf5 data/recordings -o exports/hdf5
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import IO, TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, files
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.exports.arrays import Array
+    from tacpipe.exports.arrays import FrameArray
+    from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Roles
 
     Parts = Dataset
@@ -136,7 +137,7 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
     return Result(files=Files({files.README_NAME: text}), notes=notes, written=writers)
 
 
-def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> IO[bytes]:
+def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
     """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes.
 
     What it does not carry is added to ``losses``, what it carries to ``columns``.
@@ -201,13 +202,51 @@ def _storage(values: AnyArray) -> dict[str, Any]:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 
 
+def _array_dataset(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.Dataset:
+    """Write an array of a demonstration chunk by chunk; the file is that of an array that is written at once."""
+    import h5py
+
+    path, kind, shape = _demo_path(array), array.type_in(columns), array.shape(columns.num_rows)
+    place, _, name = path.rpartition("/")
+    group = demo.require_group(place) if place else demo
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_obj_track_times(False)  # the same recording gives the same bytes
+    if shape[0]:
+        layout.set_chunk((min(shape[0], CHUNK_ROWS), *shape[1:]))
+        layout.set_shuffle()
+        layout.set_deflate(LEVEL)
+    space = h5py.h5s.create_simple(shape)
+    dataset = h5py.h5d.create(group.id, name.encode(), h5py.h5t.py_create(kind, logical=True), space, dcpl=layout)
+    for first_row, values in _chunks(array.blocks(columns, kind)):
+        space.select_hyperslab((first_row, *(0 for _ in shape[1:])), values.shape)
+        dataset.write(h5py.h5s.create_simple(values.shape), space, values)
+    return h5py.Dataset(dataset)
+
+
+def _chunks(blocks: Iterable[AnyArray]) -> Iterator[tuple[int, AnyArray]]:
+    """Yield the rows of blocks in whole chunks, each with the number of its first row; a chunk is so compressed once."""
+    import numpy as np
+
+    waiting: list[AnyArray] = []
+    first_row = count = 0
+    for block in blocks:
+        waiting.append(block)
+        count += len(block)
+        while count >= CHUNK_ROWS:
+            rows = np.concatenate(waiting)
+            yield first_row, rows[:CHUNK_ROWS]
+            waiting, count, first_row = [rows[CHUNK_ROWS:]], count - CHUNK_ROWS, first_row + CHUNK_ROWS
+    if count:
+        yield first_row, np.concatenate(waiting)
+
+
 def _demos(
     params: Params,
     recordings: Dataset,
     columns: Sequence[str],
     roles: Mapping[str, str],
     losses: list[tuple[str, Loss]],
-) -> IO[bytes]:
+) -> Scratch:
     """Return a temporary file with all demonstrations; what it does not carry of a recording is added to ``losses``."""
     import h5py
 
@@ -221,10 +260,10 @@ def _demos(
         total = 0
         for number, recording in enumerate(recordings):
             demo = data.create_group(f"demo_{number}", track_order=True)
-            table = frames.synchronized_table(recording).select(columns)
-            for array in arrays.from_table(table, params.actions):
-                dataset = demo.create_dataset(_demo_path(array), data=array.values, **_storage(array.values))
-                dataset.attrs["columns"], dataset.attrs["units"] = list(array.columns), list(array.units)
+            table = frames.synchronized_columns(recording).select(columns)
+            for array in arrays.arrays_of_frames(table, params.actions):
+                dataset = _array_dataset(demo, array, table)
+                dataset.attrs["columns"], dataset.attrs["units"] = array.columns, array.units
             losses += [(recording.name, loss) for loss in _attributes(demo, recording.attributes)]
             demo.attrs["num_samples"] = table.num_rows
             demo.attrs["recording"] = recording.name
@@ -239,7 +278,7 @@ def _demos(
     return sink.check()
 
 
-def _demo_path(array: Array) -> str:
+def _demo_path(array: FrameArray) -> str:
     """Return the path of an array below its demonstration: robomimic reads actions next to obs, policies what is in it."""
     if array.actions or array.name == TIME:
         return array.name

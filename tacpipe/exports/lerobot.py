@@ -14,14 +14,14 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.streams import GRID
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Loss
-from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
+from tacpipe.exports.files import README_NAME, Content, Files, Scratch, loss_notes, readme_text
 from tacpipe.exports.lerobot_features import (
     ACTION,
     ORIGINALS,
@@ -32,7 +32,7 @@ from tacpipe.exports.lerobot_features import (
     column_statistics,
     dataset_statistics,
     episode_statistics,
-    features_from_table,
+    features_of_frames,
     index_statistics,
 )
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
@@ -43,11 +43,14 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.exports.frames import Channel
+    from tacpipe.io.columns import Columns
 
     Parts = Dataset
 
 VERSION = "v3.0"
 RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
+INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that number frames
+GROUP_FRAMES = 1 << 17  # frames of an episode in memory at once; an episode of more has several row groups
 CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's own limits
 _PLACE = re.compile(r"\{([^{}]+)\}")
 _OPENING = """
@@ -85,20 +88,19 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
 
     from tacpipe.exports import frames
 
-    table = frames.synchronized_table(recording)
-    losses = list(_losses(params, table, str(recording.attributes[GRID])))
-    params = params if not params.actions or _has_stream(table, params.actions) else replace(params, actions="")
-    frame_features = features_from_table(params, table)
+    columns = frames.synchronized_columns(recording)
+    losses = list(_losses(params, columns, str(recording.attributes[GRID])))
+    params = params if not params.actions or _has_stream(columns, params.actions) else replace(params, actions="")
+    frame_features = features_of_frames(params, columns)
     rows = [
         (feature.name == ACTION, column, *values)
         for feature in frame_features
-        for column, values in column_statistics(feature)
+        for column, values in column_statistics(feature, columns)
     ]
-    columns = list(zip(*rows, strict=True))
     names = [ACTION, "column", *STATISTICS]
-    rows_of_statistics = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
+    rows_of_statistics = pa.Table.from_arrays([pa.array(values) for values in zip(*rows, strict=True)], names=names)
     carried = [("", column) for feature in frame_features for column in feature.columns]
-    carried += [("", channel.name) for channel in _without_feature(frames.channels(table))]  # named above
+    carried += [("", channel.name) for channel in _without_feature(frames.channels(columns))]  # named above
     return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 
@@ -117,15 +119,12 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     fps = frames.common_rate_hz(all_recordings)
     columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
     described = frames.add_frame_losses(described, recordings, originals, _shards_note(params))
-    frame_features = features_from_table(
-        params, frames.synchronized_table(all_recordings[0]).select(columns).slice(0, 2)
-    )
+    frame_features = features_of_frames(params, frames.synchronized_columns(all_recordings[0]).select(columns))
     tasks = _tasks(params, all_recordings)
     lengths = {recording.name: _row_count(parts, recording.name) for recording in all_recordings}
-    bundles = list(
-        _group_by_size(all_recordings, lengths, sum(recording.values[:1].nbytes for recording in frame_features))
-    )
+    bundles = list(_group_by_size(all_recordings, lengths, sum(feature.frame_bytes for feature in frame_features)))
     files: dict[str, Content] = {}
+    written: dict[str, Callable[[Any], object]] = {}
     starts: dict[str, int] = {}
     places: dict[str, tuple[int, int]] = {}
     number = start = 0
@@ -134,9 +133,8 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
         for recording in bundle:
             starts[recording.name], places[recording.name] = start, (chunk, file)
             start += lengths[recording.name]
-        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data_file(
-            params, columns, bundle, number, starts, tasks, fps
-        )
+        episodes = _Episodes(columns, frame_features, bundle, number, starts, tasks, fps)
+        written[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = episodes.write
         number += len(bundle)
     files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
         frame_features, all_recordings, parts, originals, starts, places, lengths, tasks, fps
@@ -148,14 +146,14 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     files["meta/stats.json"] = _json_bytes(dataset_statistics(parts, frame_features, starts, lengths, indices, fps))
     files["meta/tacpipe.json"] = _json_bytes(_feature_metadata(frame_features, described))
     files[README_NAME] = readme_text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
-    return Result(files=Files(files), notes=loss_notes(recordings, described))
+    return Result(files=Files(files), notes=loss_notes(recordings, described), written=written)
 
 
-def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:
-    """Yield what the features do not hold of a synchronized table."""
+def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
+    """Yield what the features do not hold of a synchronized recording."""
     from tacpipe.exports import frames
 
-    channels = frames.channels(table)
+    channels = frames.channels(columns)
     place = _shards_note(params)
     yield Loss(f"rates of the streams and what happened between frames: one frame rate for all{place}")
     if not params.originals:
@@ -163,7 +161,7 @@ def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:
     if grid != "uniform":
         times = f"{ORIGINALS}.{TIME} has the times"
         yield Loss(f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {times}")
-    lossy = frames.rounded_channels(table, [channel for channel in channels if channel.signal])
+    lossy = frames.rounded_channels(columns, [channel for channel in channels if channel.signal])
     for stream in dict.fromkeys(channel.stream for channel in lossy):
         yield Loss(f"digits beyond float32{place}", stream)
     for channel in _without_feature(channels):
@@ -180,10 +178,10 @@ def _shards_note(params: Params) -> str:
     return f"; the shards under {ORIGINALS}/ keep it" if params.originals else ""
 
 
-def _has_stream(table: pa.Table, stream: str) -> bool:
+def _has_stream(columns: Columns, stream: str) -> bool:
     from tacpipe.exports import frames
 
-    return any(channel.stream == stream for channel in frames.channels(table))
+    return any(channel.stream == stream for channel in frames.channels(columns))
 
 
 def _row_count(parts: Dataset, name: str) -> int:
@@ -225,63 +223,60 @@ def _group_by_size(
     yield bundle
 
 
-def _data_file(
-    params: Params,
-    columns: Sequence[str],
-    bundle: Sequence[Recording],
-    first_episode: int,
-    starts: Mapping[str, int],
-    tasks: Mapping[str, str],
-    fps: float,
-) -> Callable[[], bytes]:
-    """Return what makes a data file, one row group an episode; ``number`` is that of its first episode."""
+@dataclass(frozen=True)
+class _Episodes:
+    """The recordings of one data file."""
 
-    def content() -> bytes:
+    columns: Sequence[str]
+    features: Sequence[FrameFeature]
+    recordings: Sequence[Recording]
+    first_episode: int
+    starts: Mapping[str, int]
+    tasks: Mapping[str, str]
+    fps: float
+
+    def write(self, sink: Any) -> None:
+        """Write the data file, one row group per episode, several for an episode of more than `GROUP_FRAMES`."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         from tacpipe.exports import frames
+        from tacpipe.io.columns import release
 
-        order = _task_order(tasks)
-        sink = pa.BufferOutputStream()
+        order = _task_order(self.tasks)
+        names = [*(feature.name for feature in self.features), *INDICES]
         writer = None
-        for episode, recording in enumerate(bundle, start=first_episode):
-            frame_features = features_from_table(params, frames.synchronized_table(recording).select(columns))
-            arrays = {feature.name: _feature_array(feature) for feature in frame_features}
-            arrays |= _index_columns(
-                len(frame_features[0].values), episode, starts[recording.name], order[tasks[recording.name]], fps
-            )
-            table = pa.table(arrays)
-            writer = writer or pq.ParquetWriter(sink, table.schema, compression="zstd")
-            writer.write_table(table, row_group_size=max(1, table.num_rows))
+        for episode, recording in enumerate(self.recordings, start=self.first_episode):
+            columns = frames.synchronized_columns(recording).select(self.columns)
+            length, start, task = columns.num_rows, self.starts[recording.name], order[self.tasks[recording.name]]
+            scratch = Scratch()
+            release()
+            features = [feature.put_aside(columns, scratch) for feature in self.features]
+            columns.forget()
+            release()
+            for first in range(0, max(1, length), GROUP_FRAMES):
+                rows = min(GROUP_FRAMES, length - first)
+                numbers = _index_columns(first, rows, episode, start, task, self.fps)
+                table = pa.Table.from_arrays([*(read(first, rows) for read in features), *numbers], names)
+                writer = writer or pq.ParquetWriter(sink, table.schema, compression="zstd")
+                writer.write_table(table, row_group_size=max(1, rows))
         assert writer is not None
         writer.close()
-        return bytes(sink.getvalue().to_pybytes())
-
-    return content
 
 
-def _index_columns(rows: int, episode: int, start: int, task: int, fps: float) -> dict[str, pa.Array]:
+def _index_columns(first: int, rows: int, episode: int, start: int, task: int, fps: float) -> list[pa.Array]:
+    """Return the columns `INDICES` of frames from the frame ``first`` of an episode on."""
     import numpy as np
     import pyarrow as pa
 
-    frame = np.arange(rows)
-    return {
-        "timestamp": pa.array((frame / fps).astype(np.float32)),
-        "frame_index": pa.array(frame),
-        "episode_index": pa.array(np.full(rows, episode)),
-        "index": pa.array(frame + start),
-        "task_index": pa.array(np.full(rows, task)),
-    }
-
-
-def _feature_array(feature: FrameFeature) -> pa.Array:
-    import pyarrow as pa
-
-    values = feature.values
-    if values.ndim == 1:
-        return pa.array(values)
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+    frame = np.arange(first, first + rows)
+    return [
+        pa.array((frame / fps).astype(np.float32)),
+        pa.array(frame),
+        pa.array(np.full(rows, episode)),
+        pa.array(frame + start),
+        pa.array(np.full(rows, task)),
+    ]
 
 
 def _task_order(tasks: Mapping[str, str]) -> dict[str, int]:
@@ -356,7 +351,7 @@ def _info(
         for feature in frame_features
     }
     described["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-    for name in ("frame_index", "episode_index", "index", "task_index"):
+    for name in INDICES[1:]:
         described[name] = {"dtype": "int64", "shape": [1], "names": None}
     return {
         "codebase_version": VERSION,
@@ -380,9 +375,9 @@ def _feature_metadata(frame_features: Sequence[FrameFeature], described: content
     return {
         "features": {
             feature.name: {
-                "columns": list(feature.columns),
-                "units": list(feature.units),
-                "quantities": list(feature.quantities),
+                "columns": feature.columns,
+                "units": [channel.unit for channel in feature.channels],
+                "quantities": [channel.quantity for channel in feature.channels],
             }
             for feature in frame_features
         },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,11 @@ from tacpipe.plugins.constraints import Names, Rate
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Floats
+    from tacpipe.arrays import ArrayType, Floats
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.exports.files import Scratch
+    from tacpipe.exports.frames import Channel
+    from tacpipe.io.columns import Columns
 
 ORIGINALS = "tacpipe"
 ACTION = "action"
@@ -36,54 +39,83 @@ class Params:
 
 @dataclass(frozen=True)
 class FrameFeature:
-    """One feature of a frame: its values (time,) or (time, channel), and the channels' names, units and quantities."""
+    """One feature of a frame: its channels, and their names next to each other."""
 
     name: str
-    values: AnyArray
+    channels: Sequence[Channel]
     names: Sequence[str]
-    columns: Sequence[str]  # columns of the synchronized table
-    units: Sequence[str] = ()
-    quantities: Sequence[str] = ()
+    kind: ArrayType  # type of the values of a frame; object: text
+    later: bool = False  # True where a frame has the values of the next frame, as actions without targets have
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns of the synchronized recording."""
+        return [channel.name for channel in self.channels]
 
     @property
     def dtype(self) -> str:
         """The type, as info.json names it."""
-        return "string" if self.values.dtype.kind in "OUT" else str(self.values.dtype)
+        return "string" if self.kind.kind == "O" else str(self.kind)
 
     @property
     def shape(self) -> list[int]:
         """The shape of one frame."""
-        return list(self.values.shape[1:]) or [1]
+        return [len(self.channels)]
+
+    @property
+    def frame_bytes(self) -> int:
+        """The bytes of one frame, those of a reference for text."""
+        return self.kind.itemsize * len(self.channels)
+
+    def put_aside(self, columns: Columns, scratch: Scratch) -> Callable[[int, int], pa.Array]:
+        """Write the values of a recording to a temporary file; return a function (first frame, frames) -> values.
+
+        Text stays in memory.
+        """
+        import numpy as np
+        import pyarrow as pa
+
+        from tacpipe.exports import frames
+
+        width = len(self.channels)
+        if self.dtype == "string":
+            texts = columns.column(self.channels[0].name).combine_chunks()
+            return lambda first, rows: texts.slice(first, rows)
+        start = scratch.tell()
+        for values in frames.value_blocks(columns, self.channels, self.kind, later=self.later):
+            scratch.write(np.ascontiguousarray(values))
+        scratch.check()
+
+        def read(first: int, rows: int) -> pa.Array:
+            content = scratch.piece(start + first * self.frame_bytes, rows * self.frame_bytes)
+            numbers = pa.array(np.frombuffer(content, self.kind))
+            return pa.FixedSizeListArray.from_arrays(numbers, width) if width > 1 else numbers
+
+        return read
 
 
-def features_from_table(params: Params, table: pa.Table) -> list[FrameFeature]:
-    """Return the features of a synchronized table, in a fixed order."""
+def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
+    """Return the features of a synchronized recording, in a fixed order."""
     import numpy as np
 
     from tacpipe.exports import frames
 
-    channels = frames.channels(table)
+    channels = frames.channels(columns)
     state = frames.state_channels(channels, [name.strip() for name in params.state.split(",") if name.strip()])
     taxels = [channel for channel in channels if channel.signal and channel.quantity == frames.TACTILE]
     state = [channel for channel in state if channel not in taxels]
 
-    def vector(name: str, members: Sequence[frames.Channel], values: AnyArray | None = None) -> FrameFeature:
-        values = frames.matrix(table, members, np.dtype(np.float32)) if values is None else values
+    def vector(name: str, members: Sequence[Channel], *, later: bool = False) -> FrameFeature:
         one_stream = len({channel.stream for channel in members}) == 1
-        return FrameFeature(
-            name,
-            values[:, 0] if values.shape[1] == 1 else values,
-            [channel.short if one_stream else channel.name for channel in members],
-            [channel.name for channel in members],
-            [channel.unit for channel in members],
-            [channel.quantity for channel in members],
-        )
+        names = [channel.short if one_stream else channel.name for channel in members]
+        return FrameFeature(name, members, names, np.dtype(np.float32), later)
 
     vectors: list[FrameFeature] = []
     observed = [*state, *taxels] if params.tactile_in_state else state
     vectors += [vector("observation.state", observed)] if observed else []
     if params.actions:
-        vectors.append(vector(ACTION, *frames.actions(table, channels, params.actions)))
+        members, later = frames.action_channels(channels, params.actions)
+        vectors.append(vector(ACTION, members, later=later))
     signals = [channel for channel in channels if channel.signal and channel not in state]
     for stream in dict.fromkeys(channel.stream for channel in signals):
         touch = [channel for channel in signals if channel.stream == stream and channel in taxels]
@@ -94,16 +126,15 @@ def features_from_table(params: Params, table: pa.Table) -> list[FrameFeature]:
     vectors += [vector("observation.latents", latents)] if latents else []
     truth = [channel for channel in channels if channel.truth and channel.type in ("float", "double")]
     vectors += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
-    vectors.append(FrameFeature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
+    time = frames.Channel(TIME, "", "time", "ns", "int64")
+    vectors.append(FrameFeature(f"{ORIGINALS}.{TIME}", [time], [TIME], np.dtype(np.int64)))
     placed = {channel.name for channel in (*state, *signals, *latents, *truth)}
     for channel in channels:
         if channel.name not in placed and (channel.number or channel.type == "string"):
             name = f"{channel.short}.{channel.stream}" if channel.stream else channel.short
             name = f"{ORIGINALS}.{name.replace('/', '_')}"
-            values = table.column(channel.name).to_numpy()
-            vectors.append(
-                FrameFeature(name, values, [channel.name], [channel.name], [channel.unit], [channel.quantity])
-            )
+            kind = frames.common_type(columns, [channel]) if channel.number else np.dtype(object)
+            vectors.append(FrameFeature(name, [channel], [channel.name], kind))
     return vectors
 
 
@@ -113,15 +144,18 @@ STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
 Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
 
 
-def column_statistics(feature: FrameFeature) -> Iterator[tuple[str, tuple[float, ...]]]:
+def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield each column of a feature with its statistics; none of text, and NaN if nothing was measured."""
     import numpy as np
 
     if feature.dtype == "string":
         return
-    values = feature.values.reshape(len(feature.values), -1).astype(np.float64)
-    for channel, column in enumerate(feature.columns):
-        yield column, _statistics_of(values[:, channel])
+    for channel in feature.channels:
+        with np.errstate(over="ignore"):
+            values = columns.column(channel.name).to_numpy().astype(feature.kind).astype(np.float64)
+        if feature.later:
+            values = np.concatenate([values[1:], values[-1:]])
+        yield channel.name, _statistics_of(values)
 
 
 def _statistics_of(values: Floats) -> tuple[float, ...]:

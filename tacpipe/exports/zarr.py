@@ -8,18 +8,20 @@ Example: tacpipe export zarr data/recordings -o exports/zarr --rate-hz 50 --acti
 
 from __future__ import annotations
 
+import functools
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents
-from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
+from tacpipe.exports.files import README_NAME, Content, Files, Scratch, loss_notes, readme_text
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
-    from tacpipe.arrays import AnyArray
+    from tacpipe.arrays import AnyArray, ArrayType
     from tacpipe.datasets.dataset import Dataset, Recording
 
     Parts = Dataset
@@ -83,17 +85,31 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     rate_hz = frames.common_rate_hz(all_recordings)
     columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
     described = frames.add_frame_losses(described, recordings, originals)
-    episodes = [
-        arrays.from_table(frames.synchronized_table(recording).select(columns), params.actions)
-        for recording in all_recordings
-    ]
+    frame_arrays = arrays.arrays_of_frames(
+        frames.synchronized_columns(all_recordings[0]).select(columns), params.actions
+    )
+    types: list[list[ArrayType]] = []  # by recording and array
+    lengths: list[int] = []
+    for recording in all_recordings:
+        table = frames.synchronized_columns(recording).select(columns)
+        types.append([array.type_in(table) for array in frame_arrays])
+        lengths.append(table.num_rows)
+    chunks = Scratch()
+    writers = []
+    for array, array_types in zip(frame_arrays, zip(*types, strict=True), strict=True):
+        attributes = {"columns": array.columns, "units": array.units}
+        shape = array.shape(sum(lengths))
+        writers.append(_ArrayWriter(f"data/{array.name}", shape, np.result_type(*array_types), attributes, chunks))
+    for recording in all_recordings:
+        table = frames.synchronized_columns(recording).select(columns)
+        for array, writer in zip(frame_arrays, writers, strict=True):
+            for values in array.blocks(table, writer.kind):
+                writer.append(values)
+    ends = _ArrayWriter(ENDS, (len(lengths),), np.dtype(np.int64), {}, chunks)
+    ends.append(np.cumsum(lengths, dtype=np.int64))
     files: dict[str, Content] = {}
-    for episode_arrays in zip(*episodes, strict=True):
-        first_array = episode_arrays[0]
-        attributes = {"columns": list(first_array.columns), "units": list(first_array.units)}
-        values = np.concatenate([array.values for array in episode_arrays])
-        files |= _array(f"data/{first_array.name}", values, attributes)
-    files |= _array(ENDS, np.cumsum([len(episode[0].values) for episode in episodes], dtype=np.int64), {})
+    for writer in (*writers, ends):
+        files |= writer.files()
     names = [recording.name for recording in all_recordings]
     files |= {".zgroup": _GROUP, "data/.zgroup": _GROUP, "meta/.zgroup": _GROUP}
     files["meta/.zattrs"] = _json(
@@ -108,25 +124,64 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     return Result(files=Files(files), notes=loss_notes(recordings, described))
 
 
-def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[str, Content]:
-    """Return the files of an array: chunks of rows, compressed as zarr's own, and its metadata."""
-    import zarr
-    from zarr.storage import MemoryStore
+class _ArrayWriter:
+    """Takes the rows of an array in order and puts its chunks, compressed as zarr's own, into a temporary file."""
 
-    row_bytes = max(1, values[:1].nbytes)
-    rows = max(1, min(len(values), CHUNK_BYTES // row_bytes))
-    store: dict[str, Any] = {}
-    array = zarr.create_array(
-        MemoryStore(store),
-        shape=values.shape,
-        dtype=values.dtype,
-        chunks=(rows, *values.shape[1:]),
-        zarr_format=2,
-        attributes=dict(attributes),
-        config={"write_empty_chunks": True},
-    )
-    array[:] = values
-    return {f"{path}/{name}": content.to_bytes() for name, content in store.items()}
+    def __init__(
+        self, path: str, shape: tuple[int, ...], kind: ArrayType, attributes: Mapping[str, Any], scratch: Scratch
+    ) -> None:
+        import zarr
+        from zarr.storage import MemoryStore
+
+        self.kind = kind
+        self._path, self._scratch = path, scratch
+        row_bytes = kind.itemsize * math.prod(shape[1:])
+        self._chunk_rows = max(1, min(shape[0], CHUNK_BYTES // row_bytes))
+        self._waiting: list[AnyArray] = []
+        self._rows = self._first_row = 0  # rows that wait, and the number of the first of them
+        self._encoded: dict[str, Any] = {}  # metadata, and the chunks of the last write
+        self._array = zarr.create_array(
+            MemoryStore(self._encoded),
+            shape=shape,
+            dtype=kind,
+            chunks=(self._chunk_rows, *shape[1:]),
+            zarr_format=2,
+            attributes=dict(attributes),
+            config={"write_empty_chunks": True},
+        )
+        self._metadata = {name: content.to_bytes() for name, content in self._encoded.items()}
+        self._places: dict[str, tuple[int, int]] = {}  # offset and bytes of each chunk in the temporary file
+
+    def append(self, values: AnyArray) -> None:
+        """Add rows, and write the chunks that are complete."""
+        import numpy as np
+
+        self._waiting.append(values)
+        self._rows += len(values)
+        whole = self._rows // self._chunk_rows * self._chunk_rows
+        if whole:
+            rows = np.concatenate(self._waiting)
+            self._write(rows[:whole])
+            self._waiting, self._rows = [rows[whole:]], len(rows) - whole
+
+    def files(self) -> dict[str, Content]:
+        """Write the last rows and return the files of the array by name."""
+        import numpy as np
+
+        if self._rows:
+            self._write(np.concatenate(self._waiting))
+        self._scratch.check()
+        chunks = {name: functools.partial(self._scratch.piece, *place) for name, place in self._places.items()}
+        return {f"{self._path}/{name}": content for name, content in {**self._metadata, **chunks}.items()}
+
+    def _write(self, values: AnyArray) -> None:
+        self._array[self._first_row : self._first_row + len(values)] = values
+        self._first_row += len(values)
+        for name in self._encoded.keys() - self._metadata.keys():
+            content = self._encoded.pop(name).to_bytes()
+            self._places[name] = (self._scratch.tell(), len(content))
+            self._scratch.write(content)
+        self._scratch.check()
 
 
 def _json(value: Any) -> bytes:

@@ -114,3 +114,15 @@ def test_what_cannot_be_made_is_refused(rig: Lab, options: str) -> None:
     assert ran.code != 0
     assert "--rate-hz" in ran.err if not options else "leg" in ran.err
     assert not (rig.folder / "lr").exists()
+
+
+def test_an_episode_of_more_frames_than_memory_takes_at_once_has_the_same_frames(
+    rig: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.run(EXPORT)
+    expected = pq.read_table("lr/data/chunk-000/file-000.parquet")
+    monkeypatch.setattr("tacpipe.exports.lerobot.GROUP_FRAMES", 7)
+    rig.run(EXPORT.replace("-o lr", "-o pieces") + " --rerun")
+    path = "pieces/data/chunk-000/file-000.parquet"
+    assert pq.read_table(path).equals(expected)
+    assert pq.ParquetFile(path).num_row_groups > 2

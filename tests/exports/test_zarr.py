@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import zarr
 
@@ -49,3 +50,19 @@ def test_recordings_of_other_channels_are_refused_by_name(lab: Lab) -> None:
     ran = lab.run("export zarr rec -o buffer --rate-hz 100 --common")
     assert "arm_position_x_m" not in opened()["data/skin_tactile"].attrs["columns"]
     assert any("not carried" in line and "columns" in line for line in ran.err.splitlines())
+
+
+def test_integers_of_which_one_recording_misses_some_are_floats_in_all(lab: Lab) -> None:
+    whole, gaps = recordings.skin(1), recordings.skin(2)
+    counts = pa.field("n", pa.int32(), metadata={"unit": "1", "quantity": "state"})
+    provided: dict[str, Any] = {
+        "a": ({"skin": whole.append_column(counts, pa.array(range(40), pa.int32()))}, {}),
+        "b": ({"skin": gaps.append_column(counts, pa.array([None] * 20 + list(range(20)), pa.int32()))}, {}),
+    }
+    recordings.write(lab.folder / "rec", provided)
+    lab.run("synchronize rec -o sync --rate-hz 100 --values hold")
+    lab.run("export zarr sync -o buffer")
+    tables = [recording.table() for recording in tacpipe.open("sync")]
+    assert any(table["skin_n"].null_count for table in tables)
+    expected = np.concatenate([table["skin_n"].to_numpy().astype(float) for table in tables])
+    np.testing.assert_array_equal(opened()["data/skin_state"][:], expected)
