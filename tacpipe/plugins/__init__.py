@@ -1,1 +1,1 @@
-"""Define what plug-ins extend: stages, their params, and the registry that finds them."""
+"""Base classes and registry of plug-ins: stages, their params, and the lookup of installed plug-ins."""

@@ -1,20 +1,20 @@
-"""Architectures of a task: classes of params, each of which builds a model; entry points of ``tacpipe.models``.
+"""Architectures of a task: params classes that build models, found through entry points of ``tacpipe.models``.
 
-A task has a dataclass that all of its architectures extend, with the name of the task as ``ARCHITECTURES`` and the default
-architecture as the default of its first field, ``architecture``. An entry point ``TASK.NAME = "module:Class"`` names a
-dataclass that extends it: its ``architecture`` is a ``Literal`` with ``NAME`` among the choices, and ``build(shape)``
-returns what the task trains. Built-in architectures and those of other packages are found in the same way, and their
-classes are the kinds of params of the task's stage (`tacpipe.plugins.params`).
+A task has a dataclass that all of its architectures extend. Its ``ARCHITECTURES`` is the name of the task, and the
+default of its first field, ``architecture``, is the default architecture. An entry point ``TASK.NAME = "module:Class"``
+names a dataclass that extends it: its ``architecture`` is a ``Literal`` that includes ``NAME``, and ``build(shape)``
+returns the object that the task trains. Built-in architectures and those of other packages are found in the same way,
+and their classes are the kinds of params of the task's stage (`tacpipe.plugins.params`).
 
-- The module is imported whenever the options of the stage are needed, so it imports torch and the like inside ``build``.
-- The name and version of another package are part of the params as they are stored (``plugin``), and so of every key: a
-  model is trained again with another version. tacpipe's own architectures change with the version of the stage.
-- One that cannot be loaded is left out of the choices; who asks for it gets the reason.
-- The shared loop of the task trains what ``build`` returns. An architecture that is trained otherwise has a method ``fit``
-  of its own, so no task asks which architecture it trains.
-- What ``build`` gets and what its result must do is described by the task:
-  `tacpipe.tasks.forward.params.ForwardModelParams`, `tacpipe.tasks.material.params.Estimator` and `NetworkParams`,
-  `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
+- The module is imported whenever the options of the stage are needed, so torch and other heavy libraries are imported
+  in ``build``.
+- The name and version of another package are part of the stored params (``plugin``) and so of every key: a model is
+  trained again with another version. tacpipe's own architectures change with the version of the stage.
+- An architecture that cannot be loaded is not offered as a choice; selecting it raises the reason.
+- The shared loop of the task trains the result of ``build``, unless the architecture has its own method ``fit``. So
+  no task depends on which architecture it trains.
+- Each task documents the arguments and the result of ``build``: `tacpipe.tasks.forward.params.ForwardModelParams`,
+  `tacpipe.tasks.material.params.Estimator` and `NetworkParams`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, plain
 
-PLUGIN = "plugin"  # name of the package and its version, among stored params of an architecture of another package
+PLUGIN = "plugin"  # key of a package's name and version in the stored params of its architecture
 TAG = "architecture"
 Kind = type[Any]
 
 
 def task(kind: Any) -> str | None:
-    """Return the task whose architectures extend the class ``kind`` itself; None for other params."""
+    """Return the task whose architectures extend exactly the class ``kind``, or None for other params."""
     task_name: str | None = vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
     return task_name
 
 
 @functools.cache
 def kinds(base: Kind) -> tuple[Kind, ...]:
-    """Return the classes of the architectures that extend ``base``: the default one, tacpipe's own, those of plug-ins."""
+    """Return the classes of the architectures that extend ``base``: default, own, plug-ins."""
     architectures: list[Kind] = []
     for name in registry.architectures(str(task(base))):
-        with contextlib.suppress(TacpipeError):  # An architecture that cannot be loaded does not stop the others.
+        with contextlib.suppress(TacpipeError):  # an architecture that cannot be loaded does not affect the others
             kind = load(base, name)
             if kind not in architectures and not _shared_choices(kind, architectures):
                 architectures.append(kind)
@@ -56,7 +56,7 @@ def kinds(base: Kind) -> tuple[Kind, ...]:
 
 
 def load(base: Kind, name: str) -> Kind:
-    """Return the class of the architecture ``name``. Raises `TacpipeError` for one that does not fit ``base``."""
+    """Return the class of the architecture ``name``. Raises `TacpipeError` if it does not match ``base``."""
     task_name = task(base)
     architecture = registry.load_architecture(str(task_name), name)
     target = registry.entry_points()[registry.MODELS][f"{task_name}.{name}"]
@@ -79,17 +79,17 @@ def load(base: Kind, name: str) -> Kind:
 
 
 def title(base: Any, architecture: str) -> str:
-    """Return the name of an architecture in reports: ``TITLE`` of its class; without one, the architecture itself."""
+    """Return an architecture's name in reports: ``TITLE`` of its class, or ``architecture`` if it has none."""
     return str(getattr(find(base, architecture), "TITLE", architecture))
 
 
 def find(base: Any, architecture: str) -> Kind | None:
-    """Return the class of an architecture that extends ``base``; None if its package is not installed."""
+    """Return the class of an architecture that extends ``base``, or None if its package is not installed."""
     return next((kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG)), None)
 
 
 def require(base: Any, value: Any) -> None:
-    """Raise the reason why an architecture that is installed as ``value`` is not among the choices, if it is not."""
+    """Raise an error with the reason if the installed architecture ``value`` is not available."""
     task_name = task(base)
     if task_name is None or not isinstance(value, str) or value not in registry.architectures(task_name):
         return
@@ -103,7 +103,7 @@ def require(base: Any, value: Any) -> None:
 
 
 def plugin(kind: Kind) -> str | None:
-    """Return name and version of the package that the architecture of a class comes from; None for tacpipe's own."""
+    """Return the name and version of the package that provides an architecture, or None for tacpipe's own."""
     for base in kind.__mro__[1:]:
         if (task_name := task(base)) is not None:
             for name in fields_of.choices(kind, TAG):
@@ -115,9 +115,9 @@ def plugin(kind: Kind) -> str | None:
 
 
 def check_installed(base: Any, values: Mapping[str, Any], kind: Kind | None) -> None:
-    """Raise `TacpipeError` if stored params are of an architecture whose package is not installed, or cannot be loaded.
+    """Raise `TacpipeError` if stored params belong to an architecture that is not installed or cannot be loaded.
 
-    ``kind`` is the class that they name, if there is one.
+    ``kind`` is the class that they name, if it exists.
     """
     if kind is None and task(base) is not None:
         require(base, values.get(TAG))
@@ -129,7 +129,7 @@ def check_installed(base: Any, values: Mapping[str, Any], kind: Kind | None) -> 
 
 
 def warn_of_version(values: Mapping[str, Any], kind: Kind) -> None:
-    """Warn where a model was trained with another version of its architecture's package than is installed."""
+    """Warn if a model was trained with another version of its architecture's package than the installed one."""
     before, now = values.get(PLUGIN), plugin(kind)
     if before != now:
         trained = f"{excerpt(values.get(TAG))} of {plain(str(before), 100)}"
@@ -140,7 +140,7 @@ def warn_of_version(values: Mapping[str, Any], kind: Kind) -> None:
 
 
 def check_version(values: Mapping[str, Any], kind: Kind) -> None:
-    """Raise `TacpipeError` if stored params were computed with another version of the package than is installed."""
+    """Raise `TacpipeError` if stored params were computed with another version of the package than the installed one."""
     before, now = values.get(PLUGIN), plugin(kind)
     if before != now:
         raise TacpipeError(
@@ -150,7 +150,7 @@ def check_version(values: Mapping[str, Any], kind: Kind) -> None:
 
 
 def _shared_choices(kind: Kind, architectures: Iterable[Kind]) -> list[Any]:
-    """Return the choices of a class that another of the ``architectures`` has too."""
+    """Return the choices of a class that another of the ``architectures`` also has."""
     other_choices = {
         choice
         for architecture in architectures

@@ -1,7 +1,7 @@
-"""Constrain the values of params: metadata of ``Annotated``, checked where params are built and shown in help.
+"""Constraints on the values of params: metadata of ``Annotated``, checked when params are built and shown in help.
 
-``pressure: Annotated[float, Unit("count"), Range(0, 4095)] = 40.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is a
-``Literal``. `StoredAs` names a param that was renamed.
+``pressure: Annotated[float, Unit("count"), Range(0, 4095)] = 40.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is
+a ``Literal``. `StoredAs` gives the former name of a renamed param.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.printable import plain
 
-MAX_TOML_BYTES = 1 << 20  # Largest TOML file
+MAX_TOML_BYTES = 1 << 20  # maximum size of a TOML file
 
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers between two ends: ``minimum`` and ``maximum`` belong to it, ``above`` and ``below`` do not."""
+    """A range of numbers. ``minimum`` and ``maximum`` are inclusive, ``above`` and ``below`` exclusive."""
 
     minimum: float | None = None
     maximum: float | None = None
@@ -29,7 +29,7 @@ class Range:
     below: float | None = None
 
     def allows(self, value: float) -> bool:
-        """Return whether a number lies in the range.
+        """Return whether a number is in the range.
 
         >>> [Range(0, below=1).allows(number) for number in (-0.1, 0, 0.9, 1)]
         [False, True, True, False]
@@ -42,7 +42,7 @@ class Range:
         )
 
     def describe(self, kind: str) -> str:
-        """Return the kind of number with its ends.
+        """Return a description of the numbers in the range.
 
         >>> Range(1).describe("a whole number"), Range(0, 1).describe("a number"), Range(above=0).describe("a number")
         ('a whole number of 1 or more', 'a number from 0 to 1', 'a number above 0')
@@ -60,13 +60,13 @@ class Range:
 
 @dataclass(frozen=True)
 class CommaList:
-    """Comma-separated text; each item is read by the annotation ``item_type``."""
+    """Comma-separated text whose items have the annotation ``item_type``."""
 
     item_type: Any = str
     min_items: int = 0
 
     def items(self, text: str) -> list[Any]:
-        """Return the items of a text that is allowed; spaces around them and empty ones do not count.
+        """Return the items of a valid text. Spaces around items and empty items are ignored.
 
         >>> CommaList(int).items("1, 5,10")
         [1, 5, 10]
@@ -74,12 +74,12 @@ class CommaList:
         return [fields.parsed(part.strip(), self.item_type) for part in text.split(",") if part.strip()]
 
     def allows(self, value: str) -> bool:
-        """Return whether there are enough items and each is allowed."""
+        """Return whether there are enough items and each is valid."""
         items = self.items(value)
         return len(items) >= self.min_items and all(fields.fits(item, self.item_type) for item in items)
 
     def describe(self, kind: str) -> str:
-        """Return the description of the list and of its items."""
+        """Return a description of the list and its items."""
         return "a comma-separated list" + (
             "" if self.item_type is str else f", each item {fields.describe(self.item_type)}"
         )
@@ -87,13 +87,13 @@ class CommaList:
 
 @dataclass(frozen=True)
 class Assignments:
-    """Text that is a list of ``NAME=VALUE``; each value is read by the annotation ``item_type``."""
+    """A list of ``NAME=VALUE`` whose values have the annotation ``item_type``."""
 
     item_type: Any
     between: str = ","
 
     def items(self, text: str) -> Mapping[str, Any]:
-        """Return the values of a text that is allowed, by name.
+        """Return the values of a valid text by name.
 
         >>> Assignments(float).items("biotac=0.025, roboskin=0.05")
         {'biotac': 0.025, 'roboskin': 0.05}
@@ -102,29 +102,29 @@ class Assignments:
         return {name.strip(): fields.parsed(value.strip(), self.item_type) for name, _, value in pairs}
 
     def allows(self, value: str) -> bool:
-        """Return whether all names are present and different, and each value is allowed."""
+        """Return whether all names are present and different, and each value is valid."""
         values = self.items(value)
         count = sum(bool(part.strip()) for part in value.split(self.between))
         return len(values) == count and all(name and fields.fits(item, self.item_type) for name, item in values.items())
 
     def describe(self, kind: str) -> str:
-        """Return the description of the list and of its values."""
+        """Return a description of the list and its values."""
         between = {",": "comma", ";": "semicolon"}[self.between]
         return f"a {between}-separated list of NAME=VALUE, each value {fields.describe(self.item_type)}"
 
 
 @dataclass(frozen=True)
 class Unit:
-    """The unit of a number: ``"mm"``, ``"Hz"``, or ``"count"`` for the device's own."""
+    """The unit of a number: ``"mm"``, ``"Hz"``, or ``"count"`` for a device's raw values."""
 
     name: str
 
     def allows(self, value: float) -> bool:
-        """Return True: a unit restricts nothing."""
+        """Return True, because a unit does not restrict values."""
         return True
 
     def describe(self, kind: str) -> str:
-        """Return the kind of number with its unit.
+        """Return a description of the number with its unit.
 
         >>> Unit("mm").describe(Range(above=0).describe("a number"))
         'a number above 0 (mm)'
@@ -134,25 +134,25 @@ class Unit:
 
 @dataclass(frozen=True)
 class StoredAs:
-    """How a renamed param is written in keys, manifests and models: by the name, and the choices, that it had before.
+    """The former name and choices of a renamed param, which keys, manifests and models still use.
 
-    A new name in code and on the command line then changes no key, and what was stored before is still read.
+    So a new name in code and on the command line changes no key, and stored params remain readable.
     """
 
     name: str
-    choices: Mapping[str, str] = field(default_factory=dict)  # Maps the current choice to the stored one
+    choices: Mapping[str, str] = field(default_factory=dict)  # stored choice by current choice
 
 
 @dataclass(frozen=True)
 class TomlFile:
-    """A path of a TOML file; the param is what the file holds, as canonical JSON: neither path nor comments count."""
+    """Path of a TOML file. The param's value is the file's content as canonical JSON, without its path and comments."""
 
     def allows(self, value: str) -> bool:
-        """Return True: whether there is such a file is known when it is read."""
+        """Return True; the file is checked when it is read."""
         return True
 
     def describe(self, kind: str) -> str:
-        """Return the description of the text."""
+        """Return a description of the text."""
         return "the path of a TOML file"
 
     def read(self, path: str) -> str:
@@ -160,7 +160,7 @@ class TomlFile:
 
         Raises `UsageError` if the file does not exist or is not TOML.
         """
-        import tomllib  # not at each start of a command
+        import tomllib  # imported here, because not every command needs it
 
         if not path:
             return path
@@ -181,6 +181,6 @@ NonNegativeInt = Annotated[int, Range(0)]
 PositiveFloat = Annotated[float, Range(above=0)]
 NonNegativeFloat = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
-Seed = Annotated[int, Range(0, 2**32 - 1)]  # The range that numpy, torch and scikit-learn accept
-Rate = Annotated[float, Range(above=0, maximum=1_000_000_000), Unit("Hz")]  # stamps are whole nanoseconds
+Seed = Annotated[int, Range(0, 2**32 - 1)]  # the range that numpy, torch and scikit-learn accept
+Rate = Annotated[float, Range(above=0, maximum=1_000_000_000), Unit("Hz")]  # timestamps are integer nanoseconds
 Names = Annotated[str, CommaList()]

@@ -1,4 +1,4 @@
-"""Explain failures of optional code: the extra that brings a missing module, and the frames of a stage's exception."""
+"""Explain failures of optional code: the extra that provides a missing module, and the traceback of a stage's exception."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 NAME = "tacpipe"
 OWN = (NAME, "tacpipe_stages")
-PLUGINS = "tacpipe."  # groups of entry points
-PACKAGES = {  # modules whose package has another name
+PLUGINS = "tacpipe."  # prefix of tacpipe's groups of entry points
+PACKAGES = {  # package by module, if their names differ
     "can": "python-can",
     "cv2": "opencv-python-headless",
     "google": "protobuf",
@@ -34,15 +34,15 @@ PACKAGES = {  # modules whose package has another name
     "vl_convert": "vl-convert-python",
 }
 REQUIREMENT = re.compile(r"""\s*([\w.-]+)[^;]*;.*\bextra\s*==\s*["']([\w.-]+)["']""")
-TOGETHER = "all"  # the extra that brings all others: a user wants the one that is missing
+TOGETHER = "all"  # the extra that includes all others; errors suggest the specific one
 
 
 @contextmanager
 def explain_missing(needed_by: str, plugin: Callable[[], str | None] = lambda: None) -> Iterator[None]:
-    """Have a module that is missing in the block reported in one sentence that begins with ``needed_by``.
+    """Report a module that is missing in the block in one sentence that starts with ``needed_by``.
 
-    ``plugin`` returns the package that ``needed_by`` comes from, if it is known. Raises `MissingModuleError`, which is an
-    `ImportError` too; other import errors pass.
+    ``plugin`` returns the package that provides ``needed_by``, if it is known. Raises `MissingModuleError`, a subclass
+    of `ImportError`; other import errors are not changed.
     """
     try:
         yield
@@ -62,12 +62,12 @@ def require(needed_by: str, *modules: str) -> None:
 
 
 def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> MissingModuleError | None:
-    """Return the sentence for a module that is not installed, or None if the import failed for another reason.
+    """Return the error for a module that is not installed, or None if the import failed for another reason.
 
-    ``plugin`` is the package that ``needed_by`` comes from, for modules that tacpipe's own extras do not bring.
+    ``plugin`` is the package that provides ``needed_by``, for modules that are not in tacpipe's own extras.
     """
     module = (error.name or "").partition(".")[0]
-    if not module or module in OWN or module in sys.modules:  # a mistake in whoever imports from it
+    if not module or module in OWN or module in sys.modules:  # a mistake in the importing module
         return None
     extra, absent = extra_for(module), isinstance(error, ModuleNotFoundError) and not _installed(module)
     if extra is None:
@@ -86,7 +86,7 @@ def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> Mi
 
 
 def extra_for(module: str) -> str | None:
-    """Return the extra that brings a module, None if none does, or if tacpipe is not installed."""
+    """Return the extra that includes a module, or None if there is none or tacpipe is not installed."""
     package = _normal(PACKAGES.get(module, module))
     distribution = _distribution()
     optional = _optional(distribution.requires or []) if distribution is not None else {}
@@ -94,7 +94,7 @@ def extra_for(module: str) -> str | None:
 
 
 def command(extra: str) -> str:
-    """Return the shell command that installs an extra of tacpipe, from where this installation came from."""
+    """Return the shell command that installs an extra of tacpipe from the source of this installation."""
     distribution = _distribution()
     source = _source(distribution) if distribution is not None else None
     pip = _pip()
@@ -104,13 +104,13 @@ def command(extra: str) -> str:
         return f"{pip} install {shlex.quote(f'{NAME}[{extra}]')}"
     requires = (
         (distribution.requires or []) if distribution is not None else []
-    )  # its source is gone: what the extra names is enough
+    )  # if the source no longer exists, install only the packages of the extra
     packages = [text.partition(";")[0].strip() for text in requires if _extra(text) == extra]
     return " ".join([pip, "install", *(shlex.quote(package) for package in packages)])
 
 
 def _pip_arguments(source: dict[str, Any], extra: str) -> list[str]:
-    """Return the arguments of ``pip install`` for an extra of the package that a direct URL names."""
+    """Return the arguments of ``pip install`` for an extra of a package with this direct URL."""
     url = str(source["url"])
     if "vcs_info" in source:
         version = source["vcs_info"]
@@ -126,7 +126,7 @@ def _pip_arguments(source: dict[str, Any], extra: str) -> list[str]:
 
 
 def _source(distribution: Distribution) -> dict[str, Any] | None:
-    """Return the direct URL that a distribution was installed from (PEP 610), None if there is none or it is gone."""
+    """Return the direct URL that a distribution was installed from (PEP 610), or None if it is gone."""
     import json
     from pathlib import Path
 
@@ -143,7 +143,7 @@ def _from_index(distribution: Distribution) -> bool:
 
 
 def _path(url: str) -> str | None:
-    """Return the path of a ``file:`` URL, None of another."""
+    """Return the path of a ``file:`` URL, or None for other URLs."""
     from urllib.parse import unquote, urlsplit
 
     split = urlsplit(url)
@@ -151,7 +151,7 @@ def _path(url: str) -> str | None:
 
 
 def _pip() -> str:
-    """Return the pip of this installation: by its name where the shell finds that one."""
+    """Return the command for the pip of this installation: its name if the shell finds it, else its path."""
     import shutil
     from pathlib import Path
 
@@ -161,7 +161,7 @@ def _pip() -> str:
 
 
 def _distribution() -> Distribution | None:
-    """Return the installed distribution of tacpipe, preferably the one that states where it came from."""
+    """Return the installed distribution of tacpipe, preferably one with a direct URL."""
     from importlib.metadata import distributions
 
     installed = list(distributions(name=NAME))
@@ -204,12 +204,12 @@ def _installed(module: str) -> bool:
         return False
 
 
-ALL_FRAMES = "TACPIPE_TRACEBACK"  # environment variable: set, the whole traceback is printed
-_NAME = "tacpipe_failure"  # attribute of the exception, which travels with it from a worker process
+ALL_FRAMES = "TACPIPE_TRACEBACK"  # environment variable: if set, the full traceback is printed
+_NAME = "tacpipe_failure"  # attribute of the exception, which is pickled with it in a worker process
 
 
 def attach_stage(error: BaseException, stage: str, recording: str, outer: tuple[str, ...]) -> None:
-    """Note in ``error`` which stage raised it, and its frames without the first ones, which lie in the files ``outer``."""
+    """Add to ``error`` its stage, and its traceback without the first frames, which are in the files ``outer``."""
     described = traceback.TracebackException.from_exception(error)
     frames = list(described.stack)
     while frames and frames[0].filename in outer:
@@ -231,9 +231,9 @@ def failure_text(error: BaseException) -> str | None:
 
 
 def failure_line(error: BaseException) -> str:
-    """Return in one line what was raised and where: the file and line of the innermost frame, or of the syntax error."""
+    """Return a line with the exception and its location: file and line of the innermost frame, or of the syntax error."""
     described = f"{type(error).__name__}: {error}"
-    if isinstance(error, SyntaxError):  # Its text ends with the file's name and line
+    if isinstance(error, SyntaxError):  # its text already ends with file name and line
         return f"{type(error).__name__}: {error.msg}, in {error.filename}, line {error.lineno}."
     frames = traceback.extract_tb(error.__traceback__)
     return f"{described}, in {frames[-1].filename}, line {frames[-1].lineno}." if frames else f"{described}."

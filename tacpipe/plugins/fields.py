@@ -1,7 +1,7 @@
-"""Fit values to the annotations of a dataclass's fields, parse text for them, and describe them in words.
+"""Convert values to the annotations of dataclass fields, parse text for them, and describe the valid values.
 
-Annotations are ``bool``, ``int``, ``float``, ``str``, ``Literal``, another dataclass, a ``tuple`` or a union of these, and
-``Annotated`` with a `Constraint`, of which `tacpipe.plugins.constraints` has the usual ones.
+Annotations are ``bool``, ``int``, ``float``, ``str``, ``Literal``, another dataclass, a ``tuple`` or a union of these,
+and ``Annotated`` with a `Constraint`; `tacpipe.plugins.constraints` has common ones.
 """
 
 from __future__ import annotations
@@ -18,24 +18,28 @@ from tacpipe.errors import UsageError
 from tacpipe.printable import excerpt, plain, suggestion
 
 REFUSED = object()
-_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # YAML 1.1 takes 1e-3 for text, and nobody else does
-_HINTS: dict[type[Any], Mapping[str, Any]] = {}  # Cache: evaluating the annotations of many fields takes milliseconds
+_EXPONENT = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+"
+)  # YAML 1.1 reads 1e-3 as text, contrary to all other formats
+_HINTS: dict[
+    type[Any], Mapping[str, Any]
+] = {}  # cache, because evaluating the annotations of many fields takes milliseconds
 _UNIONS = (typing.Union, types.UnionType)
 
 
 @runtime_checkable
 class Constraint(Protocol):
-    """Metadata of ``Annotated`` that allows some values of a type."""
+    """Metadata of ``Annotated`` that restricts the values of a type."""
 
     def allows(self, value: Any) -> bool:
-        """Return whether a value of the type is allowed."""
+        """Return whether a value of the type is valid."""
 
     def describe(self, kind: str) -> str:
-        """Return what is allowed, as in "it must be …"; ``kind`` describes the type alone, as "a whole number"."""
+        """Return the description that completes "it must be …". ``kind`` describes the type, as in "a whole number"."""
 
 
 def hints(kind: type[Any]) -> Mapping[str, Any]:
-    """Return the annotation of each field of a dataclass, constraints included."""
+    """Return the annotation of each field of a dataclass, including constraints."""
     if kind not in _HINTS:
         annotations = typing.get_type_hints(kind, include_extras=True)
         _HINTS[kind] = {field.name: annotations[field.name] for field in dataclasses.fields(kind)}
@@ -59,18 +63,18 @@ def bare(annotation: Any) -> Any:
 
 
 def choices(kind: type[Any], name: str) -> tuple[Any, ...]:
-    """Return the choices of the field ``name`` of a dataclass, or empty if it is not a Literal."""
+    """Return the choices of a dataclass field, or an empty tuple if it is not a Literal."""
     annotation = bare(hints(kind).get(name))
     return get_args(annotation) if get_origin(annotation) is Literal else ()
 
 
 def constraints(annotation: Any) -> list[Constraint]:
-    """Return the constraints of an annotation, also of one that None is the only alternative to."""
+    """Return the constraints of an annotation, also if it is optional."""
     return [mark for mark in metadata(annotation) if isinstance(mark, Constraint)]
 
 
 def metadata(annotation: Any) -> tuple[Any, ...]:
-    """Return what follows the type in ``Annotated``, also where None is the only alternative; empty for other types."""
+    """Return the metadata of ``Annotated``, also if it is optional; an empty tuple for other annotations."""
     kinds = (
         [kind for kind in get_args(annotation) if kind is not types.NoneType]
         if get_origin(annotation) in _UNIONS
@@ -82,9 +86,9 @@ def metadata(annotation: Any) -> tuple[Any, ...]:
 
 
 def check(value: Any, annotation: Any, name: str, place: str = "") -> Any:
-    """Return ``value`` in the type of ``annotation``: an int becomes a float if a float is expected.
+    """Return ``value`` converted to the type of ``annotation``: an int becomes a float if a float is expected.
 
-    ``name`` and ``place`` identify the value in messages. Raises `UsageError` if it is not allowed.
+    ``name`` and ``place`` identify the value in messages. Raises `UsageError` if it is invalid.
     """
     fitted = _fit(value, annotation, f"{place}, {name}" if place else name)
     if fitted is REFUSED:
@@ -104,14 +108,14 @@ def format_value(value: Any) -> str:
 
 
 def fits(value: Any, annotation: Any) -> bool:
-    """Return whether ``annotation`` allows ``value``."""
+    """Return whether ``value`` is valid for ``annotation``."""
     return _fit(value, annotation, "") is not REFUSED
 
 
 def filled(kind: type[Any], values: Mapping[str, Any], place: str, noun: str = "param") -> Any:
-    """Return the dataclass ``kind`` with ``values`` over its defaults; an int becomes a float if a float is expected.
+    """Return the dataclass ``kind`` with ``values`` in place of defaults; an int becomes a float if a float is expected.
 
-    Raises `UsageError` for an unknown name, a value that is not allowed, and one without a default that is missing.
+    Raises `UsageError` for unknown names, invalid values, and missing values without a default.
     """
     annotations = hints(kind)
     fitting = {}
@@ -137,7 +141,7 @@ def unknown(key: Any, names: Mapping[str, Any], place: str, noun: str) -> UsageE
 
 
 def parsed(text: str, annotation: Any) -> Any:
-    """Return what ``text``, of a command line or of a list, means for an annotation; the text itself if nothing.
+    """Return the value that ``text`` represents for an annotation, or the text itself if it represents none.
 
     >>> parsed("3", int), parsed("3", float), parsed("3", str), parsed("x", int), parsed("3", Literal[1, 3])
     (3, 3.0, '3', 'x', 3)
@@ -154,7 +158,7 @@ def parsed(text: str, annotation: Any) -> Any:
 
 
 def describe(annotation: Any) -> str:
-    """Return what an annotation allows, as in "it must be …".
+    """Return a description of the valid values that completes "it must be …".
 
     >>> describe(Literal["a", "b"]), describe(int | None), describe(tuple[float, ...])
     ('one of a, b', 'a whole number', 'a list, each item a number')
@@ -177,9 +181,9 @@ def describe(annotation: Any) -> str:
 
 
 def _fit(value: Any, annotation: Any, place: str) -> Any:
-    """Return ``value`` in the type of ``annotation``, else `REFUSED`.
+    """Return ``value`` converted to the type of ``annotation``, or `REFUSED` if it is invalid.
 
-    A mapping fills a dataclass, which raises as `filled` does.
+    A mapping fills a dataclass, with the errors of `filled`.
     """
     origin = get_origin(annotation)
     if origin is Annotated:
@@ -192,7 +196,7 @@ def _fit(value: Any, annotation: Any, place: str) -> Any:
     if origin in _UNIONS:
         fits = (_fit(value, kind, place) for kind in get_args(annotation))
         return next((fit for fit in fits if fit is not REFUSED), REFUSED)
-    if origin is Literal:  # 1, 1.0 and True are equal, and three values in a key
+    if origin is Literal:  # 1, 1.0 and True are equal, but give three different keys
         return next(
             (choice for choice in get_args(annotation) if choice == value and type(choice) is type(value)), REFUSED
         )
@@ -209,11 +213,11 @@ def _fit(value: Any, annotation: Any, place: str) -> Any:
 
 
 def _fit_plain(value: Any, kind: Any) -> Any:
-    """Return ``value`` as a bool, an int, a float, a text or None, or `REFUSED`."""
+    """Return ``value`` as a bool, an int, a float, a text or None, or `REFUSED` if it is invalid."""
     if kind is float and isinstance(value, str) and _EXPONENT.fullmatch(value):
         value = float(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value) + 0.0 if abs(value) <= sys.float_info.max else REFUSED  # NaN is refused; -0.0 becomes 0.0
+        return float(value) + 0.0 if abs(value) <= sys.float_info.max else REFUSED  # NaN is invalid; -0.0 becomes 0.0
     if kind is str and isinstance(value, str) and not _encodes(value):
         return REFUSED
     if kind is types.NoneType:
@@ -223,7 +227,7 @@ def _fit_plain(value: Any, kind: Any) -> Any:
 
 
 def _encodes(text: str) -> bool:
-    """Return whether text is Unicode: of other bytes on the command line halves of characters are made."""
+    """Return whether text is valid Unicode; undecodable bytes on the command line become lone surrogates."""
     try:
         text.encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""Params as they are given: in ``params.yaml``, by presets and as options, checked before any data is read."""
+"""Combine the params from ``params.yaml``, presets and options, and check them before any data is read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tacpipe.printable import excerpt, listed
 
 
 class _Setting(NamedTuple):
-    """A value that was given, and where."""
+    """A value and its source."""
 
     origin: str
     key: str
@@ -44,10 +44,11 @@ def build(
     sets: Sequence[str] = (),
     options: Mapping[str, Any] | None = None,
 ) -> Any:
-    """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
+    """Return the params of stage ``name``.
 
-    Raises `UsageError` for an unknown name, a value that is not allowed, an option of another kind of params than the
-    chosen one, and values that do not go together.
+    Defaults are overridden by the file, the preset, ``--set`` and options, in this order.
+    Raises `UsageError` for unknown names, invalid values, options of another kind of params than the chosen one, and
+    invalid combinations.
     """
     early = [] if file is None else _from_file(file, block or name, required=block is not None)
     late = [_from_set(name, text) for text in sets]
@@ -57,7 +58,9 @@ def build(
     values: dict[str, Any] = {}
     chooses = params_of.tag(stage)
     for setting in (*early, *between, *late):
-        if setting.key != chooses or setting.value in params_of.choices(kind, setting.key):  # others were overruled
+        if setting.key != chooses or setting.value in params_of.choices(
+            kind, setting.key
+        ):  # other values were overridden
             values[setting.key] = _checked(stage, kind, setting, values)
     try:
         params = kind(**values)
@@ -69,7 +72,7 @@ def build(
 
 
 def _chosen(stage: AnyStage, early: Sequence[_Setting], late: Sequence[_Setting], preset: str | None) -> Kind:
-    """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
+    """Return the kind of params chosen by an option, or else by the preset if the file's kind does not have it."""
     kind = _kind_by_tag(stage, early)
     if any(setting.key == params_of.tag(stage) for setting in late):
         return _kind_by_tag(stage, late)
@@ -81,7 +84,7 @@ def _chosen(stage: AnyStage, early: Sequence[_Setting], late: Sequence[_Setting]
 
 
 def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
-    """Return the kind that the last tag among ``settings`` selects, or the default kind.
+    """Return the kind selected by the last tag among ``settings``, or the default kind.
 
     Raises `UsageError` for a tag that no kind has.
     """
@@ -97,7 +100,7 @@ def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
 
 
 def _checked(stage: AnyStage, kind: Kind, setting: _Setting, before: Mapping[str, Any]) -> Any:
-    """Return the value of ``setting`` in the type of its field in ``kind``."""
+    """Return the value of ``setting`` converted to the type of its field in ``kind``."""
     annotations, name = fields_of.hints(kind), params_of.tag(stage)
     if setting.key not in params_of.fields(stage):
         raise fields_of.unknown(setting.key, params_of.fields(stage), setting.origin, "param")

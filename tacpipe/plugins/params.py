@@ -1,12 +1,11 @@
-"""Read the params that a stage declares, and convert them from and to the form that is stored.
+"""Read the params that a stage declares, and convert them from and to their stored form.
 
-A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
-same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
-one by default; a field that the chosen class does not have is refused, and is not part of a key. The classes of a
-task's architectures are found like plug-ins (`tacpipe.plugins.architectures`). A method ``check`` may
-refuse values that do not go together; stored params are read back without it. A static method ``upgrade`` returns params
-that any earlier version stored by the names and values of today. ``PRESETS`` holds named sets of values,
-``PANELS`` the names of the fields that each panel of the help shows.
+A stage has one dataclass of params, or a tagged union, ``Params = Small | Large``, of classes with the same first
+field, such as ``architecture``, with different choices (``Literal``). That field selects the class, by default the
+first one. Fields of other classes are invalid and not part of a key. The classes of a task's architectures are found
+like plug-ins (`tacpipe.plugins.architectures`). A method ``check`` may reject combinations of values; it is not applied
+to stored params. A static method ``upgrade`` converts stored params of any earlier version to current names and values.
+``PRESETS`` contains named sets of values, ``PANELS`` the names of the fields in each panel of the help.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Kind = type[Any]  # a dataclass of params
 
 
 def kinds(stage: AnyStage) -> tuple[Kind, ...]:
-    """Return the dataclasses that a stage's params may be, the default one first."""
+    """Return the possible dataclasses of a stage's params, the default first."""
     return _members(stage.params)
 
 
@@ -44,7 +43,7 @@ def _members(union: Any) -> tuple[Kind, ...]:
 
 
 def tag(stage: AnyStage) -> str | None:
-    """Return the name of the field that chooses among several kinds of params, or None if there is one kind."""
+    """Return the name of the field that selects among several kinds of params, or None if there is one kind."""
     alternatives = kinds(stage)
     if len(alternatives) == 1:
         return None
@@ -63,12 +62,12 @@ def _tag_name(alternatives: Sequence[Kind]) -> str:
 
 
 def fields(stage: AnyStage) -> dict[str, Any]:
-    """Return the annotation of each param of a stage, of whatever kind; choices of several kinds are joined."""
+    """Return the annotation of each param of all kinds; choices of several kinds are joined."""
     return dict(_fields(kinds(stage)))
 
 
 def having(stage: AnyStage, field: str) -> list[str]:
-    """Return the choices of the tag for which a param counts, empty if it always does."""
+    """Return the choices of the tag with which a param is used, or an empty list if it is always used."""
     name, alternatives = tag(stage), kinds(stage)
     owners = [kind for kind in alternatives if field in fields_of.hints(kind)]
     if name is None or len(owners) == len(alternatives):
@@ -77,7 +76,7 @@ def having(stage: AnyStage, field: str) -> list[str]:
 
 
 def defaults(stage: AnyStage, field: str) -> list[Any]:
-    """Return the different defaults that a param has among the kinds; for the tag, the default of the default kind."""
+    """Return the different defaults of a param among the kinds; for the tag, the default of the default kind."""
     owners = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
     declared = [kind.__dataclass_fields__[field] for kind in owners if field in kind.__dataclass_fields__]
     return list(
@@ -91,9 +90,9 @@ def presets(stage: AnyStage) -> list[str]:
 
 
 def panels(stage: AnyStage) -> dict[str, str]:
-    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others.
+    """Return the help panel of each param, as declared in ``PANELS`` of its dataclasses; others have none.
 
-    A param of an architecture that declares none is in the panel of the architecture.
+    A param of an architecture without a declaration is in the panel of the architecture.
     """
     panel_of: dict[str, str] = {}
     for kind in kinds(stage):
@@ -107,17 +106,17 @@ def panels(stage: AnyStage) -> dict[str, str]:
 
 
 def added(default: Any) -> Any:
-    """Return a field that was added to params later: in keys only where it is not its default.
+    """Return a field that was added to params later. It is part of a key only if it differs from its default.
 
-    So what was computed before keeps its key, where the default gives the same result.
+    So earlier results keep their keys, provided that the default gives the same result.
     """
     return dataclasses.field(default=default, metadata={"added": True})
 
 
 def to_json(params: Any) -> dict[str, Any]:
-    """Return the params as keys, manifests and models hold them: `StoredAs` names, `added` ones only if not the default.
+    """Return the params as stored in keys and models: with `StoredAs` names, without unchanged `added` fields.
 
-    Of an architecture of another package they hold its name and version too.
+    For an architecture of another package they include its name and version.
     """
     silent = {
         field.name
@@ -133,17 +132,17 @@ def to_json(params: Any) -> dict[str, Any]:
 
 
 def to_input(params: Any) -> dict[str, Any]:
-    """Return the params by the names and choices that options, ``params.yaml`` and ``--set`` have."""
+    """Return the params with the names and choices used by options, ``params.yaml`` and ``--set``."""
     values = dataclasses.asdict(params)
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
-    """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
+    """Return the params from the result of `to_json`, of this or an older version, without checking values.
 
-    A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
-    Raises `TacpipeError` if a stage that works recording by recording has no such field, and where another version of
-    an architecture's package is installed: its result would be stored under a name that is not its own.
+    Fields of other kinds are ignored, and removed fields are ignored if the stage reads whole datasets. Raises
+    `TacpipeError` if a stage that works recording by recording has no such field, and if another version of an
+    architecture's package is installed, because its result would be stored under a wrong name.
     """
     kind, current = _current(kinds(stage), values)
     architectures.check_installed(stage.params, values, kind)
@@ -162,21 +161,21 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
 
 
 def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of stored params that the chosen kind has, by today's names; older versions stored those of all kinds.
+    """Return the stored params that the chosen kind has, with current names; older versions stored those of all kinds.
 
-    All of them are returned where the tag names no kind, as of a plug-in that is not installed.
+    Returns all of them if the tag names no kind, such as an architecture that is not installed.
     """
     kind, current = _current(kinds(stage), values)
     return {name: value for name, value in current.items() if kind is None or name in fields_of.hints(kind)}
 
 
 def kind_of(stage: AnyStage, values: Mapping[str, Any]) -> Kind | None:
-    """Return the kind that stored params are of, or None if the tag names no kind, as of a plug-in that is not installed."""
+    """Return the kind of stored params, or None if the tag names no kind, such as an architecture that is not installed."""
     return _current(kinds(stage), values)[0]
 
 
 def with_current_names(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored params with current names and choices; unchanged if the ``stage`` is not installed."""
+    """Return stored params with current names and choices, or unchanged if ``stage`` is not installed."""
     from tacpipe.plugins import registry
 
     try:
@@ -187,11 +186,11 @@ def with_current_names(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read(union: Any, values: Mapping[str, Any], place: str) -> Any:
-    """Return the params, of a dataclass or of one of a ``union``, that a model's configuration holds.
+    """Return the params in a model's configuration, as a dataclass or one of a ``union``.
 
-    It may be of an older version: fields that are missing have their default, those that are gone are left out, and types
-    alone are checked, for ranges and choices may have been others. Raises `TacpipeError`, which begins with ``place``,
-    for a value of another type and where the tag names none of the union.
+    The configuration may be of an older version: missing fields get their default, removed fields are ignored, and only
+    types are checked, because ranges and choices may have changed. Raises `TacpipeError`, which starts with ``place``,
+    for a value of another type and for an unknown tag.
     """
     members = _members(union)
     kind, current = _current(members, values)
@@ -210,14 +209,14 @@ def read(union: Any, values: Mapping[str, Any], place: str) -> Any:
 
 
 def _of_type(value: Any, annotation: Any, name: str, place: str) -> Any:
-    """Return ``value`` as the type of an annotation, whatever its constraints; raises `TacpipeError` for another type."""
+    """Return ``value`` in the type of an annotation, without its constraints; raises `TacpipeError` for another type."""
     kind = fields_of.bare(annotation)
     if get_origin(kind) is Literal:
         kind = typing.Union[tuple({type(choice) for choice in get_args(kind)})]  # noqa: UP007
     optional = annotation if fields_of.fits(None, annotation) else kind
     try:
         return fields_of.check(value, kind if value is not None else optional, name, place)
-    except UsageError as error:  # The mistake is in a file, not in a command
+    except UsageError as error:  # the mistake is in a file, not in a command
         raise TacpipeError(str(error)) from None
 
 
@@ -243,9 +242,9 @@ def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _current(alternatives: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
-    """Return the kind that stored params are of, and these by today's names and choices, or None if there is no such kind.
+    """Return the kind of stored params, or None if there is no such kind, and the params with current names and choices.
 
-    A name that the kind does not have is that of another kind, or stays as it is.
+    Names that the kind does not have are unchanged.
     """
     name = _tag_name(alternatives) if len(alternatives) > 1 else None
     chosen = next((kind for kind in alternatives if name is None or _tagged(kind, name, values)), None)
@@ -261,7 +260,7 @@ def _current(alternatives: Sequence[Kind], values: Mapping[str, Any]) -> tuple[K
 
 @functools.cache
 def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]]]:
-    """Return the current name and choices of each stored name; the first kind that has the name counts."""
+    """Return the current name and choices of each stored name, from the first kind with that name."""
     current: dict[str, tuple[str, Mapping[str, str]]] = {}
     for kind in order:
         for field in fields_of.hints(kind):
@@ -271,14 +270,14 @@ def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]
 
 
 def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
-    """Return whether stored params name a choice of the tag ``name`` that ``kind`` has."""
+    """Return whether stored params have a choice of the tag ``name`` that belongs to ``kind``."""
     mark = _stored_as(kind, name)
     stored = values.get(mark.name)
     return stored in [mark.choices.get(choice, choice) for choice in choices(kind, name)]
 
 
 def comments(stage: AnyStage) -> dict[str, str]:
-    """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
+    """Return the help of each param: the comment after its field, or on the lines above."""
     texts_by_name: dict[str, list[str]] = {}
     for kind in kinds(stage):
         inherited: dict[str, str] = {}
@@ -291,7 +290,7 @@ def comments(stage: AnyStage) -> dict[str, str]:
 
 
 def comments_of(kind: Kind) -> dict[str, str]:
-    """Return the comment behind each field of a dataclass, or in the lines above it."""
+    """Return the comment after each field of a dataclass, or on the lines above."""
     try:
         lines = inspect.getsource(kind).splitlines()
     except (OSError, TypeError):
@@ -323,7 +322,7 @@ def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, Any]:
 
 
 def _joined(annotations: Sequence[Any]) -> Any:
-    """Return an annotation that allows every value that one of ``annotations`` allows."""
+    """Return an annotation that accepts every value that one of ``annotations`` accepts."""
     if all(get_origin(fields_of.bare(annotation)) is Literal for annotation in annotations):
         return Literal[
             tuple(

@@ -1,4 +1,4 @@
-"""Names of what plug-ins bring (stages, formats, sensors and so on): found through entry points, loaded when asked for."""
+"""The registry of plug-ins: stages, formats, sensors and so on, found through entry points and loaded when needed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from tacpipe.tasks.task import Task
 
 STAGES, FORMATS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.sensors"
-TASKS = "tacpipe.tasks"  # Maps a name to a subclass of `tacpipe.tasks.task.Task`
+TASKS = "tacpipe.tasks"  # name: a subclass of `tacpipe.tasks.task.Task`
 EXPORTS = "tacpipe.exports"
 EXECUTORS = "tacpipe.executors"
-COMMANDS = "tacpipe.commands"  # Maps a package to the order of its commands and the help of its groups
-OWN = "tacpipe"  # the name of its own entry point there
+COMMANDS = "tacpipe.commands"  # package: the order of its commands and the help of its groups
+OWN = "tacpipe"  # name of tacpipe's entry point in that group
 TRACKERS = "tacpipe.trackers"
 MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
-CODECS = "tacpipe.codecs"  # Maps the kind of a codec to its class (`tacpipe.codecs.codec.Codec`)
+CODECS = "tacpipe.codecs"  # kind of codec: its class (`tacpipe.codecs.codec.Codec`)
 GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
-PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # Prefixes of stage names in other groups
-FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
+PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # prefixes of stage names in other groups
+FIT, PART = ".fit", ".part"  # suffixes of the parts of a stage that have keys of their own
 _used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
 
 
@@ -55,16 +55,16 @@ class Package(NamedTuple):
 
 @functools.cache
 def entry_points() -> dict[str, dict[str, str]]:
-    """Return group, name and target of every entry point of tacpipe's groups."""
+    """Return the target of every entry point in tacpipe's groups, by group and name."""
     return {group: {name: target for name, (target, _) in declared.items()} for group, declared in installed().items()}
 
 
 @functools.cache
 def installed() -> dict[str, dict[str, tuple[str, Path]]]:
-    """Return group and name of every entry point of tacpipe's groups, with its target and the file that declares it.
+    """Return target and declaring file of every entry point in tacpipe's groups, by group and name.
 
-    Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
-    takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
+    Reads ``entry_points.txt`` files directly, because ``importlib.metadata`` creates an object per entry point and
+    takes as long as the rest of ``tacpipe --help``. As there, the first one on the path has precedence.
     """
     targets_by_group: dict[str, dict[str, tuple[str, Path]]] = {group: {} for group in GROUPS}
     for folder in dict.fromkeys(sys.path):
@@ -86,9 +86,9 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
 
 
 def brought_by(group: str, name: str) -> Package | None:
-    """Return the package that brings an entry point, as its metadata has it; None for tacpipe's own.
+    """Return the package that provides an entry point, from its metadata, or None for tacpipe's own.
 
-    Metadata are read as text, so that a hit that needs them loads nothing.
+    Metadata are read as text, so that a cache hit that needs them imports nothing.
     """
     target, file = installed()[group][name]
     if target.partition(".")[0].partition(":")[0] in extras.OWN:
@@ -104,7 +104,7 @@ def brought_by(group: str, name: str) -> Package | None:
 
 @functools.cache
 def plugin_packages() -> dict[str, Path]:
-    """Return the names of the installed packages that bring plug-ins, each with the file of its entry points."""
+    """Return the entry-point file of each installed package with plug-ins, by package name."""
     return {
         package.name: file
         for group, points in installed().items()
@@ -114,7 +114,7 @@ def plugin_packages() -> dict[str, Path]:
 
 
 def package_of_stage(name: str) -> str | None:
-    """Return the name of the plug-in package that brings a stage; None for tacpipe's own stages and unknown names."""
+    """Return the package that provides a stage, or None for tacpipe's own stages and unknown names."""
     name = stage_name(name)
     for group, prefix in (*PREFIXES.items(), (STAGES, "")):
         if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
@@ -125,20 +125,20 @@ def package_of_stage(name: str) -> str | None:
 
 @functools.cache
 def package_code(package: str) -> str | None:
-    """Return the digest of all code of a plug-in package, or of tacpipe itself, or None if it is not installed.
+    """Return the digest of all code of a plug-in package or of tacpipe, or None if it is not installed.
 
-    The code is that of the first call: a process does not import a module again that was edited since.
+    The first call determines the result, because a process does not import edited modules again.
     """
     modules = extras.OWN if package == OWN else _top_modules(plugin_packages().get(package))
     files = {name: file for module in modules for name, file in _code_files(module)}
     try:
         return digest({name: file_digest(files[name]) for name in sorted(files)}) if files else None
-    except OSError:  # a file was removed meanwhile
+    except OSError:  # a file was removed in the meantime
         return None
 
 
 def _top_modules(entry_points_file: Path | None) -> set[str]:
-    """Return the modules and packages that a distribution installs at the top level."""
+    """Return the top-level modules and packages that a distribution installs."""
     if entry_points_file is None:
         return set()
     targets = (
@@ -154,7 +154,7 @@ def _top_modules(entry_points_file: Path | None) -> set[str]:
 
 
 def _code_files(module: str) -> Iterator[tuple[str, Path]]:
-    """Yield every file of code of a module or package at the top level, with its name from there. Nothing is imported."""
+    """Yield every source file of a top-level module or package with its relative name. Imports nothing."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
@@ -172,7 +172,7 @@ def _code_files(module: str) -> Iterator[tuple[str, Path]]:
 
 @contextlib.contextmanager
 def collect_packages() -> Iterator[set[str]]:
-    """Yield a set to which the packages of all plug-ins are added that are loaded by name in the block."""
+    """Yield a set that collects the packages of all plug-ins loaded by name in the block."""
     packages: set[str] = set()
     token = _used_packages.set(packages)
     try:
@@ -182,11 +182,11 @@ def collect_packages() -> Iterator[set[str]]:
 
 
 def _entry_point_files(folder: str) -> list[Path]:
-    """Return where the entry points of what is installed in a folder may be."""
+    """Return the possible entry-point files in a folder of installed packages."""
     pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
     try:
         return [metadata / "entry_points.txt" for metadata in listed(Path(folder or "."), pattern)]
-    except PermissionError:  # nothing can be imported from there either: Python passes over such a folder too
+    except PermissionError:  # Python ignores such a folder too
         return []
 
 
@@ -194,7 +194,7 @@ def _entry_point_files(folder: str) -> list[Path]:
 def stages() -> dict[str, str]:
     """Return the target of every stage by name.
 
-    A format ``x`` is the stage ``ingest.x``, an export ``export.x``, the member ``train`` of a task ``train.x``.
+    A format ``x`` is the stage ``ingest.x``, an export is ``export.x``, and ``train`` of a task is ``train.x``.
     """
     points = entry_points()
     targets = dict(points[STAGES])
@@ -205,40 +205,40 @@ def stages() -> dict[str, str]:
 
 
 def commands() -> dict[str, str]:
-    """Return the summary of each command that is a stage or a group of stages, in the order of help.
+    """Return the summary of each command that is a stage or a group of stages, in the order of the help.
 
-    A plug-in's entry point in the group ``tacpipe.commands`` is a dict of names in their order, each with the line of a
-    group, or "" where the stage, or the module of the group, has its own. tacpipe's own come first, names that are in none
-    last, in alphabetical order.
+    A plug-in's entry point in the group ``tacpipe.commands`` is a dict of names in order. The value is the summary of a
+    group, or "" if the stage or the group's module has its own. tacpipe's commands come first; commands that are not
+    listed come last in alphabetical order.
     """
     first: dict[str, str] = {}
     for name in reversed(stages()):
         first[name.partition(".")[0]] = name
     lines: dict[str, str] = {}
     for name, target in sorted(entry_points()[COMMANDS].items(), key=lambda item: (item[0] != OWN, item[0])):
-        with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils its own order alone
+        with contextlib.suppress(TacpipeError):  # an entry point that cannot be loaded affects only its own order
             lines = {**lines, **_import(name, target)}
     names = [*(name for name in lines if name in first), *sorted(set(first) - set(lines))]
     return {name: lines.get(name) or _own_summary(name) or summary(first[name]) for name in names}
 
 
 def _own_summary(command: str) -> str:
-    """Return the summary of a stage, or of a group that has a module; empty for another group."""
+    """Return the summary of a stage, or of a group with a module; empty for other groups."""
     return summary(command) if command in stages() else group_help(command).partition("\n")[0]
 
 
 def own_module(command: str) -> str:
-    """Return the name of the module of tacpipe's own stages that is named after a command."""
+    """Return the name of the module of tacpipe's stages that is named after a command."""
     return f"{entry_points()[COMMANDS][OWN].partition(':')[0]}.{command}"
 
 
 def load_command(name: str) -> Any:
-    """Return the module of tacpipe's own stages that holds a command which is no stage."""
+    """Return the module of tacpipe's stages with a command that is not a stage."""
     return _import(name, own_module(name))
 
 
 def group_help(group: str) -> str:
-    """Return the docstring of the module that is named after a group of stages or another command; empty without one."""
+    """Return the docstring of the module that is named after a group or command, or "" if there is none."""
     try:
         return docstring(source(own_module(group)).read_text(encoding="utf-8"))
     except (OSError, SyntaxError, ValueError, ImportError):
@@ -246,7 +246,7 @@ def group_help(group: str) -> str:
 
 
 def docstring(code: str) -> str:
-    """Return the docstring of a module's code, which is parsed only where it is unusual.
+    """Return the docstring in a module's source; only unusual source is parsed.
 
     >>> docstring("'Split recordings.'")
     'Split recordings.'
@@ -268,7 +268,7 @@ def stage_name(name: str) -> str:
 
 
 def load(name: str) -> AnyStage:
-    """Return the stage of this name.
+    """Return the stage with this name.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -285,7 +285,7 @@ def load(name: str) -> AnyStage:
 
 
 def load_step(name: str) -> AnyStage:
-    """Return what is run under this name: a stage, or its fit, as ``compress.pca.fit`` is the fit of ``compress.pca``."""
+    """Return the stage with this name, or its fit: ``compress.pca.fit`` is the fit of ``compress.pca``."""
     stage = load(stage_name(name))
     if name.endswith(FIT):
         assert stage.fit is not None
@@ -302,9 +302,9 @@ def tasks() -> list[str]:
 
 
 def load_task(name: str) -> Task:
-    """Return the task of this name.
+    """Return the task with this name.
 
-    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is no subclass of `Task`.
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is not a subclass of `Task`.
     """
     task_class = _load_plugin(TASKS, "task", name)
     try:
@@ -324,7 +324,7 @@ def sensors() -> dict[str, str]:
 
 
 def load_sensor(name: str) -> Any:
-    """Return the class of the sensor of this name, a `tacpipe.sensors.sensor.Sensor`.
+    """Return the sensor class with this name, a `tacpipe.sensors.sensor.Sensor`.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -332,7 +332,7 @@ def load_sensor(name: str) -> Any:
 
 
 def load_executor(name: str) -> Any:
-    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.local.Executor`).
+    """Return the function that connects to an executor (`tacpipe.engine.executors.local.Executor`).
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -345,7 +345,7 @@ def trackers() -> dict[str, str]:
 
 
 def load_tracker(name: str) -> Any:
-    """Return what makes the tracker of this name, a `tacpipe.trackers.tracking.Tracker`, from the place to write to.
+    """Return the function from a destination to a tracker, a `tacpipe.trackers.tracking.Tracker`.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -359,7 +359,7 @@ def architectures(task: str) -> list[str]:
 
 
 def load_architecture(task: str, name: str) -> Any:
-    """Return the params of an architecture of a task; `tacpipe.plugins.architectures` validates them.
+    """Return the params class of an architecture; `tacpipe.plugins.architectures` validates it.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -372,7 +372,7 @@ def codecs() -> list[str]:
 
 
 def load_codec(kind: str) -> Any:
-    """Return the class of the codecs of this kind, a `tacpipe.codecs.codec.Codec`.
+    """Return the codec class of this kind, a `tacpipe.codecs.codec.Codec`.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
@@ -380,7 +380,7 @@ def load_codec(kind: str) -> Any:
 
 
 def _load_plugin(group: str, noun: str, name: Any) -> Any:
-    """Return what an entry point of a group names; ``name`` may be anything that a file holds."""
+    """Return the object of an entry point. ``name`` comes from a file or the user and may have any type."""
     targets = entry_points()[group]
     target = targets.get(str(name))
     if target is None:
@@ -388,7 +388,7 @@ def _load_plugin(group: str, noun: str, name: Any) -> Any:
     packages = _used_packages.get()
     if (
         packages is not None and group != MODELS
-    ):  # all architectures are loaded to know a task's params, which name theirs
+    ):  # all architectures are loaded to collect a task's params, so their own packages are not recorded
         packages.update(package.name for package in [brought_by(group, str(name))] if package is not None)
     return _import(name, target)
 
@@ -404,7 +404,7 @@ def _import(name: str, target: str) -> Any:
         raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except TacpipeError:
         raise
-    except Exception as error:  # a mistake in a plug-in's module
+    except Exception as error:  # a mistake in the plug-in's module
         raise TacpipeError(f"The module {module} of {name} cannot be loaded. {extras.failure_line(error)}") from error
     try:
         return operator.attrgetter(attribute)(loaded) if attribute else loaded
@@ -413,12 +413,12 @@ def _import(name: str, target: str) -> Any:
 
 
 def package(name: str) -> str | None:
-    """Return the name of the installed package that a stage comes from, if it is known."""
+    """Return the name of the installed package that provides a stage, if it is known."""
     return _package(stages().get(name, ""))
 
 
 def _package(target: str) -> str | None:
-    """Return the name of the installed package whose entry point ``target`` is, if it is known."""
+    """Return the name of the installed package with the entry point ``target``, if it is known."""
     from importlib.metadata import entry_points as installed_points
 
     distributions = (point.dist for group in GROUPS for point in installed_points(group=group) if point.value == target)
@@ -431,12 +431,12 @@ def _package(target: str) -> str | None:
             ),
             None,
         )
-    except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises if metadata is missing
+    except FileNotFoundError:  # raised by `importlib_metadata`, once imported, if metadata are missing
         return None
 
 
 def summary(name: str) -> str:
-    """Return the first line of the docstring of a stage's function, or of its module; never imports, never raises."""
+    """Return the first line of the docstring of a stage's function or module. Imports nothing and never raises."""
     module, _, attribute = stages()[name].partition(":")
     try:
         code = source(module).read_text(encoding="utf-8")
@@ -448,7 +448,7 @@ def summary(name: str) -> str:
 
 
 def is_named_after(module: str, stage_name: str) -> bool:
-    """Return whether the docstring of a module is the help of a stage: that of a command, or of one in a group.
+    """Return whether the docstring of a module is the help of the stage ``stage_name``.
 
     >>> is_named_after("tacpipe_stages.segment_slips", "segment.slips"), is_named_after("lab.stages", "scale")
     (True, True)
@@ -459,7 +459,7 @@ def is_named_after(module: str, stage_name: str) -> bool:
 
 
 def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | None:
-    """Return the definition of a function, or of a member of a class, in the code of a module."""
+    """Return the definition of a function or of a class member in a module's syntax tree."""
     body = tree.body
     for name in names:
         kinds = ast.FunctionDef if name == names[-1] else ast.ClassDef
@@ -471,7 +471,7 @@ def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | Non
 
 
 def source(module: str) -> Path:
-    """Return the file of a module that is not imported yet."""
+    """Return the file of a module without importing it."""
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise ImportError(module)

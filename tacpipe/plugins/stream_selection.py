@@ -23,17 +23,17 @@ WILDCARDS = "*?["
 
 @dataclass(frozen=True, kw_only=True)
 class StreamSelection:
-    """Params of a stage that reads or writes some streams of recordings; `Stage` calls the methods."""
+    """Params of a stage that reads or writes selected streams of recordings; `Stage` calls the methods."""
 
     PANELS: ClassVar[Mapping[str, Sequence[str]]] = {"Streams": ("streams", "without")}
 
-    streams: Names = added("")  # names of streams to read, with * as wildcard; empty: all
-    without: Names = added("")  # names of streams to leave out, with * as wildcard
+    streams: Names = added("")  # names of streams to read, with * as wildcard; empty for all
+    without: Names = added("")  # names of streams to exclude, with * as wildcard
 
     def narrow(self, recording: Any) -> Any:
-        """Return a recording with the selected streams; of a synchronized one with the columns of these streams.
+        """Return a recording with the selected streams, or with their columns if it is synchronized.
 
-        Raises `TacpipeError` if the recording has no stream of a name, or where no stream is left.
+        Raises `TacpipeError` if the recording has no stream of a name, or if no stream remains.
         """
         if not (self.streams or self.without):
             return recording
@@ -50,7 +50,7 @@ class StreamSelection:
         return _Narrowed(recording, [""], columns.select(names))
 
     def narrow_output(self, output: RecordingOutput) -> RecordingOutput:
-        """Return the selected streams of a recording that was read from files; raises as `narrow`."""
+        """Return the selected streams of a recording that was read from files. Raises the errors of `narrow`."""
         if not (self.streams or self.without):
             return output
         selected = self._select("", output.streams)
@@ -84,7 +84,7 @@ def _described(recording: str) -> str:
 
 
 class _Narrowed:
-    """A recording with some of its streams; of a synchronized one with some of its ``columns``."""
+    """A recording with some of its streams, or with some of its ``columns`` if it is synchronized."""
 
     def __init__(self, recording: Any, streams: Sequence[str], columns: Columns | None = None) -> None:
         self._recording, self._columns = recording, columns
