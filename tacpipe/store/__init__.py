@@ -1,1 +1,1 @@
-"""Store bytes: objects by digest, records by key, roots, and leases."""
+"""Store content by digest and results by key, with roots and leases."""

@@ -1,6 +1,6 @@
-"""Addresses of stores in object storage, and the settings that the usual environment and profiles have for them.
+"""Addresses of stores in object storage, and their settings from the environment and profiles.
 
-Credentials go from here into the client alone. An address that carries one is refused, so none can get into a record.
+Credentials are passed only to the client. An address that contains one is rejected, so none can get into a record.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ SCHEMES = {
     "az": "Azure Blob Storage",
 }
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
-_PARTS = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._ =+,-]+)*")  # a bucket, and folders in it
-_OWN = (  # The client finds its credentials itself if one of these is set
+_PARTS = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._ =+,-]+)*")  # a bucket and folders in it
+_OWN = (  # if one of these is set, the client finds its credentials itself
     "AWS_ACCESS_KEY_ID",
     "AWS_WEB_IDENTITY_TOKEN_FILE",
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
 )
-_STATED = {  # settings of a profile, and what the client calls them
+_STATED = {  # name in the client by setting of a profile
     "aws_access_key_id": "access_key_id",
     "aws_secret_access_key": "secret_access_key",
     "aws_session_token": "session_token",
@@ -45,18 +45,18 @@ class BucketAddress:
     path: str  # bucket/folder/…
 
     def __str__(self) -> str:
-        """Return the address as a command takes it."""
+        """Return the address as used on the command line."""
         return f"{self.scheme}://{self.path}"
 
 
 @dataclass
 class ClientSettings:
-    """Settings of the client in addition to the address; their representation shows no credential."""
+    """Settings of the client besides the address. Their representation contains no credentials."""
 
     config: dict[str, str | bool] = field(default_factory=dict, repr=False)
-    provider: Any = field(default=None, repr=False)  # Provides credentials that change, such as those of roles
-    plaintext: bool = False  # the server is reached without TLS
-    url: str = ""  # Replaces the address if not empty
+    provider: Any = field(default=None, repr=False)  # provides credentials that change, such as those of roles
+    plaintext: bool = False  # whether the server is accessed without TLS
+    url: str = ""  # replaces the address if not empty
 
 
 def parsed(text: str) -> BucketAddress | Path:
@@ -83,7 +83,7 @@ def parsed(text: str) -> BucketAddress | Path:
             f"path of the file system."
         )
     path = location.rstrip("/")
-    if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown: it may hold a password
+    if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown, because it may contain a password
         raise UsageError(
             f"An address of a store is {scheme}://BUCKET/FOLDER, of letters, digits and ._=+,- alone. Credentials belong in "
             f"the environment or in a profile, never in an address."
@@ -94,18 +94,18 @@ def parsed(text: str) -> BucketAddress | Path:
 
 
 def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ) -> ClientSettings:
-    """Return the settings that the client does not take from the environment: those of a profile, and whether TLS is used.
+    """Return the settings that the client does not read from the environment itself: a profile's, and whether TLS is used.
 
     Raises `UsageError` if the selected profile does not exist.
     """
-    if address.scheme == "az":  # the client takes the account as a setting
+    if address.scheme == "az":  # the client expects the account as a setting
         account, _, container_path = address.path.partition("/")
         return ClientSettings({"account_name": account}, url=f"az://{container_path}")
     if address.scheme != "s3":
         return ClientSettings()
     client_settings = ClientSettings(
         {"disable_bulk_delete": True}
-    )  # Not every server supports it, and objects are deleted singly
+    )  # not every server supports bulk deletion, and objects are deleted one at a time
     profile = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
     if profile or not any(environment.get(name) for name in _OWN):
         _fill(client_settings, profile, environment)
@@ -120,7 +120,7 @@ def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ
 
 
 def _fill(client_settings: ClientSettings, profile_name: str, environment: Mapping[str, str]) -> None:
-    """Add the settings of the profile; credentials in the environment take precedence, as in other tools."""
+    """Add the settings of the profile. As in other tools, credentials in the environment take precedence."""
     home = Path(environment.get("HOME") or "~").expanduser() / ".aws"
     files = [
         (environment.get("AWS_CONFIG_FILE") or home / "config", "profile "),
@@ -132,7 +132,7 @@ def _fill(client_settings: ClientSettings, profile_name: str, environment: Mappi
         reader = configparser.RawConfigParser()
         try:
             reader.read(path, encoding="utf-8")
-        except (configparser.Error, UnicodeDecodeError):  # The text of the error could show a credential
+        except (configparser.Error, UnicodeDecodeError):  # the error's text could contain a credential
             raise UsageError(f"{path} is not a file of profiles: a line of it cannot be read.") from None
         for section in (name, f"{before}{name}"):
             if reader.has_section(section):
@@ -155,7 +155,7 @@ def _fill(client_settings: ClientSettings, profile_name: str, environment: Mappi
 
 
 def _provider(name: str) -> Any:
-    """Return what asks boto3 for the credentials of a profile that states none itself: a role, or a single sign-on."""
+    """Return a boto3 provider for the credentials of a profile without its own: a role, or a single sign-on."""
     with extras.explain_missing(f"The profile {name}, whose credentials are those of a role or a sign-on,"):
         from boto3 import Session
         from obstore.auth.boto3 import Boto3CredentialProvider

@@ -1,9 +1,10 @@
-"""Keep a store's bytes in a folder or a bucket, by six operations on names, and implement them for folders.
+"""Storage backends: six operations on names, which folders and buckets implement.
 
-A name is a path within the store, as `docs/format.md` lists them, such as ``objects/ab/ab12…``. A place that computers share
-needs no more than that one of several that create a name wins: what has to change gets another name.
+A name is a path in the store, as listed in `docs/format.md`, such as ``objects/ab/ab12…``. Storage that several
+computers share only needs to guarantee that exactly one of several processes succeeds in creating a name; content that
+changes gets a new name.
 
-In a folder, drafts lie in ``tmp/``, are synced and renamed, and links replace nothing.
+In a folder, drafts are written to ``tmp/``, synced and renamed, and links never replace a file.
 """
 
 from __future__ import annotations
@@ -20,67 +21,68 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sentence, unread, write_whole
 from tacpipe.store import layout
 
-MAX_CONCURRENT = 16  # requests on their way at once
+MAX_CONCURRENT = 16  # maximum number of concurrent requests
 
 
 class Entry(NamedTuple):
-    """State of one name in a place."""
+    """Size and modification time of a name."""
 
     name: str
     bytes: int
-    changed_s: float  # seconds of UTC since 1970, by the clock of the place
+    changed_s: float  # Unix time in seconds by the backend's clock
 
 
 T = TypeVar("T")
 
 
 class Backend(Protocol):
-    """A place that keeps bytes by name.
+    """A backend that stores content by name.
 
-    Every method raises `StorageError` if the place fails. Such an error states nothing about what the place holds.
+    Every method raises `StorageError` if the backend fails. Such an error implies nothing about the stored content.
     """
 
-    place: str  # Name in messages
+    place: str  # name in messages
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
-        """Keep ``content``, whole or in blocks, under a name that nothing has; return False if something has it.
+        """Store ``content``, given as bytes or blocks, under a new name; return False if the name exists.
 
-        Of several that create one name at once one wins. Nobody ever sees a part of the content.
+        Of several concurrent calls for one name, one succeeds. Partial content is never visible.
         """
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
-        """Return the content of at most ``max_bytes`` bytes.
+        """Return the content of a name.
 
-        Raises `FileNotFoundError` if there is none, and `IrregularError` for one that is larger or is not content.
+        Raises `FileNotFoundError` if it does not exist, and `IrregularError` if it is not a file or larger than
+        ``max_bytes``.
         """
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
-        """Yield the content block by block; raises as `read` does."""
+        """Yield the content block by block. Raises the errors of `read`."""
 
     def stat(self, name: str) -> Entry | None:
-        """Return what the place states of a name, or None if nothing has it; raises `IrregularError` as `read` does."""
+        """Return the entry of a name, or None if it does not exist. Raises `IrregularError` as `read` does."""
 
     def list(self, folder: str) -> Iterator[Entry]:
-        """Yield what has the form of a store's names within ``folder``, at any depth, in no order.
+        """Yield the entries below ``folder`` that have the form of a store's names, in any order.
 
-        What is deleted meanwhile may be left out.
+        Names that are deleted during the listing may be missing.
         """
 
     def move(self, name: str, to: str) -> bool:
-        """Give content another name, and replace what has that; return False if nothing has ``name``.
+        """Rename content, replacing any content at the new name; return False if ``name`` does not exist.
 
-        Whoever looks finds it under the one name, the other, or both.
+        At any time the content is available under one of the names or both.
         """
 
     def delete(self, name: str) -> None:
-        """Keep a name no longer; one that nothing has is no mistake."""
+        """Delete a name; nothing happens if it does not exist."""
 
 
 def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes], T | None]) -> T | None:
-    """Return the parsed content of a file, which is read again if the first answer cannot be parsed.
+    """Return the parsed content of a file, reading it again if the first response cannot be parsed.
 
-    Returns None only if the second answer agrees with the first: an answer may be damaged on its way. Raises
-    `StorageError` if they differ, and `FileNotFoundError` if no such file exists.
+    Returns None only if both responses agree, because a response may be damaged in transit. Raises `StorageError` if
+    they differ, and `FileNotFoundError` if the file does not exist.
     """
     answers: list[bytes | str] = []
     for _ in range(2):
@@ -101,7 +103,7 @@ def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes
 
 
 class Directory:
-    """The folder of a store; ``draft`` returns the path of a new file in its ``tmp/``."""
+    """The folder of a store. ``draft`` returns the path of a new file in its ``tmp/``."""
 
     def __init__(self, root: Path | str, draft: Callable[[], str] | None = None) -> None:
         self.place = str(root)
@@ -109,26 +111,27 @@ class Directory:
         self._draft = draft or self._nobodys
 
     def path(self, name: str) -> str:
-        """Return where a name lies."""
+        """Return the path of a name."""
         return f"{self.place}/{name}"
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
-        """Do as `Backend.create`; on file systems without links the first of two that finish at once may be replaced."""
+        """Implement `Backend.create`; without hard links, one of two concurrent calls may replace the other."""
         return self.write(self.path(name), content, exclusive=True)
 
     def write(
         self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
     ) -> bool:
-        """Write a file of the store whole or not at all, over what was there; return False if ``exclusive`` lost the race.
+        """Write a file atomically, replacing an existing one; return False if ``exclusive`` is set and the file exists.
 
-        Raises `StorageError` if its folder is a symbolic link: what is replaced there may be anybody's.
+        Raises `StorageError` if the file's folder is a symbolic link, because the file could then belong to something
+        else.
         """
         self.refuse_linked(path)
         with readable_errors(self._root):
             return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive)
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
-        """Do as `Backend.read`."""
+        """Implement `Backend.read`."""
         try:
             return regular.content(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
@@ -137,7 +140,7 @@ class Directory:
             raise unread(self.path(name), error) from error
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
-        """Do as `Backend.blocks`."""
+        """Implement `Backend.blocks`."""
         try:
             yield from regular.blocks(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
@@ -146,10 +149,10 @@ class Directory:
             raise unread(self.path(name), error) from error
 
     def stat(self, name: str) -> Entry | None:
-        """Do as `Backend.stat`."""
+        """Implement `Backend.stat`."""
         path = self.path(name)
         try:
-            status = os.lstat(path)  # Called once per shard: os is 5 times faster than pathlib
+            status = os.lstat(path)  # called once per shard, and os is 5 times faster than pathlib
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -158,14 +161,14 @@ class Directory:
         return Entry(name, status.st_size, status.st_mtime)
 
     def list(self, folder: str) -> Iterator[Entry]:
-        """Do as `Backend.list`; ``folder`` is one of those of the layout."""
+        """Implement `Backend.list`; ``folder`` is a folder of the store's layout."""
         for path in layout.entries(self._root, folder):
             with contextlib.suppress(FileNotFoundError), readable_errors(self._root):
                 status = path.lstat()
                 yield Entry(str(path.relative_to(self._root)), status.st_size, status.st_mtime)
 
     def move(self, name: str, to: str) -> bool:
-        """Do as `Backend.move`: within a folder of the file system a name changes at once."""
+        """Implement `Backend.move`; renaming is atomic in a file system."""
         self.refuse_linked(self.path(to))
         with readable_errors(self._root):
             try:
@@ -178,12 +181,12 @@ class Directory:
         return True
 
     def delete(self, name: str) -> None:
-        """Do as `Backend.delete`."""
+        """Implement `Backend.delete`."""
         with readable_errors(self._root):
             Path(self.path(name)).unlink(missing_ok=True)
 
     def refuse_linked(self, path: Path | str) -> None:
-        """Raise `StorageError` if a file of the store lies in a folder that is a symbolic link."""
+        """Raise `StorageError` if a file of the store is in a folder that is a symbolic link."""
         if layout.is_linked(self.place, path):
             raise StorageError(
                 f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."

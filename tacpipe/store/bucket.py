@@ -1,4 +1,4 @@
-"""Object storage as the place of a store, by `obstore`: whole objects, and one winner of several that create a name."""
+"""Object storage as a backend, through `obstore`: objects are written completely, and one of several creations succeeds."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from tacpipe.store.addresses import BucketAddress
 from tacpipe.store.backend import Entry
 
 Result = TypeVar("Result")
-TRIES = 5  # Attempts per request
-RETRIES = 2  # Retries of the client within each attempt
-PAUSE_S = 0.2  # Pause after the first attempt; each pause is four times longer
-PART_BYTES = 8 << 20  # an object up to this size is one request
-PAGE = 1000  # names that one request lists
-_AHEAD = 4  # parts of one object on their way at once
-_LARGE = 4  # objects of several parts on their way at once, which bounds memory to 128 MB
-_COPY_BYTES = 5 * 10**9  # the largest object that S3 copies by itself
+TRIES = 5  # attempts per request
+RETRIES = 2  # retries of the client within each attempt
+PAUSE_S = 0.2  # pause after the first attempt; each further pause is four times longer
+PART_BYTES = 8 << 20  # maximum size of an object that is sent in one request
+PAGE = 1000  # names listed per request
+_AHEAD = 4  # parts of an object transferred concurrently
+_LARGE = 4  # multi-part objects transferred concurrently, which limits memory to 128 MB
+_COPY_BYTES = 5 * 10**9  # largest object that S3 copies in one request
 _STATUS = re.compile(r"status code: (\d{3}[ A-Za-z]*)")
 _NO_BUCKET = ("NoSuchBucket", "bucket does not exist", "ContainerNotFound")
-_METADATA = ("169.254.169.254", "metadata.google.internal")  # asked last, where nothing else gives credentials
+_METADATA = ("169.254.169.254", "metadata.google.internal")  # used last, if nothing else provides credentials
 
 
 class Bucket:
-    """A folder of a bucket. Safe to use from several threads; credentials never leave the client."""
+    """A folder in a bucket. Thread-safe; credentials stay in the client."""
 
     def __init__(self, address: BucketAddress | str, client: Any = None) -> None:
         self.place = str(address)
@@ -44,10 +44,11 @@ class Bucket:
         self._large = Semaphore(_LARGE)
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
-        """Do as `Backend.create`.
+        """Implement `Backend.create`.
 
-        Content of more than one part is uploaded in parts and replaces an object that was created meanwhile. An error of
-        ``content`` aborts the upload. After a lost connection ``content`` is iterated again, unless it is an iterator.
+        Content larger than one part is uploaded in parts and replaces an object that was created in the meantime. An
+        error of ``content`` aborts the upload. After a lost connection ``content`` is iterated again, unless it is an
+        iterator.
         """
         if isinstance(content, bytes):
             return self._create(name, content)
@@ -83,10 +84,12 @@ class Bucket:
             tries += 1
             try:
                 obstore.put(self._client, name, content, mode="create")
-            except obstore.exceptions.AlreadyExistsError:  # S3 answers so too where requests collide, and keeps nothing
+            except (
+                obstore.exceptions.AlreadyExistsError
+            ):  # S3 also returns this if requests collide and nothing was stored
                 if self.stat(name) is None:
                     return None
-                return tries > 1 and self.read(name) == content  # an answer that was lost had kept it
+                return tries > 1 and self.read(name) == content  # a request whose response was lost may have succeeded
             return True
 
         try:
@@ -105,11 +108,11 @@ class Bucket:
         )
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
-        """Do as `Backend.read`."""
+        """Implement `Backend.read`."""
         return b"".join(self._blocks(name, max_bytes))
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
-        """Do as `Backend.blocks`: parts of a large object are fetched ahead of the one that is used."""
+        """Implement `Backend.blocks`; parts of a large object are prefetched."""
         return self._blocks(name, max_bytes)
 
     def _blocks(self, name: str, max_bytes: int | None) -> Iterator[bytes]:
@@ -146,7 +149,7 @@ class Bucket:
         return self._tried(lambda: bytes(obstore.get_range(self._client, name, start=start, end=end)))
 
     def stat(self, name: str) -> Entry | None:
-        """Do as `Backend.stat`."""
+        """Implement `Backend.stat`."""
         import obstore
 
         try:
@@ -156,7 +159,7 @@ class Bucket:
         return Entry(name, head["size"], head["last_modified"].timestamp())
 
     def list(self, folder: str) -> Iterator[Entry]:
-        """Do as `Backend.list`; what has another form than a store's names is listed too."""
+        """Implement `Backend.list`; other names are listed too."""
         import obstore
 
         pages: Iterator[Sequence[Any]] | None = None
@@ -173,13 +176,13 @@ class Bucket:
                 raise
             return [Entry(item["path"], item["size"], item["last_modified"].timestamp()) for item in page]
 
-        while page := self._tried(next_page):  # one request each, so whoever looks at some asks for no more
+        while page := self._tried(next_page):  # one request per page, so that reading only some names costs no more
             new = [entry for entry in page if entry.name not in listed]
             listed.update(entry.name for entry in new)
             yield from new
 
     def move(self, name: str, to: str) -> bool:
-        """Do as `Backend.move`: a copy, which the server makes, and then a deletion."""
+        """Implement `Backend.move` as a copy on the server followed by a deletion."""
         import obstore
 
         entry = self.stat(name)
@@ -196,14 +199,14 @@ class Bucket:
         return True
 
     def delete(self, name: str) -> None:
-        """Do as `Backend.delete`."""
+        """Implement `Backend.delete`."""
         import obstore
 
         with contextlib.suppress(FileNotFoundError):
             self._tried(lambda: obstore.delete(self._client, name))
 
     def _tried(self, request: Callable[[], Result], tries: int = 0) -> Result:
-        """Return the result of a request, repeated if the connection or the server fails. Raises `StorageError`."""
+        """Return the result of a request, repeating it if the connection or the server fails. Raises `StorageError`."""
         import obstore
         from obstore.exceptions import BaseError
 
@@ -213,7 +216,7 @@ class Bucket:
                 return request()
             except obstore.exceptions.GenericError as error:
                 if remaining_tries == 0 or not _may_pass(error):
-                    raise self._sentence(error) from None  # its own text may hold what nobody may read
+                    raise self._sentence(error) from None  # the client's error may contain confidential text
             except FileNotFoundError as error:
                 if any(mark in str(error) for mark in _NO_BUCKET):
                     raise self._sentence(error) from None
@@ -225,7 +228,7 @@ class Bucket:
         raise AssertionError
 
     def _sentence(self, error: Exception) -> StorageError | UsageError:
-        """Return in words what the server answered; of its text only the status is shown."""
+        """Return an error that describes the server's response; only the status of its text is shown."""
         from obstore.exceptions import PermissionDeniedError, UnauthenticatedError
 
         text = str(error)
@@ -255,7 +258,7 @@ class Bucket:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Return whether a request may succeed when it is repeated: not one that the server understood and refused."""
+    """Return whether a repeated request may succeed, which excludes requests that the server understood and refused."""
     text = str(error)
     status = _STATUS.search(text)
     lasting = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")
@@ -263,7 +266,7 @@ def _may_pass(error: Exception) -> bool:
 
 
 def _part(blocks: Iterator[bytes]) -> bytes:
-    """Return the next ``blocks`` joined, up to a little more than one part."""
+    """Return the next ``blocks`` joined, up to slightly more than one part."""
     parts: list[bytes] = []
     size = 0
     for block in blocks:
@@ -275,14 +278,14 @@ def _part(blocks: Iterator[bytes]) -> bytes:
 
 
 def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
-    """Yield the same bytes in pieces of a part or so: each step of the client costs a change of threads."""
+    """Yield the same bytes in pieces of about one part, because each step of the client costs a thread switch."""
     blocks = iter(blocks)
     while part := _part(blocks):
         yield part
 
 
 def _connected(address: BucketAddress) -> Any:
-    """Return obstore's client of an address, with the credentials that the environment or a profile gives."""
+    """Return obstore's client for an address, with credentials from the environment or a profile."""
     with extras.explain_missing(f"A store at {address.scheme}://"):
         from obstore.exceptions import BaseError
         from obstore.store import from_url
@@ -301,7 +304,7 @@ def _connected(address: BucketAddress) -> Any:
         arguments["credential_provider"] = client_settings.provider
     try:
         return from_url(client_settings.url or str(address), **arguments)
-    except (BaseError, ValueError, TypeError):  # its text may hold a credential
+    except (BaseError, ValueError, TypeError):  # the error's text may contain a credential
         raise UsageError(
             f"The settings for {address} cannot be used. Look at the variables {_VARIABLES[address.scheme]} and the profile."
         ) from None

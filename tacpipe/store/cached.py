@@ -1,8 +1,8 @@
-"""A store in a bucket as stages use it: a store in a folder of this computer in front, which keeps what was read and made.
+"""A store in a bucket with a local cache: a store in a folder on this computer that keeps what was read and computed.
 
-What the folder has is used as it is, and asks nothing of the network. What it lacks comes from the bucket, each object
-verified by its digest. What is made goes to the bucket at once: objects, then the record that names them; the name of a
-dataset comes last. So the bucket holds what its records and names state, wherever a process or a connection ends.
+Objects in the folder are used without network access. Missing ones are fetched from the bucket, and each is verified by
+its digest. New results are uploaded immediately: objects first, then the record that names them, the dataset's name
+last. So the bucket contains everything that its records and names refer to, wherever a process or a connection ends.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from tacpipe.store.roots import RootProject
 from tacpipe.store.store import AbsentError, MissingError, Object, Store
 
 VARIABLE = "TACPIPE_CACHE"
-_LOOKS = 100  # pushes of one name that may come first
-_buckets: dict[tuple[int, Path], Bucket] = {}  # Buckets of this process: a client outlives the tasks that use it
-_stores: set[tuple[int, Path]] = set()  # Buckets that hold a store
+_LOOKS = 100  # attempts if other pushes of the same name come first
+_buckets: dict[tuple[int, Path], Bucket] = {}  # buckets of this process; a client outlives the tasks that use it
+_stores: set[tuple[int, Path]] = set()  # buckets that contain a store
 
 
 def folder(address: BucketAddress) -> Path:
-    """Return the folder in front of a bucket: below ``TACPIPE_CACHE``, else below the cache of this user.
+    """Return the cache folder of a bucket: below ``TACPIPE_CACHE``, or else below the user's cache.
 
-    Its name holds a digest of the address and of the server: the same address at another one is another store.
+    Its name contains a digest of address and server, because the same address on another server is another store.
     """
     cache = os.environ.get(VARIABLE)
     above = Path(cache).expanduser() if cache else _of_user() / "tacpipe"
@@ -50,7 +50,7 @@ def _of_user() -> Path:
 
 
 class CachedStore(Store):
-    """The store at an address; ``root`` is the folder that caches it.
+    """The store at an address; ``root`` is its cache folder.
 
     Methods raise `StorageError` if they need the bucket and cannot reach it.
     """
@@ -62,16 +62,16 @@ class CachedStore(Store):
         self.address = address
         self._remote: RemoteStore | None = None
         self._is_prepared = False  # the folder
-        self._work: ExitStack | None = None  # Closed at the end of the run that began here
-        self._is_announced = False  # True once the run is announced in the bucket
+        self._work: ExitStack | None = None  # closed at the end of the run that started here
+        self._is_announced = False  # whether the run has been announced in the bucket
         self._reads: list[str] = []
         self._forget()
 
     def _forget(self) -> None:
-        self._requested: set[str] = set()  # objects that are looked for next
-        self._bucket_sizes: dict[str, int | None] = {}  # bytes of objects in the bucket, None for those that it has not
-        self._not_uploaded: set[str] = set()  # objects that were put here, and did not go to the bucket yet
-        self._no_record: set[str] = set()  # keys without a record there
+        self._requested: set[str] = set()  # objects that will be looked up next
+        self._bucket_sizes: dict[str, int | None] = {}  # size of objects in the bucket, None for missing ones
+        self._not_uploaded: set[str] = set()  # new objects that have not been uploaded
+        self._no_record: set[str] = set()  # keys without a record in the bucket
 
     @property
     def place(self) -> str:
@@ -80,7 +80,7 @@ class CachedStore(Store):
 
     @property
     def bucket(self) -> RemoteStore:
-        """The store in the bucket, which need not have begun yet. Raises `UsageError` if it has another format."""
+        """The store in the bucket, which may not exist yet. Raises `UsageError` if it has another format."""
         if self._remote is None:
             key = os.getpid(), self.root
             if key not in _buckets:
@@ -91,7 +91,7 @@ class CachedStore(Store):
         return self._remote
 
     def prepare(self) -> None:
-        """Create the folder where there is none yet; raises as `Store.prepare`."""
+        """Create the folder if it does not exist. Raises the errors of `Store.prepare`."""
         if not self._is_prepared:
             super().prepare()
             self._is_prepared = True
@@ -100,7 +100,7 @@ class CachedStore(Store):
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Do as `Store.at_work`; collections in the bucket hear of it once something is asked of that."""
+        """Implement `Store.at_work`. The run is announced in the bucket when the bucket is first used."""
         reads = sorted(manifests)
         if self._run is not None:
             with super().at_work(reads):
@@ -115,13 +115,13 @@ class CachedStore(Store):
             self._work, self._is_announced = None, False
 
     def announce(self, names: Iterable[str]) -> None:
-        """Do as `Store.announce`. The bucket is asked for all of them as soon as one is needed and missing here."""
+        """Implement `Store.announce`. The bucket is asked for all objects when the first missing one is needed."""
         announced = list(names)
         self._requested.update(announced)
         super().announce(announced)
 
     def _announce(self, names: Collection[str], *, manifests: Collection[str] = (), keys: Collection[str] = ()) -> None:
-        """Announce to collections in the bucket, where a run was begun here: a worker's is announced by who began it."""
+        """Announce objects in the bucket if the run started here; for a worker, the starting process does it."""
         if self._work is None:
             return
         if not self._is_announced:
@@ -143,7 +143,7 @@ class CachedStore(Store):
             self._requested.update(records.digests(record["result"]))
 
     def seek(self, key: str) -> None:
-        """Bring the record of a key that is not here, or note that there is none."""
+        """Fetch the record of a key that is not cached, or note that there is none."""
         if key in self._no_record or present(self.record_path(key)):
             return
         record = self.bucket.record(key)
@@ -155,7 +155,7 @@ class CachedStore(Store):
     # ---- objects
 
     def has(self, name: str, size: int | None = None) -> bool:
-        """Return whether an object of this digest (and size in bytes) is here or in the bucket."""
+        """Return whether an object with this digest (and size in bytes) is in the cache or the bucket."""
         if self._lies(name, size):
             return True
         if name not in self._bucket_sizes:
@@ -164,7 +164,7 @@ class CachedStore(Store):
         return stored_bytes is not None and size in (None, stored_bytes)
 
     def _look(self, names: Iterable[str]) -> None:
-        """Ask the bucket once which of these objects it has."""
+        """Query the bucket once for these objects."""
         unknown = [name for name in names if name not in self._bucket_sizes and not present(self.object_path(name))]
         self._requested.clear()
         self._announce(unknown)
@@ -172,7 +172,7 @@ class CachedStore(Store):
         self._bucket_sizes.update({name: sizes.get(name) for name in unknown})
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Bring objects that are not here, several at once; what cannot be brought is reported by who reads it."""
+        """Fetch missing objects concurrently. Reading an object reports why it could not be fetched."""
         absent = [name for name in dict.fromkeys(names) if not present(self.object_path(name))]
         if not absent:
             return
@@ -189,9 +189,10 @@ class CachedStore(Store):
                 advance()
 
     def _bring(self, name: str, size: int | None = None) -> None:
-        """Bring an object, verified. Raises `MissingError` if the bucket has not it, or has it damaged.
+        """Fetch and verify an object. Raises `MissingError` if it is missing or damaged in the bucket.
 
-        What is damaged there twice in a row is moved to quarantine there: then it is missing for everybody, and recomputed.
+        An object that is damaged twice in a row is quarantined in the bucket, so that it is missing for everybody and
+        recomputed.
         """
         self.prepare()
         for last in (False, True):
@@ -204,12 +205,12 @@ class CachedStore(Store):
             except MissingError:
                 if last:
                     self._bucket_sizes[name] = None
-                    with contextlib.suppress(StorageError):  # The store may be read-only
+                    with contextlib.suppress(StorageError):  # the store may be read-only
                         self.bucket.quarantine(name)
                     raise
 
     def read(self, name: str, size: int | None = None) -> bytes:
-        """Do as `Store.read`; what is not here, or damaged here, is brought."""
+        """Implement `Store.read`, fetching an object that is missing or damaged here."""
         try:
             return super().read(name, size)
         except MissingError:
@@ -217,27 +218,27 @@ class CachedStore(Store):
             return super().read(name, size)
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
-        """Do as `Store.blocks`; what is not here is brought."""
+        """Implement `Store.blocks`, fetching an object that is missing here."""
         if not self._lies(name):
             self._bring(name, size)
         yield from super().blocks(name, size)
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
-        """Do as `Store.put`; the object is uploaded with the record or the dataset that names it."""
+        """Implement `Store.put`. The object is uploaded with the record or dataset that names it."""
         self.prepare()
         stored = super().put(content, durable=durable)
         self._not_uploaded.add(stored.digest)
         return stored
 
     def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
-        """Do as `Store.put_written`; the object is uploaded as in `put`."""
+        """Implement `Store.put_written`. The object is uploaded as by `put`."""
         self.prepare()
         stored = super().put_written(write, durable=durable)
         self._not_uploaded.add(stored.digest)
         return stored
 
     def send(self, names: Iterable[str]) -> None:
-        """Have the bucket hold objects; those that it lacks are sent. Raises `MissingError` for one that is not here."""
+        """Upload the objects that the bucket lacks. Raises `MissingError` if one is not in the cache."""
         sizes = {}
         for name in names:
             if not self._lies(name):
@@ -247,7 +248,7 @@ class CachedStore(Store):
         self._complete(sizes)
 
     def _upload(self, names: Collection[str]) -> None:
-        """Have the bucket keep objects that lie here. Raises `MissingError` for one that is damaged."""
+        """Upload objects from the cache. Raises `MissingError` if one is damaged."""
 
         def send(name: str) -> None:
             self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
@@ -261,17 +262,17 @@ class CachedStore(Store):
         self._not_uploaded.difference_update(names)
 
     def _bar(self, description: str, total: int) -> contextlib.AbstractContextManager[Callable[..., None]]:
-        """Do as `progress.bar`, but in a task: there is one for all of these."""
+        """Return a progress bar, or one that shows nothing in a worker, whose run already has a bar."""
         return terminal.progress_bar(description, total) if self._work is not None else contextlib.nullcontext(_no_bar)
 
     def read_here(self, name: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the blocks of an object that lies here; raises as `Store.blocks`."""
+        """Yield the blocks of a cached object. Raises the errors of `Store.blocks`."""
         return super().blocks(name, size)
 
     # ---- records
 
     def read_record(self, key: str) -> Record:
-        """Do as `Store.read_record`; one that is not here is brought."""
+        """Implement `Store.read_record`, fetching a record that is not cached."""
         try:
             return super().read_record(key)
         except MissingError:
@@ -289,35 +290,35 @@ class CachedStore(Store):
         replace: bool = False,
         durable: bool = False,
     ) -> Record:
-        """Do as `Store.commit` in the bucket; the objects that the record names are uploaded first."""
+        """Implement `Store.commit` in the bucket. The record's objects are uploaded first."""
         self._begin()
         self._upload([name for name in dict.fromkeys(records.digests(result)) if name in self._not_uploaded])
         committed = self.bucket.commit(identity, result, provenance, replace=replace)
         return self._keep_record(committed, durable=durable)
 
     def _begin(self) -> None:
-        """Begin the store in the bucket where there is none."""
+        """Create the store in the bucket if it does not exist."""
         key = os.getpid(), self.root
         if key not in _stores:
             self.bucket.prepare()
             _stores.add(key)
 
     def _keep_record(self, record: Record, *, durable: bool = False) -> Record:
-        """Keep a record of the bucket here, in place of any other, and return it."""
+        """Cache a record of the bucket, replacing an existing one, and return it."""
         identity, result, provenance = record["identity"], record["result"], record["provenance"]
         self._no_record.discard(digest(identity))
         self.prepare()
         return super().commit(identity, result, provenance, replace=True, durable=durable)
 
     def records(self) -> Iterator[tuple[str, Record]]:
-        """Yield every key and its record, those of the bucket too; they are kept here."""
+        """Yield every key and its record, including those of the bucket, which are cached."""
         keys = [Path(entry.name).stem for entry in self.bucket.files.list("records")]
         for _, record in self.bucket.records(key for key in keys if not present(self.record_path(key))):
             self._keep_record(record)
         yield from super().records()
 
     def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
-        """Do as `Store.records_of`, of the records that are here: those that this computer looked for."""
+        """Implement `Store.records_of` for the cached records."""
         return super().records()
 
     # ---- datasets
@@ -332,11 +333,11 @@ class CachedStore(Store):
         before: str = "",
         lasting: bool = False,
     ) -> None:
-        """Keep ``manifest`` and everything that it ``needs`` in the bucket, as the dataset ``name`` of a project.
+        """Store ``manifest`` and everything that it ``needs`` in the bucket, as the dataset ``name`` of a project.
 
-        ``needs`` gives names and bytes of objects for the digest of a manifest that lies here, nothing for another one;
-        ``before`` is the manifest that this computer last knew under that name: what the bucket's own newest version needs
-        was there when that was named, has been needed since, and is not looked for. ``lasting`` is as `Store.roots` has it.
+        ``needs`` maps the digest of a cached manifest to the sizes of its objects by name, and other digests to
+        nothing. ``before`` is the last known manifest of that name: objects of the bucket's newest version have been
+        needed since it was named, so they exist and are not checked. ``lasting`` is as in `Store.roots`.
         """
         roots = self.bucket.roots
         root = roots.pushed(name, project["id"])
@@ -359,22 +360,22 @@ class CachedStore(Store):
         raise TacpipeError(f"{name} is written to {self.place} by others all the time. Run the same command again.")
 
     def _complete(self, sizes: Mapping[str, int]) -> None:
-        """Upload announced objects that the bucket lacks. Raises `MissingError` for one that is missing here too.
+        """Upload announced objects that the bucket lacks. Raises `MissingError` if one is missing in the cache too.
 
-        Objects that were sent before are checked too: a collection may have run before the announcement.
+        Objects uploaded earlier are checked too, because a collection may have run before the announcement.
         """
         sizes_in_bucket = self.bucket.sizes(sizes)
         absent = [name for name in sizes if sizes_in_bucket.get(name) != sizes[name]]
         for name in absent:
             if not self._lies(name):
                 raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")
-            if name in sizes_in_bucket:  # The size differs, so it is damaged
+            if name in sizes_in_bucket:  # the size differs, so the object is damaged
                 self.bucket.quarantine(name)
         self._upload(absent)
 
 
 class _Blocks:
-    """The verified blocks of an object that lies here, as often as they are asked for."""
+    """The verified blocks of a cached object, which can be iterated repeatedly."""
 
     def __init__(self, store: CachedStore, name: str) -> None:
         self._store, self._name = store, name

@@ -1,7 +1,7 @@
-"""The layout of a store: its folders, the form of every name in them, and whether a folder is a store at all.
+"""The layout of a store: its folders, the form of every name in them, and whether a folder is a store.
 
-What has another form was put there by somebody else: it is never moved, never removed, and `tacpipe store verify` names it.
-No symbolic link within a store is followed. ``.tacpipe`` itself may be one, to another disk.
+Files with other names do not belong to the store: they are never moved or removed, and `tacpipe store verify` lists
+them. Symbolic links inside a store are not followed. ``.tacpipe`` itself may be a link, for example to another disk.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from tacpipe.printable import listed, plain
 
 FORMAT = "1"
 BESIDE_NAME = ".tacpipe"  # name of a store in its project's folder
-MARK = "format"  # the file that makes a folder a store
-PROJECT = "project"  # the file that makes the folder of a store that of a project, written by `tacpipe store init`
+MARK = "format"  # file that marks a folder as a store
+PROJECT = "project"  # file that marks the store's folder as a project, written by `tacpipe store init`
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
-SPOOL = "spool"  # made by the first recording
-KEPT = "kept-spools"  # made by the first recording whose raw bytes are kept
-PROJECTS = "projects"  # made by the first push
-PRESENCE = "presence"  # made by the first command that finds a large dataset complete
-ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
-SHELF = re.compile(r"[0-9a-f]{2}")  # folders within objects/ and records/: how the names in them begin
+SPOOL = "spool"  # created by the first recording
+KEPT = "kept-spools"  # created by the first recording whose raw bytes are kept
+PROJECTS = "projects"  # created by the first push
+PRESENCE = "presence"  # created by the first command that finds a large dataset complete
+ASIDE = "gc-"  # prefix in ``tmp/`` of an object that a collection has set aside
+SHELF = re.compile(r"[0-9a-f]{2}")  # folders in objects/ and records/, named after the first digits of their names
 _DIGEST = r"[0-9a-f]{64}"
 _RANDOM = r"[0-9a-f]{32}"
-_FORMS = {  # Pattern of the paths within each folder
+_FORMS = {  # pattern of the paths in each folder
     "objects": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}"),
     "records": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}\.json"),
     "roots": re.compile(rf"{_DIGEST}\.json"),
@@ -45,16 +45,16 @@ _FORMS = {  # Pattern of the paths within each folder
     PRESENCE: re.compile(_DIGEST),
 }
 _SHELVED = ("objects", "records")
-_NAME_LENGTHS = {"objects": 64, "records": 69}  # characters: a digest, and ".json" after that of a record
-_HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files
-_BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may hold something before there is a mark
-_BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # no reason to refuse a folder that is to become a store
+_NAME_LENGTHS = {"objects": 64, "records": 69}  # length of names: a digest, followed by ".json" for a record
+_HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # folders whose entries are folders; others contain files
+_BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may have content before the mark is written
+_BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # files that may exist in a folder that becomes a store
 
 
 def object_name(name: str) -> str:
-    """Return the path within a store of the object ``name``.
+    """Return the path of the object ``name`` in a store.
 
-    Raises `DamagedError` for a name that is not a digest: it would lead out of the store.
+    Raises `DamagedError` if the name is not a digest, because it could lead out of the store.
     """
     if not DIGEST.fullmatch(name):
         raise DamagedError(f"{name[:80]!r} is not a digest (64 hex digits): what names it is damaged or was made up.")
@@ -62,20 +62,20 @@ def object_name(name: str) -> str:
 
 
 def record_name(key: str) -> str:
-    """Return the path within a store of the record of ``key``."""
+    """Return the path of the record of ``key`` in a store."""
     return f"records/{key[:2]}/{key}.json"
 
 
 def check(root: Path) -> bool:
-    """Return whether ``root`` holds a store; False if it is empty or missing, so that a store can be created.
+    """Return whether ``root`` is a store, or False if it is empty or missing, so that a store can be created.
 
-    Raises `UsageError` for a folder with other content, for a store of another format, and for one whose folders are
-    symbolic links. Nothing is changed.
+    Raises `UsageError` for a folder with other content, for a store of another format, and if its folders are symbolic
+    links. Changes nothing.
     """
     with readable_errors(root):
         mark = _mark(root)
         if mark is None and not _may_begin(root):
-            mark = _mark(root)  # another process may have begun the store between the two looks
+            mark = _mark(root)  # another process may have created the store in between
             if mark is None:
                 raise UsageError(_not_a_store(root))
         if mark not in (None, FORMAT):
@@ -93,7 +93,7 @@ def check(root: Path) -> bool:
 
 
 def refuse_within(output: Path) -> None:
-    """Raise `UsageError` for an output within a store, whatever links lead there."""
+    """Raise `UsageError` for an output path inside a store, also through links."""
     path = Path(os.path.realpath(output))
     for folder in (path, *path.parents):
         if folder.name == BESIDE_NAME or ((folder / MARK).is_file() and (folder / "objects").is_dir()):
@@ -103,20 +103,20 @@ def refuse_within(output: Path) -> None:
 
 
 def entries(root: Path, name: str) -> Iterator[Path]:
-    """Yield what lies in a folder of the store and has the form of its names, sorted.
+    """Yield the sorted entries of a folder of the store whose names have the store's form.
 
-    What vanishes meanwhile is left out. Raises `StorageError` for a folder that cannot be listed.
+    Entries that disappear in the meantime are skipped. Raises `StorageError` if the folder cannot be listed.
     """
     return (Path(path) for path, ours in _contents(root, name) if ours)
 
 
 def names(root: Path, folder: str) -> Iterator[str]:
-    """Yield the names of the files in ``objects`` or ``records``, which are digests, sorted. Raises as `entries` does."""
+    """Yield the sorted file names in ``objects`` or ``records``, which are digests. Raises the errors of `entries`."""
     return (path[-_NAME_LENGTHS[folder] :][:64] for path, ours in _contents(root, folder) if ours)
 
 
 def foreign(root: Path) -> list[str]:
-    """Return the sorted paths within the store that do not belong to it, symbolic links included."""
+    """Return the sorted paths in the store that do not belong to it, including symbolic links."""
     paths = [path for name in _FORMS for path, ours in _contents(root, name) if not ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
     paths += [entry.path for entry in _scan(root, root) if entry.name not in expected]
@@ -124,14 +124,14 @@ def foreign(root: Path) -> list[str]:
 
 
 def is_linked(root: str, path: str | Path) -> bool:
-    """Return whether a file of the store lies in a folder that is a symbolic link; the store itself may be one."""
+    """Return whether a file of the store is in a folder that is a symbolic link; the store's own folder may be one."""
     folder = os.path.dirname(path)  # noqa: PTH120
     with readable_errors(Path(root)):
         return folder != root and _is_link(folder)
 
 
 def _is_link(path: str | Path) -> bool:
-    """Return whether a symbolic link lies at a path. Raises `OSError` if the system fails to look."""
+    """Return whether a path is a symbolic link. Raises `OSError` if that cannot be determined."""
     try:
         return stat.S_ISLNK(os.lstat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -139,7 +139,7 @@ def _is_link(path: str | Path) -> bool:
 
 
 def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
-    """Yield the paths in a folder of the store and its shelves, and whether each belongs to the store."""
+    """Yield the paths in a folder of the store and in its subfolders, and whether each belongs to the store."""
     folder = root / name
     if folder.is_symlink():
         yield str(folder), False
@@ -166,7 +166,7 @@ def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
 
 
 def _mark(root: Path) -> str | None:
-    """Return the format that a store names, or None if there is no mark. Raises `UsageError` for what cannot be a store."""
+    """Return the format in a store's mark, or None if there is no mark. Raises `UsageError` if it cannot be a store."""
     try:
         with regular.opened(root / MARK) as file:
             return file.read(64).strip().decode(errors="replace")
@@ -184,7 +184,7 @@ def _mark(root: Path) -> str | None:
 
 
 def _may_begin(root: Path) -> bool:
-    """Return whether a folder without a mark is empty, but for what a process leaves there that begins a store."""
+    """Return whether a folder without a mark is empty, apart from files of a process that is creating a store."""
     for entry in _scan(root, root):
         if entry.name in _BESIDE:
             continue
@@ -196,7 +196,7 @@ def _may_begin(root: Path) -> bool:
 
 
 def _all_entries(root: Path, name: str) -> Iterator[tuple[str, bool]]:
-    """Do as `_contents`, but yield shelves, which may be empty, instead of their content."""
+    """Yield the paths that `_contents` yields, but with subfolders, which may be empty, instead of their contents."""
     if name in _SHELVED:
         return ((entry.path, False) for entry in _scan(root, root / name))
     return _contents(root, name)

@@ -1,4 +1,7 @@
-"""Leases: who works on which key, and which runs are at work. Advisory; the kernel frees those of a process that dies."""
+"""Leases: which process computes which key, and which runs are active.
+
+They are advisory. The kernel releases the leases of dead processes.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +26,11 @@ from tacpipe.io.files import readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
-LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
-REPORT_AFTER_S = 2.0  # a shorter wait is not news
-LEASE_BYTES = 1 << 30  # the largest lease that is read: it names 16 million objects
+LOCK_TIMEOUT_S = 3600.0  # default; TACPIPE_LOCK_TIMEOUT_S overrides it
+REPORT_AFTER_S = 2.0  # shorter waits are not reported
+LEASE_BYTES = 1 << 30  # maximum size of a lease, which is enough for 16 million objects
 _POLL_S = 0.02
-_UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the file system has no locks
+_UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts as active on a file system without locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
@@ -45,11 +48,11 @@ class Holder(TypedDict, total=False):
 
 @dataclass
 class Run:
-    """A process at work on a store, as it stated in its lease."""
+    """A process that uses a store, as described in its lease."""
 
     path: Path
     note: Holder
-    objects: set[str] = field(default_factory=set)  # digests of what it reads, puts and reuses
+    objects: set[str] = field(default_factory=set)  # digests of the objects that it reads, stores and reuses
 
     @property
     def manifests(self) -> list[str]:
@@ -58,7 +61,7 @@ class Run:
 
     @property
     def keys(self) -> list[str]:
-        """The keys that it makes, whose records and all they name are kept as they come."""
+        """The keys that it computes; their records and objects are protected when they are written."""
         return [key for key in self.note.get("keys", ()) if isinstance(key, str) and DIGEST.fullmatch(key)]
 
 
@@ -70,9 +73,9 @@ class Leases:
 
     @contextlib.contextmanager
     def hold(self, key: str, work: str = "", timeout_s: float | None = None) -> Iterator[None]:
-        """Hold the key exclusively in the block, so that two processes do not both compute ``work``.
+        """Hold a key exclusively in the block, so that two processes do not both compute ``work``.
 
-        The kernel frees the lease of a process that dies. The holder that is waited for is reported on stderr. Raises
+        The kernel releases the lease of a process that dies. While waiting, the holder is reported on stderr. Raises
         `LockedError` after ``timeout_s``.
         """
         path = self.folder / f"{key}.lock"
@@ -80,7 +83,7 @@ class Leases:
         if handle is None:
             handle = _wait(path, work or f"key {key[:12]}", _timeout_s() if timeout_s is None else timeout_s)
         try:
-            with contextlib.suppress(OSError):  # The note only informs processes that wait
+            with contextlib.suppress(OSError):  # the note only informs waiting processes
                 os.ftruncate(handle, 0)
                 os.pwrite(handle, note(what=work), 0)
             yield
@@ -89,7 +92,7 @@ class Leases:
 
     @contextlib.contextmanager
     def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
-        """Announce to ``gc`` while in the block that a run reads these manifests; yield what it announces objects with."""
+        """Announce to ``gc`` during the block that a run reads these manifests. Yields an object that announces objects."""
         path = self.folder / f"run-{uuid.uuid4().hex}.lock"
         handle = None
         while handle is None:  # gc may look at the file between its creation and the lock
@@ -104,7 +107,7 @@ class Leases:
             _release(path, handle)
 
     def runs(self) -> list[Run]:
-        """Return the running processes with their announcements; remove the leases of dead ones.
+        """Return the active runs with their announcements, and remove the leases of dead ones.
 
         A run without announcements uses nothing yet.
         """
@@ -127,12 +130,12 @@ class Leases:
         return running
 
     def sweep(self) -> None:
-        """Remove the files that killed processes left; their locks went with them."""
+        """Remove the files of killed processes, whose locks are already released."""
         for path in self._files():
             with contextlib.suppress(FileNotFoundError, TacpipeError):
                 handle = _try_lock(path, create=False)
                 if handle is not None:
-                    if _has_locks(handle):  # else nobody knows whose it is
+                    if _has_locks(handle):  # without locks the owner is unknown
                         path.unlink()
                     os.close(handle)
 
@@ -141,7 +144,7 @@ class Leases:
 
     @contextlib.contextmanager
     def exclusive(self, work: str) -> Iterator[None]:
-        """Do ``work`` exclusively in the block. Raises `LockedError` at once if another process does it."""
+        """Run the block exclusively. Raises `LockedError` immediately if another process does the same ``work``."""
         path = self.folder / f"{work}.lock"
         handle = _try_lock(path)
         if handle is None:
@@ -155,9 +158,10 @@ class Leases:
 
 
 class Announcing:
-    """File in which the processes of a run announce the objects that they use, before they check for them.
+    """The file in which a run's processes announce the objects that they use, before checking that they exist.
 
-    Whoever collects garbage moves objects away first and reads the announcements then: so of the two one sees the other.
+    A garbage collector first moves objects aside and then reads the announcements, so at least one of the two notices
+    the other.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -166,7 +170,7 @@ class Announcing:
         self._parsed: set[str] = set()
 
     def announce(self, names: Iterable[str]) -> None:
-        """Announce that objects are used. Raises `TacpipeError` if the process that began the run is gone."""
+        """Announce that objects are used. Raises `TacpipeError` if the process that started the run has ended."""
         new = [name for name in names if name not in self._parsed]
         if not new:
             return
@@ -180,15 +184,15 @@ class Announcing:
         self._parsed.update(new)
 
     def close(self) -> None:
-        """Announce nothing more."""
+        """Stop announcing."""
         if self._handle >= 0:
-            with contextlib.suppress(OSError):  # The announcements are no longer needed
+            with contextlib.suppress(OSError):  # the announcements are no longer needed
                 os.close(self._handle)
             self._handle = -1
 
 
 def _release(path: Path, handle: int) -> None:
-    with contextlib.suppress(OSError):  # the kernel frees the lock in any case
+    with contextlib.suppress(OSError):  # the kernel releases the lock anyway
         path.unlink()
     with contextlib.suppress(OSError):
         os.close(handle)
@@ -199,12 +203,12 @@ def _parsed(path: Path) -> Run:
 
 
 def parsed(path: Path, content: bytes) -> Run:
-    """Parse a lease: one line that describes its holder, and one line per digest that is used."""
+    """Parse a lease: a line that describes its holder, then one line per used digest."""
     first, _, digests = content.decode("latin-1").partition("\n")
     try:
         value = json.loads(first)
     except ValueError:
-        value = None  # The lease is being written
+        value = None  # the lease is being written
     holder = cast("Holder", value if isinstance(value, dict) else {})
     return Run(path, holder, set(digests.split()))
 
@@ -251,9 +255,9 @@ def _wait(path: Path, work: str, timeout_s: float) -> int:
 
 
 def _holder(path: Path, unknown: str = "Another process") -> str:
-    """Return in words who holds a lease, and whether it is stopped."""
+    """Return a phrase with the holder of a lease and whether it is stopped."""
     note: Holder = {}
-    with contextlib.suppress(OSError, TacpipeError):  # The name of the holder only informs the user
+    with contextlib.suppress(OSError, TacpipeError):  # the holder's name only informs the user
         note = _parsed(path).note
     if "pid" not in note:
         return unknown
@@ -267,19 +271,19 @@ def _stopped(note: Holder) -> bool:
         return False
     try:
         return Path(f"/proc/{note['pid']}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
-    except (OSError, IndexError):  # no such process, or no such system
+    except (OSError, IndexError):  # no such process, or another operating system
         return False
 
 
 def _seems_alive(path: Path) -> bool:
-    """Return whether a run may be at work on a file system that knows no locks."""
+    """Return whether a run may be active, on a file system without locks."""
     note = _parsed(path).note
     if note.get("host") == platform.node() and "pid" in note:
         try:
             os.kill(note["pid"], 0)
         except ProcessLookupError:
             return False
-        except PermissionError:  # The process belongs to another user
+        except PermissionError:  # the process belongs to another user
             return True
         return True
     return time.time() - path.stat().st_mtime < _UNKNOWN_S
@@ -294,9 +298,10 @@ def _has_locks(handle: int) -> bool:
 
 
 def _try_lock(path: Path, *, create: bool = True) -> int | None:
-    """Return an open handle that holds the lock, or None if somebody else does.
+    """Return an open handle that holds the lock, or None if another process holds it.
 
-    Where the file system knows no locks everybody holds it: a lease saves double work, and no result rests on it.
+    On a file system without locks, every caller gets the lock: a lease saves duplicate work, but no result depends on
+    it.
     """
     with readable_errors(path.parent):
         handle = _open(path, create=create)
@@ -310,7 +315,7 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
         if error.errno in _NO_LOCKS:
             return handle
         os.close(handle)
-        if error.errno == errno.ESTALE:  # another computer of a network file system unlinked it meanwhile
+        if error.errno == errno.ESTALE:  # another computer on a network file system deleted it in the meantime
             return None
         with readable_errors(path.parent):
             raise
@@ -331,6 +336,6 @@ def _open(path: Path, *, create: bool) -> int:
         try:
             return os.open(
                 path, os.O_RDONLY | os.O_NOFOLLOW
-            )  # another user's, who shares the store: it can be waited for
+            )  # belongs to another user of the store: read-only access is enough to wait for it
         except FileNotFoundError:
             raise error from None

@@ -15,7 +15,7 @@ from tacpipe.store import addresses, layout
 from tacpipe.store.layout import BESIDE_NAME
 from tacpipe.store.store import Store
 
-# Files and folders that mark the folder of a project
+# files and folders that mark a project's folder
 MARKS = (
     "pyproject.toml",
     "dvc.yaml",
@@ -26,11 +26,11 @@ MARKS = (
 
 
 def opened(place: str, run: str = "") -> Store:
-    """Return the store at a path or an address, as `Store.place` names it; ``run`` is as `Store` has it."""
+    """Return the store at a path or address as in `Store.place`; ``run`` is the argument of `Store`."""
     address = addresses.parsed(place)
     if isinstance(address, Path):
         return Store(address, run)
-    from tacpipe.store.cached import CachedStore  # Only buckets need it
+    from tacpipe.store.cached import CachedStore  # needed only for buckets
 
     return CachedStore(address, run)
 
@@ -38,9 +38,9 @@ def opened(place: str, run: str = "") -> Store:
 def locate(*datasets: Path) -> Store:
     """Return the store for a command that reads or writes ``datasets``, the output first.
 
-    ``TACPIPE_STORE`` names it, else it lies in `project`. With an address, the cache folder of the bucket is used as a
-    store. Raises `UsageError` if something else lies there, as `layout.check` does, for an
-    address that is not one of a bucket, and for a store of another user that ``TACPIPE_STORE`` does not name.
+    It is given by ``TACPIPE_STORE``, or else it is in `project`. For an address, this is a store with a local cache.
+    Raises `UsageError` as `layout.check` does, for an address that is not a bucket, and for another user's store that
+    ``TACPIPE_STORE`` does not name.
     """
     setting = os.environ.get("TACPIPE_STORE")
     if setting:
@@ -56,9 +56,9 @@ def locate(*datasets: Path) -> Store:
 def project(*datasets: Path) -> Path:
     """Return the folder whose ``.tacpipe`` is the store for ``datasets``, which need not exist.
 
-    It lies in the project of the first dataset that is in a project, else in that of the working directory. Within the
-    project the nearest store upwards is used, else a new one in the project's folder. A store outside of it is used only
-    where it holds one of the datasets already.
+    It is in the project of the first dataset that has one, or else in that of the working directory. Inside the project
+    the nearest store upwards is used, or a new one in the project's folder. A store outside the project is used only if
+    it already contains one of the datasets.
     """
     paths = [Path(os.path.abspath(path)) for path in datasets]  # noqa: PTH100  (a name holds no "..", and links stay)
     start, top = next(((path, top) for path in paths if (top := project_folder(path)) is not None), (None, None))
@@ -77,7 +77,7 @@ def project(*datasets: Path) -> Path:
 
 
 def project_folder(path: Path) -> Path | None:
-    """Return the nearest folder upwards with a mark of a project, else the working directory if it is above, else None."""
+    """Return the nearest parent with a project mark, else the working directory if it is a parent, else None."""
     for folder in (path, *path.parents):
         if any(_marks(folder / mark) for mark in MARKS):
             return folder
@@ -86,7 +86,7 @@ def project_folder(path: Path) -> Path | None:
 
 
 def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
-    """Return the first of ``folders``, which are in no project of the datasets, whose store holds one of them; else None."""
+    """Return the first of ``folders`` outside the datasets' projects whose store contains one of them, or None."""
     for folder in folders:
         root = folder / BESIDE_NAME
         if not _marks(root) or _other_owner(root) is not None:
@@ -101,7 +101,7 @@ def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
 
 @functools.cache
 def _report_holder(root: Path, dataset: Path) -> None:
-    """Report once that a store outside of the project is used."""
+    """Report once that a store outside the project is used."""
     terminal.report_progress(
         f"the store {root} is used: it holds {dataset}, though no project is marked from there to here. If all below "
         f"{root.parent} is one project, run `tacpipe store init` there."
@@ -109,7 +109,7 @@ def _report_holder(root: Path, dataset: Path) -> None:
 
 
 def _other_owner(root: Path) -> int | None:
-    """Return the id of the user to whom a store belongs if that is another one; None without such an owner."""
+    """Return the user id of a store's owner if it is another user, else None."""
     try:
         owner = os.stat(root).st_uid  # noqa: PTH116  (of what a link leads to)
     except OSError:  # described by `layout.check`
@@ -118,7 +118,7 @@ def _other_owner(root: Path) -> int | None:
 
 
 def _refuse_other_owner(root: Path) -> None:
-    """Raise `UsageError` for a store of another user: whoever owns it decides what its results are, and may change them."""
+    """Raise `UsageError` for another user's store, because its owner could change results."""
     owner = _other_owner(root)
     if owner is not None:
         raise UsageError(
@@ -128,13 +128,13 @@ def _refuse_other_owner(root: Path) -> None:
 
 
 def _marks(path: Path) -> bool:
-    """Return whether a mark is there; a link to a disk that is not mounted counts.
+    """Return whether a mark exists; a link to an unmounted disk counts.
 
-    Raises `StorageError` if the system fails to look: without the mark another store would be used.
+    Raises `StorageError` if that cannot be determined, because another store would be used without the mark.
     """
     try:
         return present(path)
-    except ValueError:  # The path is invalid
+    except ValueError:  # the path is invalid
         return False
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):

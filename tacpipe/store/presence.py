@@ -1,13 +1,13 @@
-"""Remember in notes that all files of a large dataset were present, with the state of their folders.
+"""Note that all files of a large dataset exist, together with the state of their folders.
 
-While the folders are unchanged the files are there, and none of them is looked at.
+While the folders are unchanged, the files exist and none of them is checked.
 
-A folder changes its time whenever a name in it comes, goes or is given to another file. Where it changed so shortly before
-the look that the next change might have the same time, its time is not noted. Of a folder of objects each object is looked
-at then; of the dataset's directory the names and inodes are listed, which are those of the objects. What is written into a
-file in place changes no folder; whoever reads the file finds that.
+A folder's modification time changes whenever a name in it is added, removed or replaced. If it changed so shortly
+before the check that the next change could have the same time, the time is not noted. In that case each object of an
+object folder is checked, and for the dataset's directory names and inodes are listed and compared with those of the
+objects. Writing into a file in place changes no folder; reading the file detects that.
 
-No result rests on a note: a key is made of bytes that were hashed. A note that cannot be read is ignored.
+No result depends on a note: keys are computed from bytes that were hashed. An unreadable note is ignored.
 """
 
 from __future__ import annotations
@@ -32,36 +32,38 @@ from tacpipe.store.roots import name_of
 from tacpipe.store.store import Store
 
 NOTE_FORMAT = 2
-_HEAD_BYTES = 1 << 20  # the longest first line that is read
-_ROW = 48  # bytes: a digest of 32, the size of the object, and its inode
-State = list[int]  # State of a folder: device, inode, and times of change
-Row = tuple[str, int, int]  # Object: digest, size in bytes, inode
+_HEAD_BYTES = 1 << 20  # maximum length of the first line
+_ROW = 48  # bytes per row: a digest of 32, the size of the object, and its inode
+State = list[int]  # state of a folder: device, inode, and times of change
+Row = tuple[str, int, int]  # digest, size in bytes and inode of an object
 
 
 @dataclass(frozen=True)
 class Head:
-    """Note on a dataset whose objects are all in the store, and whose directory holds only links to them."""
+    """The header of a note on a dataset whose objects are all stored, and whose directory contains only links to them."""
 
-    key: str  # Key of the run that computed the dataset
+    key: str  # key of the run that computed the dataset
     manifest: str  # digest
-    reused: int  # results of that run
+    reused: int  # number of results of that run
     rows: int
     boot: str = ""
-    directory: State | None = None  # None: it changed too shortly before; then its listing is compared
-    listing: str = ""  # digest of the names in the directory and their inodes
+    directory: State | None = None  # None if it changed too recently; then its listing is compared
+    listing: str = ""  # digest of the directory's names and inodes
 
 
 @dataclass(frozen=True)
 class Note:
-    """A note as it is kept."""
+    """A note as stored."""
 
     head: Head
-    shelves: Mapping[str, tuple[State | None, int, int, str]]  # state, first row, rows, digest of these rows
+    shelves: Mapping[
+        str, tuple[State | None, int, int, str]
+    ]  # state, first row, number of rows and their digest, by shelf
     file: Path
-    body: int  # Offset of the rows in the file
+    body: int  # offset of the rows in the file
 
     def rows(self, shelf: str) -> list[Row] | None:
-        """Return the objects that were noted on a shelf, or None if the note is damaged."""
+        """Return the noted objects on a shelf, or None if the note is damaged."""
         content = self.content(shelf)
         if content is None:
             return None
@@ -72,7 +74,7 @@ class Note:
         return rows
 
     def content(self, shelf: str) -> bytes | None:
-        """Return the rows of a shelf as they are kept, or None if the note is damaged."""
+        """Return the encoded rows of a shelf, or None if the note is damaged."""
         _, begin, count, expected_digest = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
         content = b""
         with contextlib.suppress(OSError, TacpipeError), regular.opened(self.file, follow=False) as reading:
@@ -82,7 +84,7 @@ class Note:
 
 
 def encode_note(rows: Iterable[Row]) -> bytes:
-    """Return objects as they are kept."""
+    """Return the encoded rows of objects."""
     parts = (
         bytes.fromhex(name) + size.to_bytes(8, "little") + inode.to_bytes(8, "little") for name, size, inode in rows
     )
@@ -90,7 +92,7 @@ def encode_note(rows: Iterable[Row]) -> bytes:
 
 
 def read_note(store: Store, directory: Path) -> Note | None:
-    """Return the note on a directory, or None if there is none, or none that can be read."""
+    """Return the note on a directory, or None if there is no readable one."""
     file = _file(store, directory)
     with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
         with regular.opened(file, follow=False) as reading:
@@ -103,7 +105,7 @@ def read_note(store: Store, directory: Path) -> Note | None:
 
 
 def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple[State | None, bytes]]) -> None:
-    """Keep a note whole or not at all; it need not outlast a loss of power. ``shelves`` has state and rows of each."""
+    """Write a note atomically, without syncing it. ``shelves`` contains the state and the rows of each shelf."""
     places, begin = {}, 0
     for shelf, (state, content) in sorted(shelves.items()):
         places[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()
@@ -122,7 +124,7 @@ def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, 
 
 
 def forget_notes(store: Store, names: Iterable[str]) -> None:
-    """Remove the notes on directories that no root of these names has."""
+    """Remove the notes on directories without a root among these names."""
     retained = set(names)
     for path in layout.entries(store.root, layout.PRESENCE):
         if path.name not in retained:
@@ -130,7 +132,7 @@ def forget_notes(store: Store, names: Iterable[str]) -> None:
 
 
 def shelved_notes(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield each shelf with its objects, in the order of shelves."""
+    """Yield each shelf with its objects, in order."""
     shelves: dict[str, list[Row]] = {}
     for row in rows:
         shelves.setdefault(row[0][:2], []).append(row)
@@ -141,14 +143,14 @@ def _file(store: Store, directory: Path) -> Path:
     return store.root / layout.PRESENCE / name_of(*store.roots.kind_and_name(directory))
 
 
-BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system is repaired between two starts of a computer
-_MAX_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
-_SAMPLE = 16  # files of which both ways to learn the inode are compared
-_MANIFEST = "manifest.json"  # A copy instead of a link, so its content is hashed whenever a note is used
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system may be repaired between two boots
+_MAX_CHANGED = 32  # shelves that each command checks again before the note is rewritten
+_SAMPLE = 16  # number of files for which two ways of reading the inode are compared
+_MANIFEST = "manifest.json"  # a copy and not a link, so its content is hashed whenever a note is used
 
 
 class Look:
-    """A look at the files of a dataset that begins now, and what is noted of it afterwards."""
+    """A check of a dataset's files that starts now, and writes a note afterwards."""
 
     def __init__(self, store: Store, directory: Path) -> None:
         self._store, self._directory = store, directory
@@ -157,27 +159,28 @@ class Look:
 
     @cached_property
     def inodes(self) -> Mapping[str, int]:
-        """The inode of each name in the directory, as it is when this is first asked for: before the files are looked at."""
+        """The inode of each name in the directory, read on first access, before the files are checked."""
         return _inodes(self._directory)
 
     def begin(self) -> None:
-        """List the directory, before its files are looked at."""
+        """List the directory before its files are checked."""
         self.inodes  # noqa: B018  (it is cached)
 
     @property
     def unchanged(self) -> bool:
-        """Return whether the directory has the same names and files as at the start of the look."""
+        """Return whether the directory has the same names and files as at the start of the check."""
         with contextlib.suppress(OSError, TacpipeError):
             if self._settled()(self._directory_state) is not None:
                 return _state(self._directory) == self._directory_state
         return _inodes(self._directory) == self.inodes
 
     def holds(self, note: Note, *, listed: bool = False) -> bool:
-        """Return whether all that was noted is still there.
+        """Return whether everything in a note still exists.
 
-        Of a folder of objects that changed, or whose state is not noted, each object is looked at. The directory is listed
-        where it changed, and for whoever is about to change it and `succeed`: ``listed``. Else the note is written anew
-        where that saves the next look something. False if it is not known: then each file is to be looked at.
+        Each object is checked in folders of objects that have changed or whose state was not noted. The directory is
+        listed if it has changed, or if ``listed`` is set, which a caller that will change it and call `succeed` needs.
+        The note is rewritten if that saves work for the next check. Returns False if unknown: then each file must be
+        checked.
         """
         head = note.head
         if not head.boot or head.boot != _boot() or self._directory_state is None:
@@ -196,9 +199,10 @@ class Look:
         return True
 
     def note(self, head: Head, contents: Iterable[tuple[str, str, int]]) -> bool:
-        """Note that all files of a dataset were present; return False if that would not be safe.
+        """Note that all files of a dataset exist; return False if that would not be safe.
 
-        ``contents`` are path in the directory, digest and size in bytes of each shard and file: links to the objects.
+        ``contents`` are path in the directory, digest and size in bytes of each shard and file, which are links to
+        objects.
         """
         boot, directory_state, inodes = _boot(), self._directory_state, self.inodes
         if not boot or directory_state is None:
@@ -224,10 +228,10 @@ class Look:
         return False
 
     def succeed(self, note: Note, head: Head, before: Iterable[str], now: Iterable[tuple[str, str, int]]) -> bool:
-        """Update the note after a change of the dataset; return False if that is not safe. The old note must have held.
+        """Update a valid note after a change of the dataset; return False if that is not safe.
 
-        ``before`` are the paths of what the dataset named then and does not name now, or otherwise, and ``now`` path, digest
-        and size of what it names now in their place. Objects that it named stay in the note until all are looked at again.
+        ``before`` are the paths that the dataset no longer names, or names with other content, and ``now`` path, digest
+        and size of the new content. Objects of the old content stay in the note until everything is checked again.
         """
         directory_state = _state(self._directory)
         if directory_state is None:
@@ -262,7 +266,7 @@ class Look:
         return False
 
     def _renew(self, note: Note, changed: Collection[str]) -> None:
-        """Note the states that folders have now, where they can be noted; all that was noted was found there."""
+        """Note the current states of folders where that is safe; everything in the note was found."""
         with contextlib.suppress(OSError, TacpipeError):
             settled = self._settled()
             directory_state = settled(self._directory_state) or note.head.directory
@@ -282,7 +286,7 @@ class Look:
         return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
 
     def _stored(self, name: str) -> Row:
-        """Return digest, size and inode of an object. Raises `KeyError` if it is not a file next to the directory."""
+        """Return digest, size and inode of an object. Raises `KeyError` if it is not a file of the directory."""
         status = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
         if (
             not stat.S_ISREG(status.st_mode)
@@ -293,20 +297,21 @@ class Look:
         return name, status.st_size, status.st_ino
 
     def _lie(self, rows: Iterable[Row] | None) -> bool:
-        """Return whether objects lie where they should, the very files that were noted."""
+        """Return whether every noted object is still in place and is the same file."""
         try:
             return rows is not None and all(self._stored(row[0]) == row for row in rows)
         except (OSError, KeyError):
             return False
 
     def _alike(self, rows: Sequence[Row]) -> bool:
-        """Return whether a list of the directory gives the inodes that files have: not every file system does."""
+        """Return whether listing the directory gives the inodes of its files, which is not the case on every file system."""
         return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
 
     def _settled(self) -> Callable[[State | None], State | None]:
-        """Return a function of what a folder's state was as the look began, which is None if it had changed just before.
+        """Return a function that maps a folder's state at the start of the check to None if the folder had just changed.
 
-        Then the next change might have the same time. Raises `TacpipeError` if a change leaves no time in its folder.
+        The next change might then have the same time. Raises `TacpipeError` if changes do not update the time of a
+        folder.
         """
         before_ns = self._clock_ns() - (time.monotonic_ns() - self._begun_ns) - SETTLED_NS
         return lambda state: state if state is not None and max(state[-2:]) < before_ns else None
@@ -333,7 +338,7 @@ def _inodes(directory: Path) -> dict[str, int]:
 
 
 def _listing(state: State, inodes: Mapping[str, int]) -> str:
-    """Return the digest of the names in a directory, on a device, and of their inodes."""
+    """Return the digest of a directory's device, names and inodes."""
     names = sorted(inodes)
     hasher = hashlib.sha256("\0".join([str(state[0]), *names]).encode(errors="surrogateescape"))
     hasher.update(array("Q", [inodes[name] for name in names]).tobytes())
@@ -345,7 +350,7 @@ def _states(store: Store) -> dict[str, State | None]:
 
 
 def _state(folder: Path | str) -> State | None:
-    """Return the state of a folder, which changes with its names; None if it does not exist."""
+    """Return the state of a folder, which changes when its names change, or None if it does not exist."""
     try:
         status = os.lstat(folder)
     except OSError:
@@ -356,7 +361,7 @@ def _state(folder: Path | str) -> State | None:
 
 
 def _boot() -> str:
-    """Return what names the time since this computer was started; empty on a system that does not state it."""
+    """Return an identifier of the current boot, or "" on systems without one."""
     try:
         return BOOT.read_text().strip()
     except OSError:

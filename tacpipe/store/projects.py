@@ -1,6 +1,6 @@
-"""The identity of a project, under which other stores keep what it pushes: made once, and kept in the project's store.
+"""The identity of a project, under which it pushes to other stores: created once and kept in the project's store.
 
-Where a folder begins anew each time, as in a job of continuous integration, the environment names the project instead.
+If a folder is created anew each time, as in a continuous integration job, the environment names the project instead.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from tacpipe.printable import plain
 from tacpipe.store.location import project, project_folder
 from tacpipe.store.store import Store
 
-FOLDER = "projects"  # Folder of the store
+FOLDER = "projects"  # folder in the store
 VARIABLE = "TACPIPE_PROJECT"
-_FILE_BYTES = 1 << 16  # the largest identity that is read
+_FILE_BYTES = 1 << 16  # maximum size of an identity file
 _NAME_LETTERS = 60
 
 
 @dataclass(frozen=True)
 class Project:
-    """Unique identity of a project, and its name for people: the name of its folder."""
+    """The unique identity of a project and its readable name, which is that of its folder."""
 
     id: str  # hex digits
     name: str
 
 
 def place(directory: Path) -> tuple[Path, str]:
-    """Return the folder of the project that a dataset belongs to, and the dataset's name: its path within that folder.
+    """Return the folder of a dataset's project, and the dataset's name, which is its path in that folder.
 
-    Where nothing marks a project, the folder is the working directory, and that above a dataset outside of it. A dataset in
-    the folder itself has the folder's name.
+    Without a project mark, the folder is the working directory, or the dataset's parent if it is outside of it. A
+    dataset in the project's folder itself has the folder's name.
     """
     path = Path(os.path.abspath(directory))  # noqa: PTH100  (a name holds no ".." and follows no link)
     folder = project(path)
@@ -48,7 +48,7 @@ def place(directory: Path) -> tuple[Path, str]:
 
 
 def from_environment() -> Project | None:
-    """Return the project that the environment names, identical on every computer; None if it names none.
+    """Return the project named by the environment, equal on every computer, or None if it names none.
 
     Raises `UsageError` for an invalid name.
 
@@ -69,11 +69,10 @@ def from_environment() -> Project | None:
 
 
 def identity_of(store: Store, folder: Path) -> Project | None:
-    """Return the identity of the project in ``folder``, or None.
+    """Return the identity of the project in ``folder``, or None if it has none.
 
-    It has one once it pushed something, or if `from_environment` gives one.
-
-    Raises `DamagedError` for one that is damaged: under a new one it would be another project.
+    It has one after its first push, or if `from_environment` returns one. Raises `DamagedError` if it is damaged,
+    because a new identity would make it another project.
     """
     if (project := from_environment()) is not None:
         return project
@@ -95,9 +94,9 @@ def identity_of(store: Store, folder: Path) -> Project | None:
 
 
 def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
-    """Return the identity of the project in ``folder``, made now if it has none.
+    """Return the identity of the project in ``folder``, creating it if necessary.
 
-    In a store that is not ``writable`` it is derived from the computer and the paths.
+    If the store is not ``writable``, the identity is derived from the computer and the paths.
     """
     existing = identity_of(store, folder)
     if existing is not None:
@@ -110,13 +109,13 @@ def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
             raise
         derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:32]
         return Project(derived, _name(folder))
-    written = identity_of(store, folder)  # the first to write it wins
+    written = identity_of(store, folder)  # the first process that writes it wins
     assert written is not None
     return written
 
 
 def new_id() -> str:
-    """Return an id that no other project has."""
+    """Return a new unique id."""
     return uuid.uuid4().hex
 
 
@@ -148,7 +147,7 @@ def _file(store: Store, folder: Path) -> Path:
 
 
 def _name(folder: Path) -> str:
-    """Return a folder's name as one that people can type and that a terminal shows.
+    """Return a folder's name with only characters that can be typed and displayed in a terminal.
 
     >>> _name(Path("/lab/slip detection")), _name(Path("/lab/a:b")), _name(Path("/"))
     ('slip detection', 'a-b', 'project')

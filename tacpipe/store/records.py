@@ -225,18 +225,18 @@ def _sound(record: Record, key: str) -> bool:
 
 
 def complete(store: Store, record: ComputedResult) -> bool:
-    """Return whether the store has every object of the record in its full size; announces them first."""
+    """Announce a record's objects, and return whether the store has all of them in their full size."""
     store.announce(digests(record["result"]))
     return all(store.has(content["digest"], content["bytes"]) for content in _objects(record["result"]))
 
 
 def digests(result: StoredResult) -> Iterator[str]:
-    """Yield the digests of all shards and files of a record's ``result`` (or of a manifest)."""
+    """Yield the digests of all shards and files in a record's ``result``, or in a manifest."""
     return (content["digest"] for content in _objects(result))
 
 
 def naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
-    """Yield the records that contain the digest ``name``, those written closest to ``written_s`` first.
+    """Yield the records that contain the digest ``name``, starting with those written closest to ``written_s``.
 
     A record is written just before its result is published, so few records are read.
     """

@@ -1,8 +1,8 @@
-"""A store in a place that knows no locks: objects by digest, records by key, and roots that are never written over.
+"""A store on a backend without locks: objects by digest, records by key, and roots that are never overwritten.
 
-No promise rests on a clock, or on a lock. Whoever uses an object announces it before looking whether it is there, and a
-collection moves objects aside before it reads the announcements, as in a folder. A push keeps each version of a root under a
-number of its own: of two that push the same name at once one gets the number, and the other one looks again.
+No guarantee depends on a clock or a lock. A process announces an object before it checks that the object exists, and a
+collection moves objects aside before it reads the announcements, as in a folder. A push stores each version of a root
+under its own number: of two concurrent pushes of a name, one gets the number, and the other reads the root again.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from tacpipe.store.records import (
 from tacpipe.store.remote_roots import RemoteRoots
 from tacpipe.store.store import AbsentError, MissingError, Object, read_limit
 
-SNAPSHOTS = "snapshots"  # Keys of the records of each manifest, so that a pull reads only these
-_LISTED = 12  # looks that cost as much as a list of 1,000 names, on S3
-_PAGE = 1000  # names that a list gives for one request
-_TRIES = 10  # Attempts to replace a record that others replace too
+SNAPSHOTS = "snapshots"  # keys of the records of each manifest, so that a pull reads only these
+_LISTED = 12  # number of requests that cost as much on S3 as listing 1,000 names
+_PAGE = 1000  # names listed per request
+_TRIES = 10  # attempts to replace a record that others also replace
 
 
 class RemoteStore:
-    """A store in a place such as a bucket, for `push` and `pull`. It may be used from several threads."""
+    """A store on a backend such as a bucket, for `push` and `pull`. Thread-safe."""
 
     at_once = MAX_CONCURRENT
 
@@ -56,11 +56,11 @@ class RemoteStore:
 
     @property
     def place(self) -> str:
-        """The address of the store, as sentences name it."""
+        """The address of the store in messages."""
         return self.files.place
 
     def check(self) -> bool:
-        """Return whether there is a store. Raises `UsageError` for one of another format."""
+        """Return whether a store exists. Raises `UsageError` if it has another format."""
         try:
             if read_twice(self.files, layout.MARK, regular.BLOCK_BYTES, _parse_format) is not None:
                 return True
@@ -77,9 +77,9 @@ class RemoteStore:
         return True
 
     def prepare(self) -> None:
-        """Create the store if there is none yet.
+        """Create the store if it does not exist.
 
-        Raises `UsageError` as `check` does, and if the server creates an object that exists already.
+        Raises `UsageError` as `check` does, and if the server creates an object that already exists.
         """
         if self.files.create(layout.MARK, layout.FORMAT.encode() + b"\n"):
             self._expect_conditional()
@@ -90,7 +90,7 @@ class RemoteStore:
         self.files.create(tried, b"1")
         replaced = self.files.create(
             tried, b"2"
-        )  # other content: an answer that is lost is no reason to count it as kept
+        )  # with other content, so that a lost response does not count as success
         self.files.delete(tried)
         if replaced:
             raise UsageError(
@@ -102,9 +102,9 @@ class RemoteStore:
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Have what is announced in the block kept by collections; what they read is ``manifests``.
+        """Protect from collection what is announced in the block, and ``manifests``, which the run reads.
 
-        Raises `TacpipeError` after the block if an announcement was taken for one of a process that is gone.
+        Raises `TacpipeError` after the block if a collection treated the announcement as that of a dead process.
         """
         self.prepare()
         self._manifests = sorted(manifests)
@@ -116,15 +116,16 @@ class RemoteStore:
                     f"what was there already. Run the same command again."
                 )
         finally:
-            with contextlib.suppress(TacpipeError):  # A later collection removes the remaining files
+            with contextlib.suppress(TacpipeError):  # a later collection removes the remaining files
                 for name in self._leases:
                     self.files.delete(name)
             self._leases, self._announced = [], set()
 
     def announce(self, names: Iterable[str], *, manifests: Iterable[str] = (), keys: Iterable[str] = ()) -> None:
-        """Announce objects to collections; an object is announced before its presence is checked.
+        """Announce objects to collections, before checking that they exist.
 
-        ``manifests`` announce all that they name, and ``keys`` all that their records name once these exist.
+        ``manifests`` announce everything that they name, and ``keys`` everything that their records name once these
+        exist.
         """
         new = sorted(set(names) - self._announced)
         new_manifests, new_keys = sorted({*manifests} - {*self._manifests}), sorted(set(keys) - self._announced)
@@ -137,10 +138,10 @@ class RemoteStore:
         self._announced.update(new, new_keys)
 
     def runs(self) -> dict[str, tuple[Entry, Run]]:
-        """Return the current announcements by name, each with its entry in the place."""
+        """Return the current announcements with their entries, by name."""
         runs = {}
         for entry in self.files.list("leases"):
-            with contextlib.suppress(FileNotFoundError):  # The run has ended
+            with contextlib.suppress(FileNotFoundError):  # the run has ended
                 content = self.files.read(entry.name, LEASE_BYTES)
                 runs[entry.name] = entry, leases.parsed(Path(entry.name), content)
         return runs
@@ -152,18 +153,19 @@ class RemoteStore:
     # ---- objects
 
     def sizes(self, names: Collection[str]) -> dict[str, int]:
-        """Return the bytes of those objects that are there."""
+        """Return the sizes in bytes of the objects that exist."""
         entries = self._entries_at("objects", {layout.object_name(name): name for name in names})
         return {name: entry.bytes for name, entry in entries.items()}
 
     def present(self, keys: Iterable[str]) -> set[str]:
-        """Return those keys that have a record, sound or not."""
+        """Return the keys that have a record, valid or damaged."""
         return set(self._entries_at("records", {layout.record_name(key): key for key in keys}))
 
     def _entries_at(self, folder: str, names_by_path: Mapping[str, str]) -> dict[str, Entry]:
         """Return the entries of the names (values) whose paths (keys) exist in a folder.
 
-        The folder is listed as long as that costs no more than single requests; the remaining paths are requested.
+        The folder is listed while that costs no more than single requests; the remaining paths are requested one by
+        one.
         """
         entries_by_name: dict[str, Entry] = {}
         remaining = dict(names_by_path)
@@ -177,7 +179,7 @@ class RemoteStore:
                 budget -= 1
                 if not remaining:
                     return entries_by_name
-            if budget > 0:  # The listing is complete
+            if budget > 0:  # the listing is complete
                 return entries_by_name
         entries = threads.map_in_threads(self.files.stat, remaining, MAX_CONCURRENT)
         return entries_by_name | {
@@ -185,18 +187,18 @@ class RemoteStore:
         }
 
     def has(self, name: str, size: int | None = None) -> bool:
-        """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
+        """Return whether an object with this digest (and size in bytes) exists, without reading it."""
         entry = self.files.stat(layout.object_name(name))
         return entry is not None and size in (None, entry.bytes)
 
     def put(self, content: bytes, *, durable: bool = True) -> Object:
-        """Store ``content`` and return its digest and size; whatever is kept here outlasts a loss of power."""
+        """Store ``content`` and return its digest and size. Stored content always survives a power loss."""
         name = bytes_digest(content)
         self.take(name, [content])
         return Object(name, len(content))
 
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
-        """Store the object ``name`` from ``blocks`` that are verified; what is there is replaced if it is damaged."""
+        """Store the object ``name`` from verified ``blocks``, replacing a damaged one."""
         self.announce([name])
         path = layout.object_name(name)
         if self.files.create(path, blocks):
@@ -209,18 +211,18 @@ class RemoteStore:
         self.files.create(path, blocks)
 
     def settle(self, names: Iterable[str]) -> None:
-        """Do nothing: what was created here outlasts a loss of power."""
+        """Do nothing, because stored content always survives a power loss."""
 
     def read(self, name: str, size: int | None = None) -> bytes:
-        """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
+        """Return the verified content of an object; ``size`` is the size in bytes declared by its manifest or record.
 
-        Raises `MissingError` if it is not there or its bytes do not hash to its name, and `StorageError` if the place
+        Raises `MissingError` if it does not exist or does not match its digest, and `StorageError` if the backend
         fails.
         """
         return b"".join(self.blocks(name, size))
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
+        """Yield the content of an object block by block. Raises the errors of `read`, for damage after the last block."""
         hashed = hashlib.sha256()
         limit = sys.maxsize if size is None else read_limit(size)
         try:
@@ -236,7 +238,7 @@ class RemoteStore:
             )
 
     def _stored_blocks(self, name: str, limit: int) -> Iterator[bytes]:
-        """Yield the content of an object, also of one that a running or killed collection moved aside."""
+        """Yield the content of an object, including one that a running or killed collection moved aside."""
         try:
             yield from self.files.blocks(layout.object_name(name), limit)
             return
@@ -246,27 +248,27 @@ class RemoteStore:
             with contextlib.suppress(FileNotFoundError):
                 yield from self.files.blocks(entry.name, limit)
                 return
-        try:  # It may have been put back meanwhile
+        try:  # it may have been put back in the meantime
             yield from self.files.blocks(layout.object_name(name), limit)
         except FileNotFoundError:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
 
     def quarantine(self, name: str) -> bool:
-        """Move a damaged object out of the way, for whoever wants to know why; return False if it is gone already."""
+        """Move a damaged object to quarantine for inspection; return False if it no longer exists."""
         return self.files.move(layout.object_name(name), f"quarantine/{name}.{time.time_ns()}")
 
     def asides(self, name: str = "") -> Iterator[Entry]:
-        """Yield what collections have moved aside of an object, or of all."""
+        """Yield the entries that collections have moved aside, of one object or of all."""
         return (entry for entry in self.files.list("tmp") if entry.name.startswith(f"tmp/{layout.ASIDE}{name}"))
 
     def begins(self, name: str, start: bytes) -> bool:
-        """Return whether an object begins so; False for one that is not there. It is not verified."""
+        """Return whether an object starts with ``start``, or False if it does not exist. It is not verified."""
         with contextlib.suppress(FileNotFoundError):
             return next(iter(self.files.blocks(layout.object_name(name), sys.maxsize))).startswith(start)
         return False
 
     def room(self) -> int | None:
-        """Return None: nobody knows how many bytes there is room for."""
+        """Return None, because the free space is unknown."""
         return None
 
     # ---- records
@@ -279,7 +281,7 @@ class RemoteStore:
         *,
         replace: bool = False,
     ) -> Record:
-        """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
+        """Record ``result`` for ``identity`` and return the valid record; the first of several processes wins.
 
         An existing record stays valid unless it is damaged or ``replace`` is set.
         """
@@ -297,7 +299,7 @@ class RemoteStore:
         )
 
     def record(self, key: str) -> Record | None:
-        """Return the record of ``key``, or None; a damaged one counts as none."""
+        """Return the record of ``key``, or None if there is none or it is damaged."""
         return self._record(key)[1]
 
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
@@ -306,16 +308,16 @@ class RemoteStore:
         self.files.create(f"{SNAPSHOTS}/{manifest}/{bytes_digest(content)}.json", content)
 
     def noted(self, manifest: str) -> set[str]:
-        """Return the keys of the records that were noted as belonging to a manifest."""
+        """Return the keys of the records noted for a manifest."""
         entries = list(self.files.list(f"{SNAPSHOTS}/{manifest}"))
         return {key for entry in entries for key in self._keys(entry.name)}
 
     def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
-        """Yield the records that belong to a manifest, with their keys: as was noted, else all of the store's."""
+        """Yield the records of a manifest with their keys: those noted for it, or else all records in the store."""
         return self.records(self.noted(manifest) or None)
 
     def _keys(self, name: str) -> list[str]:
-        """Return the keys in a snapshot; none if it is damaged: records save work, but no result depends on them."""
+        """Return the keys in a snapshot, or none if it is damaged: records save work, but no result depends on them."""
         with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
             keys = json.loads(self.files.read(name, regular.JSON_BYTES))
             if isinstance(keys, list):
@@ -323,7 +325,7 @@ class RemoteStore:
         return []
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
-        """Yield keys and their records, by default all; damaged ones count as none."""
+        """Yield keys and their records, by default all; damaged records are skipped."""
         if keys is None:
             keys = [Path(entry.name).stem for entry in self.files.list("records")]
         for key, record in threads.map_in_threads(self._record, keys, MAX_CONCURRENT):

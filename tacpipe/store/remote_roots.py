@@ -1,4 +1,4 @@
-"""The roots of a store in a place that knows no locks: versions with numbers of their own, of which none is written over."""
+"""The roots of a store on a backend without locks: numbered versions that are never overwritten."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 class RemoteRoots:
     """The roots of a store without locks: which project pushed which manifest under which name.
 
-    Each version has a number. The newest one counts, and holds the history of the name.
+    Each version has a number. The newest one is valid and contains the history of the name.
     """
 
     def __init__(self, files: Backend) -> None:
         self.files = files
 
     def all(self) -> list[Root]:
-        """Return all roots; what is damaged is named by `damaged`."""
+        """Return all valid roots; `damaged` lists the others."""
         return [root for _, root in self._read() if root is not None]
 
     def damaged(self) -> list[str]:
-        """Return the names of roots whose newest version is damaged: nobody knows which datasets they represent."""
+        """Return the names of roots whose newest version is damaged, so that their datasets are unknown."""
         return sorted(name for name, root in self._read() if root is None)
 
     def get(self, path: Path) -> Root | None:
-        """Return None: no path of this computer is a root there."""
+        """Return None, because paths of this computer have no roots there."""
         return None
 
     def pushed(self, name: str, project: str) -> Root | None:
-        """Return the root that a project pushed as ``name``, or None.
+        """Return the root that a project pushed as ``name``, or None if there is none.
 
         Raises `DamagedError` if its newest version is damaged.
         """
@@ -63,12 +63,13 @@ class RemoteRoots:
         lasting: bool,
         output: bool = False,
     ) -> bool:
-        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``, which `pushed` returned.
+        """Record that a project pushed ``manifest`` as its dataset ``name``, after ``before`` as returned by `pushed`.
 
-        Pushed versions stay in the history until they are forgotten. The ``output`` of a command is no snapshot: the next
-        output replaces it, unless it is ``lasting``. Returns False without a change if another push came first.
+        Pushed versions stay in the history until they are forgotten. The ``output`` of a command is not kept as a
+        snapshot: the next output replaces it, unless it is ``lasting``. Returns False without a change if another push
+        came first.
         """
-        is_snapshot = before is not None and not before.get("output")  # True for a snapshot
+        is_snapshot = before is not None and not before.get("output")  # whether ``before`` is a snapshot
         same = before is not None and before["manifest"] == manifest and before.get("project") == project
         if same and (output or is_snapshot):
             return True
@@ -82,21 +83,21 @@ class RemoteRoots:
         return self._succeed(root)
 
     def write(self, root: Root) -> None:
-        """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` if another one came first."""
+        """Write ``root`` as the successor of the version from `all`. Raises `TacpipeError` if another one came first."""
         if not self._succeed(root):
             raise TacpipeError(
                 f"{root['path']} was pushed to {self.files.place} meanwhile. Run the same command again."
             )
 
     def remove(self, root: Root) -> None:
-        """Remove a root, as `all` gave it, with all its earlier versions; one that was succeeded meanwhile stays."""
+        """Remove a root from `all` with all its versions, unless it was replaced in the meantime."""
         name = _name(root)
         if dict(self._read(name)).get(name) == root:
             for _, file in self._versions().get(name, []):
                 self.files.delete(file)
 
     def superseded(self) -> list[str]:
-        """Return the names of versions that no push can take for the newest any more: all but the last two of each."""
+        """Return the names of versions that no push can still take for the newest: all but the last two of each root."""
         return [file for versions in self._versions().values() for _, file in versions[:-2]]
 
     def _succeed(self, root: Root) -> bool:
@@ -104,12 +105,12 @@ class RemoteRoots:
         number = root["number"] + 1
         if not self.files.create(_version(name, number), encoded(root)):
             return False
-        if number > 2:  # the version before stays, so that whoever read that one is refused this number
+        if number > 2:  # the previous version stays, so that a process that has read it cannot use this number
             self.files.delete(_version(name, number - 2))
         return True
 
     def _read(self, only: str = "") -> Iterator[tuple[str, Root | None]]:
-        """Yield the name of each root, or of ``only`` one, and its newest version; None for a damaged one."""
+        """Yield the name and newest version of each root, or only of one; None for a damaged root."""
         newest = {name: versions[-1] for name, versions in self._versions(only).items()}
         return zip(newest, threads.map_in_threads(self._at, newest.values(), MAX_CONCURRENT), strict=True)
 

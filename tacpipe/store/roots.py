@@ -1,4 +1,4 @@
-"""Roots: which paths hold which manifest. What they name is needed, and so is all that it descends from."""
+"""Roots: which path contains which manifest. A root protects its manifest and everything that it was computed from."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from tacpipe.store.store import Store
 
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
-ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
-HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
-PUSHES = 100  # manifests of a path that are remembered as pushed
-_MAX_TIME_S = 1 << 40  # a time in a root is no later: the year 36,812
+ROOT_BYTES = 1 << 24  # maximum size of a root, which is enough for a history of 100,000 entries
+HISTORY = 20  # number of previous manifests in a path's history; ``lasting`` ones are kept forever
+PUSHES = 100  # number of pushed manifests remembered per path
+_MAX_TIME_S = 1 << 40  # maximum time in a root: the year 36,812
 
 
 class RootProject(TypedDict):
@@ -65,9 +65,9 @@ class Roots:
         self.store = store
 
     def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False, key: str = "") -> None:
-        """Note that ``path`` now holds ``manifest``, the result of the run ``key``; the previous one goes into the history.
+        """Record that ``path`` now contains ``manifest``, the result of the run ``key``; the previous one becomes history.
 
-        The previous one is ``lasting`` if it held recordings or labels that the new one lacks: `gc` then keeps it.
+        The previous one is ``lasting`` if it contained recordings or labels that the new one lacks; `gc` then keeps it.
         """
         kind, name = self.kind_and_name(path)
         current = self.get(path)
@@ -82,7 +82,7 @@ class Roots:
             self.store.sync(self._file(kind, name))
 
     def get(self, path: Path) -> Root | None:
-        """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
+        """Return the root of ``path``, or None if there is none. Its ``path`` is the dataset's present location."""
         return self.at(self._file(*self.kind_and_name(path)))
 
     def push(self, name: str, project: RootProject, manifest: str, before: Root | None, *, lasting: bool) -> bool:
@@ -101,33 +101,33 @@ class Roots:
         return self.at(self._file(PUSHED, name, project))
 
     def note_pushed(self, path: Path, manifest: str) -> None:
-        """Note that ``manifest`` of ``path`` was pushed to another store; do nothing for a path without a root."""
+        """Record that ``manifest`` of ``path`` was pushed to another store. Does nothing for a path without a root."""
         root = self.get(path)
         if root is not None:
             earlier = [pushed for pushed in root.get("pushed", []) if pushed != manifest]
             self.write({**root, "pushed": [manifest, *earlier][:PUSHES]})
 
     def all(self) -> list[Root]:
-        """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
+        """Return all roots. Damaged ones are quarantined; the next run of their stage writes them again."""
         roots = (self.at(path) for path in self.store.listed("roots", "*.json"))
         return [root for root in roots if root is not None]
 
     def remove(self, root: Root) -> None:
-        """Remove a root, as `all` gave it, whatever its file is called."""
+        """Remove a root returned by `all`, whatever the name of its file."""
         for file in self.store.listed("roots", "*.json"):
             if self.at(file) == root:
                 with readable_errors(self.store.root):
                     file.unlink(missing_ok=True)
 
     def write(self, root: Root) -> None:
-        """Replace a root, as `all` gave it or with more to state."""
+        """Replace a root returned by `all`, possibly with additional fields."""
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
             name = os.path.relpath(name, self.store.root.parent)
         self.store.write_file(self._file(kind, name, project_id(root)), encoded({**root, "path": name, "kind": kind}))
 
     def at(self, file: Path) -> Root | None:
-        """Return the root in ``file``; None if the file does not exist or is damaged, in which case it is quarantined."""
+        """Return the root in ``file``, or None if it does not exist or is damaged. A damaged one is quarantined."""
         try:
             with readable_errors(self.store.root, reading=True):
                 value = regular.json_value(file, ROOT_BYTES)
@@ -137,23 +137,23 @@ class Roots:
             value = None
         root = decoded(value)
         if root is None:
-            if DIGEST.fullmatch(file.stem):  # another name is not one of ours
+            if DIGEST.fullmatch(file.stem):  # files with other names do not belong to the store
                 self.store.quarantine(file)
             return None
         is_relative = root["kind"] == BESIDE
         return {**root, "path": str(self.store.root.parent / root["path"])} if is_relative else root
 
     def damaged(self) -> list[str]:
-        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they represented."""
+        """Return the names of damaged roots that have not been rewritten, so that their datasets are unknown."""
         names = {path.name[len("root-") :].partition(".")[0] for path in self.store.listed("quarantine", "root-*")}
         return sorted(name for name in names if not (self.store.root / "roots" / f"{name}.json").exists())
 
     def is_of(self, name: str, path: Path) -> bool:
-        """Return whether the root of this name represents the dataset at ``path``."""
+        """Return whether the root with this name belongs to the dataset at ``path``."""
         return self._file(*self.kind_and_name(path)).stem == name
 
     def is_own(self, root: Root) -> bool:
-        """Return whether this user wrote a root: in a shared store, roots of other users may name any path."""
+        """Return whether this user wrote a root; in a shared store, roots of other users may name any path."""
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
             name = os.path.relpath(name, self.store.root.parent)
@@ -164,7 +164,7 @@ class Roots:
             return False
 
     def kind_and_name(self, path: Path) -> tuple[str, str]:
-        """Return kind and name of a root: a relative path if the dataset lies next to its store, so that both can move."""
+        """Return kind and name of a root: a relative path if the dataset is next to its store, so that both can be moved."""
         parent = self.store.root.parent
         if self.store.root.name == BESIDE_NAME and path.is_relative_to(parent):
             return BESIDE, str(path.relative_to(parent))
@@ -175,19 +175,19 @@ class Roots:
 
 
 def name_of(kind: str, name: str, project: str = "") -> str:
-    """Return the digest that names the file of a root."""
+    """Return the digest that is the file name of a root."""
     parts: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
     return digest(parts)
 
 
 def encoded(root: Root) -> bytes:
-    """Return a root as it is kept, with a digest of itself."""
+    """Return an encoded root that includes a digest of itself."""
     content = {key: value for key, value in root.items() if key not in ("check", "number")}
     return json.dumps({**content, "check": digest(content)}, sort_keys=True).encode()
 
 
 def decoded(value: object) -> Root | None:
-    """Return the root that a JSON value holds, None for one that is damaged."""
+    """Return the root in a JSON value, or None if it is damaged."""
     root = dict(value) if isinstance(value, dict) else {}
     check = root.pop("check", None)
     return root if check is not None and check == digest(root) and _formed(root) else None
@@ -211,7 +211,7 @@ def succeeding(current: Root | None, path: str, kind: str, manifest: str, *, las
 
 
 def _formed(root: dict[object, Any]) -> TypeGuard[Root]:
-    """Return whether the values of a root have the right types: another program may have written it."""
+    """Return whether the values of a root have the right types; another program may have written it."""
     project, history = root.get("project", {"id": "", "name": ""}), root.get("history", [])
     if not (
         isinstance(project, dict)

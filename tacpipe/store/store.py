@@ -1,4 +1,4 @@
-"""The store: objects by digest, records by key, roots; see docs/format.md for its invariants."""
+"""The store: objects by digest, records by key, and roots. `docs/format.md` lists its invariants."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from tacpipe.store.roots import Roots
 
 
 class MissingError(DamagedError):
-    """An object is not in the store, or was damaged and is now in quarantine."""
+    """An object is not in the store, or it was damaged and has been quarantined."""
 
 
 class AbsentError(MissingError):
-    """An object or a record is not in the store, which is not a sign of damage: it may have been collected."""
+    """An object or record is not in the store. That is not a sign of damage, because it may have been collected."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,14 @@ class Object:
 
 
 class Store:
-    """Content by digest and results by key, in one folder.
+    """Content by digest and results by key in one folder.
 
-    ``run`` is the lease of the run that this process works for, as `at_work` gave it to the process that began it.
+    ``run`` is the lease of the run that this process works for, as created by `at_work` in the process that started the
+    run.
     """
 
-    at_once = 1  # objects that a transfer reads or writes at once
-    distant = False  # True for the local cache of a remote store
+    at_once = 1  # number of objects that a transfer reads or writes concurrently
+    distant = False  # whether this is the local cache of a remote store
 
     def __init__(self, root: Path | str, run: str = "") -> None:
         self.root = Path(root)
@@ -74,23 +75,23 @@ class Store:
 
     @property
     def place(self) -> str:
-        """The place of the store, as sentences name it and `location.opened` finds it."""
+        """The location of the store, for messages and `location.opened`."""
         return self._root
 
     def object_path(self, name: str) -> str:
-        """Return where the object ``name`` lies, whether or not it is there; raises as `layout.object_name` does."""
+        """Return the path of the object ``name``, whether or not it exists. Raises the errors of `layout.object_name`."""
         return self.files.path(layout.object_name(name))
 
     def record_path(self, key: str) -> str:
-        """Return where the record of ``key`` lies, whether or not it is there."""
+        """Return the path of the record of ``key``, whether or not it exists."""
         return self.files.path(layout.record_name(key))
 
     def check(self) -> bool:
-        """Return whether there is a store, or False if one may be begun. Raises `UsageError` as `layout.check` does."""
+        """Return whether the store exists, or False if it can be created. Raises `UsageError` as `layout.check` does."""
         return layout.check(self.root)
 
     def prepare(self) -> None:
-        """Create the store where there is none yet; raises as `check` does."""
+        """Create the store if it does not exist. Raises the errors of `check`."""
         if self.check():
             return
         with readable_errors(self.root):
@@ -98,15 +99,15 @@ class Store:
                 (self.root / name).mkdir(parents=True, exist_ok=True)
             self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
             sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
-        if self.root.name == layout.BESIDE_NAME:  # a store that was not named
+        if self.root.name == layout.BESIDE_NAME:  # the default store, not one that the user named
             terminal.report_progress(f"created the store {self._root}")
 
     # ---- runs
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Announce to `gc` while in the block what is read (``manifests`` and all they name), put and reused."""
-        if self._run is not None:  # The surrounding work holds the lease
+        """Announce to `gc` during the block what is read (``manifests`` and all they name), stored and reused."""
+        if self._run is not None:  # the enclosing block holds the lease
             self._run.announce(manifests)
             yield
             return
@@ -119,47 +120,47 @@ class Store:
                 self._run = None
 
     def _sweep_drafts(self) -> None:
-        """Remove what this run left in ``tmp/``."""
-        with contextlib.suppress(TacpipeError, OSError):  # a collection does it later
+        """Remove this run's files in ``tmp/``."""
+        with contextlib.suppress(TacpipeError, OSError):  # a collection removes them later
             for path in layout.entries(self.root, "tmp"):
                 if path.name.startswith(f"{Path(self.run).stem}."):
                     path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Keep no file open: whoever opens a store for each of many tasks would run out of them."""
+        """Close all files, so that opening a store for each of many tasks does not exhaust file handles."""
         if self._run is not None:
             self._run.close()
 
     def exclusively(self, key: str, work: str) -> contextlib.AbstractContextManager[None]:
-        """Hold the lease of ``key`` within the block, as `Leases.hold` does."""
+        """Hold the lease of ``key`` in the block, as `Leases.hold` does."""
         return self.leases.hold(key, work)
 
     @property
     def run(self) -> str:
-        """The lease of the run at work, for the processes that work for it, or empty if nobody stated so."""
+        """The lease of the active run, for the processes that work for it; empty if there is none."""
         return "" if self._run is None else self._run.path
 
     def announce(self, names: Iterable[str]) -> None:
-        """Announce objects to `gc`; whoever reuses one does so before it looks whether it is there."""
+        """Announce objects to `gc`. An object must be announced before it is reused or its existence is checked."""
         if self._run is not None:
             self._run.announce(names)
 
     def expect(self, keys: Iterable[str]) -> None:
-        """Note that the records of ``keys`` are looked for next, and their results made where there is none.
+        """Prepare for lookups of the records of ``keys``, and for computing the missing ones.
 
-        A store that is kept elsewhere looks for all of them at once.
+        A remote store looks them all up at once.
         """
 
     def seek(self, key: str) -> None:
-        """Do as `expect` for one key, which a run has announced; it may be called in several threads."""
+        """Prepare for the lookup of one key that a run has announced. Thread-safe."""
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Note that objects are read next: a store that is kept elsewhere brings several at once."""
+        """Prepare for reading objects; a remote store fetches several concurrently."""
 
     # ---- objects
 
     def has(self, name: str, size: int | None = None) -> bool:
-        """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
+        """Return whether an object with this digest (and size in bytes) exists, without reading it."""
         return self._lies(name, size)
 
     def _lies(self, name: str, size: int | None = None) -> bool:
@@ -173,14 +174,14 @@ class Store:
         return size is None or entry.bytes == size
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return the sizes in bytes of the objects that are stored."""
+        """Return the sizes in bytes of the objects that exist."""
         stored = (name for name in names if self._lies(name))
         return {
             name: entry.bytes for name in stored if (entry := self.files.stat(layout.object_name(name))) is not None
         }
 
     def room(self) -> int | None:
-        """Return how many bytes the disk has left, or None if that is not known."""
+        """Return the free space on the disk in bytes, or None if it is unknown."""
         disk = shutil.disk_usage(self.root)
         return disk.free if disk.total else None
 
@@ -188,7 +189,7 @@ class Store:
         """Store ``content`` and return its digest and size.
 
         An existing object of the same size is kept; damage is detected on reading. Content that cannot be recomputed is
-        ``durable``: the folders above it are synced too, and an existing copy is read and replaced if it is damaged.
+        ``durable``: its parent folders are synced too, and an existing copy is verified and replaced if it is damaged.
         """
         name = bytes_digest(content)
         path = self.object_path(name)
@@ -200,14 +201,14 @@ class Store:
             is_stored = self._lies(name, len(content))
         if not is_stored:
             self.write_file(path, content, mode=0o444)
-        if durable:  # Also if another process stored it
+        if durable:  # also if another process stored it
             self.sync(path)
         return Object(name, len(content))
 
     def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
-        """Store what ``write`` writes to the file that it is given, and return its digest and size.
+        """Store the content that ``write`` writes to a file, and return its digest and size.
 
-        For content that memory need not hold; else as `put`. Where ``write`` raises, nothing of it is kept.
+        Like `put`, for content that does not fit in memory. If ``write`` raises, nothing is stored.
         """
         path = self.draft()
         with files.new_draft(path, self.root, mode=0o444) as draft:
@@ -215,7 +216,7 @@ class Store:
             draft.sync()
             name = draft.digest
             self.announce([name])
-            if durable or not self._lies(name, draft.bytes):  # a copy that is there may be damaged
+            if durable or not self._lies(name, draft.bytes):  # an existing copy may be damaged
                 self.files.refuse_linked(self.object_path(name))
                 with readable_errors(self.root):
                     move(path, self.object_path(name))
@@ -224,26 +225,26 @@ class Store:
         return Object(name, draft.bytes)
 
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
-        """Store the object ``name`` from ``blocks`` that are verified, as `blocks` of another store yields them.
+        """Store the object ``name`` from verified ``blocks``, as yielded by `blocks` of another store.
 
-        What was there is replaced. After `settle` it outlasts a loss of power.
+        An existing object is replaced. After `settle` it survives a power loss.
         """
         self.announce([name])
         self.write_file(self.object_path(name), blocks, mode=0o444)
 
     def settle(self, names: Iterable[str]) -> None:
-        """Have names within the store outlast a loss of power, as their contents do; each folder is synced once."""
+        """Make names in the store survive a power loss, as their contents do; each folder is synced once."""
         above = {str(folder) for name in names for folder in Path(name).parents}
         with readable_errors(self.root):
-            for folder in sorted(above, reverse=True):  # those within first
+            for folder in sorted(above, reverse=True):  # subfolders first
                 sync_folder(self.files.path(folder))
 
     def read(self, name: str, size: int | None = None) -> bytes:
-        """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
+        """Return the verified content of an object; ``size`` is the size in bytes declared by its manifest or record.
 
-        Raises `MissingError` if it is not there, if it is so much larger than declared that it is not read, or if its bytes
-        do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` if the system fails to
-        read it (EIO, EMFILE, EACCES, …) or memory is short, which states nothing of the object.
+        Raises `MissingError` if it does not exist, is much larger than declared, or does not match its digest; damaged
+        bytes are moved to ``quarantine/``. Raises `StorageError` if the system fails to read it (EIO, EMFILE, EACCES,
+        …) or memory is short, which implies nothing about the object.
         """
         return self._read(name, size)
 
@@ -261,10 +262,10 @@ class Store:
         return content
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
+        """Yield the content of an object block by block. Raises the errors of `read`, for damage after the last block."""
         hashed = hashlib.sha256()
         try:
-            self._lies(name)  # puts back what a collection moved aside
+            self._lies(name)  # puts back an object that a collection moved aside
             for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else read_limit(size)):
                 hashed.update(block)
                 yield block
@@ -279,7 +280,7 @@ class Store:
         return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
 
     def _irregular(self, name: str, error: regular.IrregularError) -> MissingError:
-        """Return what to state of an object that is not one; what is not a regular file is moved to quarantine."""
+        """Return the error for an object that is not a regular file, and move it to quarantine."""
         with contextlib.suppress(TacpipeError):
             self._lies(name)
         return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {str(error).rstrip('.')}.")
@@ -290,7 +291,7 @@ class Store:
         return MissingError(f"Object {name[:12]} was damaged and {outcome}.")
 
     def quarantine(self, path: str | Path) -> bool:
-        """Move a damaged file out of the way, for whoever wants to know why; return False if nothing may be moved."""
+        """Move a damaged file to quarantine for inspection; return False if nothing may be moved."""
         if layout.is_linked(self._root, path):
             return False
         kind = "root-" if Path(path).parent.name == "roots" else ""
@@ -298,42 +299,42 @@ class Store:
         try:
             target.parent.mkdir(exist_ok=True)
             Path(path).replace(target)
-        except FileNotFoundError:  # another process did
+        except FileNotFoundError:  # another process moved it
             return True
         except OSError:
             return False
         return True
 
     def quarantined(self, name: str) -> bool:
-        """Return whether an object of this digest was damaged, lies in quarantine, and was not recomputed."""
+        """Return whether an object with this digest is in quarantine and has not been recomputed."""
         return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
 
     def aside_path(self, name: str) -> str:
-        """Return the path at which a collection keeps an object between its first and its second check."""
+        """Return the path of an object that a collection moved aside between its first and its second check."""
         return f"{self._root}/tmp/{layout.ASIDE}{name}"
 
     def _put_back(self, name: str) -> bool:
-        """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then.
+        """Put an object that a running or killed collection moved aside back in place; return whether there was one.
 
-        Raises `StorageError` for one that is aside and cannot be put back: it is not gone.
+        Raises `StorageError` if it cannot be put back, because it is not lost.
         """
         if layout.is_linked(self._root, self.object_path(name)):
             return False
         try:
             return self.files.move(f"tmp/{layout.ASIDE}{name}", layout.object_name(name))
-        except StorageError:  # The store may be read-only
+        except StorageError:  # the store may be read-only
             with readable_errors(self.root):
                 if present(self.aside_path(name)):
                     raise
             return False
 
     def sync(self, path: str | Path) -> None:
-        """Have the name of a file of the store outlast a loss of power, as its content does."""
+        """Make the name of a file in the store survive a power loss, as its content does."""
         with readable_errors(self.root):
             sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
 
     def listed(self, *patterns: str) -> list[Path]:
-        """Return the paths that match one pattern per level. Raises `TacpipeError` for folders it cannot list."""
+        """Return the paths that match one pattern per level. Raises `TacpipeError` for folders that cannot be listed."""
         paths = [self.root]
         with readable_errors(self.root):
             for pattern in patterns:
@@ -343,20 +344,20 @@ class Store:
     def write_file(
         self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
     ) -> bool:
-        """Do as `Directory.write`."""
+        """Write a file as `Directory.write` does."""
         return self.files.write(path, content, mode=mode, exclusive=exclusive)
 
     def draft(self, name: str = "") -> str:
-        """Return a path in ``tmp/``, of a new name or of this one (32 hex digits), that begins with the run's.
+        """Return a path in ``tmp/`` with a new name, or this one (32 hex digits), prefixed by the run's name.
 
-        From that a collection sees whether the run that wrote there is over.
+        The prefix shows a collection whether the run that wrote the file has ended.
         """
         return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
 
     # ---- records
 
     def record(self, key: str) -> Record | None:
-        """Return the record of ``key``, or None; a damaged one is quarantined and counts as none."""
+        """Return the record of ``key``, or None if there is none or it is damaged. A damaged one is quarantined."""
         try:
             return self.read_record(key)
         except MissingError:
@@ -365,7 +366,7 @@ class Store:
     def read_record(self, key: str) -> Record:
         """Return the record of ``key``.
 
-        Raises `AbsentError` if there is none, and `MissingError` if it is damaged: it is then in ``quarantine/``.
+        Raises `AbsentError` if there is none, and `MissingError` if it is damaged; it is then in ``quarantine/``.
         """
         path = self.record_path(key)
         try:
@@ -377,7 +378,7 @@ class Store:
                 return record
         except FileNotFoundError:
             raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
-        except StorageError:  # the disk failed, which states nothing of the record
+        except StorageError:  # the disk failed, which implies nothing about the record
             raise
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
@@ -393,14 +394,14 @@ class Store:
         replace: bool = False,
         durable: bool = False,
     ) -> Record:
-        """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
+        """Record ``result`` for ``identity`` and return the valid record; the first of several processes wins.
 
-        ``replace`` is for results whose old record names missing objects.
+        ``replace`` is for results whose existing record names missing objects.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)
         path = self.record_path(key)
-        for _ in range(2):  # A second attempt, in case the existing record is damaged
+        for _ in range(2):  # try twice, in case the existing record is damaged
             if self.write_file(path, content, exclusive=not replace):
                 break
             existing = self.record(key)
@@ -412,14 +413,14 @@ class Store:
         return record
 
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
-        """Do nothing: in a folder all records are read in little time."""
+        """Do nothing, because reading all records in a folder is fast."""
 
     def noted(self, manifest: str) -> set[str]:
-        """Return nothing, as `note_records` notes nothing."""
+        """Return an empty set, because `note_records` notes nothing."""
         return set()
 
     def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
-        """Yield records and their keys, among them all that belong to a manifest: those of the store."""
+        """Yield records with their keys that include all records of a manifest: those of the whole store."""
         return self.records()
 
     def records(self) -> Iterator[tuple[str, Record]]:
@@ -431,5 +432,5 @@ class Store:
 
 
 def read_limit(size: int) -> int:
-    """Return how many bytes of an object of this declared size are read: a small one that grew is quarantined."""
+    """Return the number of bytes to read of an object with this declared size; a small object that grew is quarantined."""
     return max(size, memory.AT_HAND)
