@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import tacpipe
 from tacpipe.io.parquet import from_parquet
+from tacpipe.metrics.calibration import Band
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import evaluation as touch_evaluation
@@ -25,7 +26,7 @@ from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
-from tacpipe.tasks.touch.report.uncertainty import Band, measure_bands
+from tacpipe.tasks.touch.report.quantiles import measure_bands
 
 if TYPE_CHECKING:
     import pandas as pd

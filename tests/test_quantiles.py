@@ -10,7 +10,7 @@ from sklearn.metrics import mean_pinball_loss
 
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import calibration
-from tacpipe.tasks.forward.uncertainty import ResidualQuantiles
+from tacpipe.tasks.forward.quantiles import ResidualQuantiles
 
 LEVELS = np.array([0.1, 0.5, 0.9])
 

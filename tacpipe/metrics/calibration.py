@@ -13,13 +13,17 @@ fraction of true values in the band between the lowest and the highest quantile;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Ints
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import intervals
+from tacpipe.metrics.intervals import Estimate
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 BINS = 10  # equally wide bins of confidence
 MIN_PROBABILITY = 1e-12  # probability
@@ -209,6 +213,57 @@ def _by_step(values: AnyFloats) -> dict[str, float]:
     """Return values (step + 1,) by their names, to 9 digits; what is not defined is left out."""
     names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
     return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+
+
+@dataclass(frozen=True)
+class Band:
+    """The worth of a predictor's band, which reaches from its lowest to its highest quantile."""
+
+    values: int
+    clusters: int
+    coverage: Estimate
+    width: float  # mean, in the unit of the values
+    pinball: float  # mean loss, in the unit of the values
+    gain: Estimate  # 1 - pinball / pinball of the baseline
+
+
+def measure_bands(rows: pd.DataFrame, group: str, cluster: str, baseline: str) -> dict[tuple[Any, str], Band]:
+    """Return the worth of each predictor's band on each ``group``, a column with targets or steps.
+
+    ``rows`` are those of ``coverage.parquet``: ``covered``, ``width`` and ``pinball`` of single values, or their sums over
+    ``values``. Intervals are over what the column ``cluster`` names.
+    """
+    columns = ["covered", "width", "pinball", "values"]
+    counted = rows.assign(values=rows.get("values", 1.0)).astype(dict.fromkeys(columns, float))
+    sums = counted.groupby([group, "predictor", cluster])[columns].sum()
+    parts: dict[Any, pd.DataFrame] = {names: part.droplevel([0, 1]) for names, part in sums.groupby(level=[0, 1])}
+    bands = {}
+    for (key, predictor), by_cluster in parts.items():
+        reference = parts[key, baseline].loc[by_cluster.index]
+        covered, values, pinball = (by_cluster[[name]].to_numpy() for name in ("covered", "values", "pinball"))
+        count = float(values.sum())
+        bands[key, str(predictor)] = Band(
+            round(count),
+            len(by_cluster),
+            intervals.share_interval(covered, values).first,
+            float(by_cluster["width"].sum()) / count,
+            float(pinball.sum()) / count,
+            intervals.skill_interval(pinball, reference[["pinball"]].to_numpy()).first,
+        )
+    return bands
+
+
+def promised_quantile(scores: AnyFloats, groups: Ints, level: float, noun: str) -> float:
+    """Return the promised `conformal_quantile`. Raises `TacpipeError` if ``groups``, each a ``noun``, are too few."""
+    bound = conformal_quantile(scores, groups, level, promised=True)
+    if not np.isfinite(bound):
+        count = len(np.unique(groups))
+        raise TacpipeError(
+            f"{count} calibration {noun} can promise a band that holds {100 * most_promised(count):.0f} % at most, not "
+            f"{100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave "
+            f"out --promise."
+        )
+    return bound
 
 
 def most_promised(groups: int) -> float:

@@ -15,8 +15,8 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
+from tacpipe.tasks.forward.quantiles import FILE, ForecastQuantiles, WindowErrors, fewer
 from tacpipe.tasks.forward.training import check_codec
-from tacpipe.tasks.forward.uncertainty import FILE, Uncertainty, WindowErrors, fewer
 from tacpipe.tasks.recordings import add_calibration, trained_on_datasets
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def calibrate(
     training_errors = errors_of(forecaster, training, max(1, FITTED // max(1, len(training.recordings))))
     errors = errors_of(forecaster, calibration, CORRECTED)
     levels = np.array(request.quantiles) / 100
-    uncertainty = Uncertainty.fit(levels, training_errors, errors, promised=request.promise, seed=request.seed)
+    quantiles = ForecastQuantiles.fit(levels, training_errors, errors, promised=request.promise, seed=request.seed)
     count = len(np.unique(errors.recordings))
     config = forecaster.config.copy()
     config["quantiles"] = {
@@ -54,7 +54,7 @@ def calibrate(
     return {
         **model,
         CONFIG: model_files.to_json(config),
-        FILE: uncertainty.to_bytes(),
+        FILE: quantiles.to_bytes(),
     }
 
 
@@ -82,7 +82,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Window
                 past, truth = track.tactile[forecast.past], track.tactile[forecast.future]
                 parts.append(
                     (
-                        forecaster.signs(forecast.windows, past, forecast.count),
+                        forecaster.error_features(forecast.windows, past, forecast.count),
                         (truth - forecast.count).transpose(0, 2, 1).astype(np.float32),
                         (truth - past[:, -1:]).transpose(0, 2, 1).astype(np.float32),
                         np.full(len(past), number),

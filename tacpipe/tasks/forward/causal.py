@@ -112,7 +112,7 @@ class Rolling:
         frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
         self._levels = np.zeros((frames, len(codec.channels)))
         self._begins: Bools = np.zeros(frames, bool)
-        self._past = np.zeros((forecaster.context if forecaster.uncertainty else 0, len(codec.channels)))
+        self._past = np.zeros((forecaster.context if forecaster.quantiles else 0, len(codec.channels)))
         self._rows = self._run = 0
         self._unknown = max(1, frames - 1) if continues else 0
 

@@ -26,11 +26,11 @@ from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL, look_ahead_notes, unit_of_model
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, predicted
+from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.slips import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
-from tacpipe.tasks.forward.uncertainty import CHUNK, Uncertainty
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -55,7 +55,7 @@ class QuantileSums:
     def add(self, track: Track, trial: Trial) -> None:
         """Count the windows of a recording."""
         forecaster = self.forecaster
-        uncertainty = forecaster.uncertainty
+        uncertainty = forecaster.quantiles
         if uncertainty is None:
             return
         drawn = _Drawn(forecaster, track) if not trial.seen and len(self.examples) < SHOWN else None
@@ -77,7 +77,7 @@ class QuantileSums:
 
     def summary(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what ``metrics.json`` holds under ``quantiles``: measures by predictor, of unseen recordings at the top."""
-        uncertainty = self.forecaster.uncertainty
+        uncertainty = self.forecaster.quantiles
         if uncertainty is None:
             return {}
         fresh = [trial for trial in trials if not trial.seen and trial.name in self.sums]
@@ -111,7 +111,7 @@ class QuantileSums:
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:
         """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw."""
-        if self.forecaster.uncertainty is None:
+        if self.forecaster.quantiles is None:
             return {}
         rows: list[dict[str, Any]] = []
         for trial in trials:
@@ -144,7 +144,7 @@ def band(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: s
 
 
 def _predicted(
-    forecaster: Forecaster, uncertainty: Uncertainty, track: Track, forecast: WindowForecast, part: slice
+    forecaster: Forecaster, uncertainty: ForecastQuantiles, track: Track, forecast: WindowForecast, part: slice
 ) -> Iterator[tuple[str, AnyFloats]]:
     """Yield the quantiles (window, step, channel, level) of each predictor."""
     yield MODEL, band(forecaster, track, forecast, part)

@@ -27,8 +27,8 @@ from tacpipe.signals.kinematics import continuous
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.networks import acted
 from tacpipe.tasks.forward.params import ForwardConfig, Params
-from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
-from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
+from tacpipe.tasks.forward.quantiles import FILE as QUANTILES
+from tacpipe.tasks.forward.quantiles import ForecastQuantiles, window_features
 from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.tasks.task import quantiles_of
 
@@ -73,7 +73,7 @@ class Forecaster:
     baselines: FittedBaselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
     chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
-    uncertainty: Uncertainty | None = None  # present if `tacpipe calibrate` made the model
+    quantiles: ForecastQuantiles | None = None  # present if `tacpipe calibrate` made the model
 
     @property
     def context(self) -> int:
@@ -197,8 +197,8 @@ class Forecaster:
             )
             baselines = None if baseline_arrays is None else FittedBaselines.from_tensors(baseline_arrays)
             sizes = len(codec.channels), params.horizon
-            uncertainty = Uncertainty.load(files[QUANTILES], *sizes) if QUANTILES in files else None
-            forecaster = cls(model.eval(), params, config, codec, baselines, codec_files, chain, uncertainty)
+            quantiles = ForecastQuantiles.load(files[QUANTILES], *sizes) if QUANTILES in files else None
+            forecaster = cls(model.eval(), params, config, codec, baselines, codec_files, chain, quantiles)
             forecaster._try()
         return forecaster
 
@@ -233,9 +233,9 @@ class Forecaster:
         predicted = self._of_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
 
-    def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
+    def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
         """Return `tacpipe.tasks.task.quantiles_of` of the model."""
-        return quantiles_of(self.uncertainty, percents)
+        return quantiles_of(self.quantiles, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
         """Return quantiles of counts above rest of arrays; `prediction.ForwardModel.predict` describes all three."""
@@ -249,20 +249,20 @@ class Forecaster:
         quantiles = self.band(read, touch[:, -self.context :], ahead)[..., at]
         return quantiles[0] if single else quantiles
 
-    def signs(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
-        """Return features of how uncertain a forecast is: `uncertainty.window_signs` of windows.
+    def error_features(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+        """Return features of how uncertain a forecast is: `window_features` of windows.
 
         Forecasts ``ahead`` (window, step, channel) and levels ``past`` (window, context, channel) are above rest.
         """
-        return window_signs(windows, past, ahead, self.channel_scale, self.actions)
+        return window_features(windows, past, ahead, self.channel_scale, self.actions)
 
     def band(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
-        """Return all quantiles (window, step, channel, level) of the forecast ``ahead``; `signs` describes what is given.
+        """Return all quantiles (window, step, channel, level) of the forecast ``ahead``.
 
-        The model must have quantiles.
+        `error_features` describes what is given. The model must have quantiles.
         """
-        assert self.uncertainty is not None
-        return self.uncertainty.quantiles(self.signs(windows, past, ahead), ahead)
+        assert self.quantiles is not None
+        return self.quantiles.quantiles(self.error_features(windows, past, ahead), ahead)
 
     def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""

@@ -18,8 +18,8 @@ from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.evaluation import KEPT_BYTES, band, check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
+from tacpipe.tasks.forward.quantiles import CHUNK
 from tacpipe.tasks.forward.training import check_codec
-from tacpipe.tasks.forward.uncertainty import CHUNK
 from tacpipe.tasks.recordings import open_for_model
 
 if TYPE_CHECKING:

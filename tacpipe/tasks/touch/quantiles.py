@@ -18,7 +18,6 @@ from safetensors.numpy import save
 from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import calibration
 from tacpipe.metrics.calibration import Sums
@@ -185,13 +184,7 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
         away = np.abs(flat - offsets[middle])
         for low in range(middle):
             level = float(levels[-1 - low] - levels[low])
-            far = calibration.conformal_quantile(away, groups, level, promised=True)
-            if not np.isfinite(far):
-                raise TacpipeError(
-                    f"{len(errors)} calibration grasps can promise a band that holds "
-                    f"{100 * calibration.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with "
-                    f"more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
-                )
+            far = calibration.promised_quantile(away, groups, level, "grasps")
             offsets[low], offsets[-1 - low] = offsets[middle] - far, offsets[middle] + far
     return offsets
 

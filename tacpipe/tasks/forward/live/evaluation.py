@@ -109,7 +109,7 @@ def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
     tables = streams_as_recorded(recording)
-    levels = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
+    levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
     session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
     chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
     forecasts = list(replay.replayed(chain, tables))

@@ -12,7 +12,8 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import ComparisonRow
 from tacpipe.comparison.runs import MODEL, Method
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics import intervals, pairing
+from tacpipe.metrics import calibration, intervals, pairing
+from tacpipe.metrics.calibration import Band
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, fold, interval, number, table
@@ -24,6 +25,8 @@ from tacpipe.tasks.forward.report import methods
 from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from tacpipe.arrays import AnyFloats
     from tacpipe.comparison.runs import ComparedRun
     from tacpipe.metrics.pairing import Sums
@@ -166,13 +169,14 @@ def band_folds(context: Context) -> list[Fold]:
     drawn: list[Chart] = []
     rows: list[Sequence[Any]] = []
     for method in methods:
-        sums = _band_sums([run for run in runs if run.method == method])
+        read = _read_coverage([run for run in runs if run.method == method])
         for known_objects in (True, False):
-            part_sums = {name: by_part[known_objects] for name, by_part in sums.items() if by_part.get(known_objects)}
-            if part_sums:
+            part = read[read.known == known_objects]
+            if len(part):
                 title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known_objects])))
-                drawn.append(_coverage_chart(title, part_sums, level))
-                rows += _coverage_rows(title, part_sums)
+                bands = calibration.measure_bands(part, "step", "unit", BASELINE)
+                drawn.append(_coverage_chart(title, bands, level))
+                rows += _coverage_rows(title, bands)
     heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")
     title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
     return fold(
@@ -184,59 +188,43 @@ def band_folds(context: Context) -> list[Fold]:
     )
 
 
-BandSums = Mapping[str, dict[str, "AnyFloats"]]  # recording -> covered, width, pinball and values, each (step,)
+Bands = Mapping[tuple[Any, str], Band]  # (step, predictor) -> band
 
 
-def _band_sums(runs: Sequence[ComparedRun]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
-    """Return the sums of recordings that were not seen, by predictor, whether the object is known, and recording."""
-    sums: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
-    for run in runs:
-        read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
-        read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
-        for (name, is_known, recording), group in read[~read.seen].groupby(["predictor", "known", "unit"]):
-            by_step = group.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
-            added = {key: by_step[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
-            predictor_sums = sums.setdefault(str(name), {}).setdefault(bool(is_known), {})
-            before = predictor_sums.get(str(recording))
-            predictor_sums[str(recording)] = (
-                added if before is None else {key: before[key] + added[key] for key in added}
-            )
-    return sums
+def _read_coverage(runs: Sequence[ComparedRun]) -> pd.DataFrame:
+    """Return the sums of recordings that were not seen: one row per run, predictor, recording and step.
+
+    The column ``unit`` is what intervals are over: recordings, and objects where these are unseen.
+    """
+    import pandas as pd
+
+    read = pd.concat([from_parquet(run.details.dataset.files[COVERAGE]).to_pandas() for run in runs])
+    read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
+    fresh: pd.DataFrame = read[~read.seen]
+    return fresh
 
 
-def _sums_for(sums: Mapping[str, Mapping[str, AnyFloats]], key: str) -> AnyFloats:
-    """Return one kind of sums (recording, step)."""
-    return np.stack([recording_sums[key] for recording_sums in sums.values()])
-
-
-def _coverage_chart(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]], level: float) -> Chart:
+def _coverage_chart(title: str, bands: Bands, level: float) -> Chart:
     """Return coverage by step of each predictor, with its interval over recordings."""
     lines = []
-    for name in (predictor for predictor in NAMES if predictor in sums):
-        interval = intervals.share_interval(_sums_for(sums[name], "covered"), _sums_for(sums[name], "values"))
-        low, high = (np.where(np.isnan(ends), interval.mean, ends) for ends in (interval.low, interval.high))
-        steps = np.arange(1.0, len(low) + 1)
-        lines.append(Curve(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
+    for name in NAMES:
+        coverage = {step: band.coverage for (step, predictor), band in sorted(bands.items()) if predictor == name}
+        if coverage:
+            mean, low, high = np.array(list(coverage.values())).T
+            low, high = (np.where(np.isnan(ends), mean, ends) for ends in (low, high))
+            lines.append(Curve(NAMES[name], np.array(list(coverage), float), mean, low, high, dashed=name != "model"))
     spec = charts.lines(lines, "rows ahead", "coverage", level=("asked for", level))
     return Chart(f"Coverage: {title}", spec)
 
 
-def _coverage_rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]]) -> list[Sequence[Any]]:
+def _coverage_rows(title: str, bands: Bands) -> list[Sequence[Any]]:
     """Return the rows of the table: a predictor and step each."""
-    persistence = _sums_for(sums["persistence"], "pinball").sum(axis=0)
     rows: list[Sequence[Any]] = []
-    for name in (totals for totals in NAMES if totals in sums):
-        totals = {key: _sums_for(sums[name], key).sum(axis=0) for key in ("covered", "width", "pinball", "values")}
-        for step in (shown_step for shown_step in SHOWN if shown_step <= len(persistence)):
-            at, values = step - 1, totals["values"][step - 1]
-            gain = 100 * (1 - totals["pinball"][at] / persistence[at]) if persistence[at] else float("nan")
-            measured = (
-                totals["covered"][at] / values,
-                totals["width"][at] / values,
-                totals["pinball"][at] / values,
-                gain,
-            )
-            rows.append([f"{title}: {NAMES[name]}", f"t+{step}", str(len(sums[name])), *map(number, measured)])
+    for name in NAMES:
+        for step in (step for step in SHOWN if (step, name) in bands):
+            band = bands[step, name]
+            measured = (band.coverage[0], band.width, band.pinball, 100 * band.gain[0])
+            rows.append([f"{title}: {NAMES[name]}", f"t+{step}", str(band.clusters), *map(number, measured)])
     return rows
 
 

@@ -11,7 +11,7 @@ from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint
 from tacpipe.report.context import Context
 from tacpipe.tasks.material import headline
-from tacpipe.tasks.material.report import figures, joint, methods, scores, uncertainty
+from tacpipe.tasks.material.report import figures, joint, methods, probabilities, scores
 from tacpipe.tasks.material.report.methods import question_on, runs_on, sensor_title, sensors_of
 from tacpipe.tasks.material.report.predictions import LAST, LEVEL, MODEL
 
@@ -82,7 +82,7 @@ def folds(context: Context) -> list[Fold]:
         *figures.few_slides_folds(methods),
         *joint.zero_shot_folds(methods),
         *figures.confusion_folds(context),
-        *uncertainty.uncertainty_folds(methods),
+        *probabilities.probability_folds(methods),
         *figures.latent_folds(methods),
         *figures.training_folds(methods),
         *figures.profile_folds(context.others),

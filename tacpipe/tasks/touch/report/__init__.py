@@ -14,7 +14,7 @@ from tacpipe.report import blocks, screen
 from tacpipe.report.blocks import NONE, Cell, Charts, Fold
 from tacpipe.report.context import Context
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch.report import figures, methods, predictions, uncertainty
+from tacpipe.tasks.touch.report import figures, methods, predictions, quantiles
 from tacpipe.tasks.touch.report.methods import (
     caution,
     default_method,
@@ -114,7 +114,7 @@ def folds(context: Context) -> list[Fold]:
     return [
         *figures.pressure_folds(first),
         *figures.electrode_folds(first),
-        *uncertainty.uncertainty_folds(methods),
+        *quantiles.quantile_folds(methods),
         *figures.cloud_folds(context.others, chosen),
         *blocks.fold("The paper's tables and figures" if published else "What settings change", *paper),
         *folds,

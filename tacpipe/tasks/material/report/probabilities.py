@@ -50,7 +50,7 @@ class Rate(NamedTuple):
     slides: int
 
 
-def uncertainty_folds(methods: Sequence[Method]) -> list[Fold]:
+def probability_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return reliability and curves of unknown, of calibrated models; nothing without any."""
     reliable, refused, rows = [], [], []
     for sensor in sensors_of(methods):

@@ -13,7 +13,7 @@ from scipy import stats
 
 from tacpipe.channels import biotac_sp
 from tacpipe.report.blocks import Charts, Fold, Table
-from tacpipe.tasks.touch.report import uncertainty
+from tacpipe.tasks.touch.report import quantiles
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import result
@@ -59,7 +59,7 @@ def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() 
     runs = pd.concat([rows(0), rows(1)])
     for is_known, cluster in ((True, "recording"), (False, "object")):
         part = runs[runs.known == is_known]
-        band = uncertainty.measure_bands(part, is_known)["e_mf", "model"]
+        band = quantiles.measure_bands(part, is_known)["e_mf", "model"]
         model_rows = part[(part.target == "e_mf") & (part.predictor == "model")]
         assert band.values == len(model_rows) == 2 * 2 * 10 * 24
         assert band.coverage[0] == model_rows.covered.mean()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tacpipe.report.blocks import Charts, Fold, Table
-from tacpipe.tasks.material.report import uncertainty
+from tacpipe.tasks.material.report import probabilities
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result, slides
@@ -76,7 +76,7 @@ def test_reliability_is_drawn_of_as_many_slides_a_bin_and_unknown_with_its_thres
 def test_a_curve_states_which_fraction_of_unknown_slides_lies_below_each_threshold() -> None:
     rng = np.random.default_rng(0)
     known_scores, unknown = rng.normal(1, 1, 300), rng.normal(0, 1, 200)
-    curve = uncertainty.unknown_curve(known_scores, unknown)
+    curve = probabilities.unknown_curve(known_scores, unknown)
     for at in (10, 50, 90):  # thresholds below which so many percent of known slides lie
         threshold = np.sort(known_scores)[3 * at]
         assert curve[at] == pytest.approx(np.mean(unknown < threshold), abs=1e-12)

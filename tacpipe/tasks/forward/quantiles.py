@@ -21,7 +21,7 @@ from torch.nn import functional
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Float32s, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.calibration import conformal_quantile, most_promised
+from tacpipe.metrics.calibration import conformal_quantile, promised_quantile
 from tacpipe.models.tensors import tensors_under
 from tacpipe.models.windows import POSE, ForecastWindows, without_plan
 from tacpipe.tasks import task
@@ -168,11 +168,11 @@ def _scaled(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:
     return np.clip((rows - centre) / spread, -FARTHEST, FARTHEST).astype(np.float32)
 
 
-SIGNS = 13  # features beside the predicted change at each step
+FIXED_FEATURES = 13  # features beside the predicted change at each step
 LATEST_ROWS = 3  # rows whose change is looked at beside that of the whole context
 
 
-def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, scale: AnyFloats) -> Float32s:
+def error_features(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, scale: AnyFloats) -> Float32s:
     """Return features (window, channel, feature), float32, of windows and their forecasts.
 
     ``past`` (window, context, channel) and the forecast ``ahead`` (window, horizon, channel) are levels above rest, ``arm``
@@ -221,7 +221,7 @@ CHUNK = 256  # windows whose quantiles are computed at once
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class ForecastQuantiles:
     """Quantiles of a model's error and, to compare with, constant ones of its error and of persistence's."""
 
     errors: ResidualQuantiles
@@ -268,8 +268,8 @@ class Uncertainty:
         quantiles are moved together so far that the band between them holds in a new recording with at least its level;
         raises `TacpipeError` with too few recordings for that.
         """
-        errors = ResidualQuantiles.fit(training.signs, training.errors, levels, seed=seed)
-        predicted = errors.predict(calibration.signs)
+        errors = ResidualQuantiles.fit(training.features, training.errors, levels, seed=seed)
+        predicted = errors.predict(calibration.features)
         moved = _moved(errors, predicted, calibration, promised)
         return cls(errors, moved, _empirical(calibration.errors, levels), _empirical(training.changes, levels))
 
@@ -283,45 +283,47 @@ class Uncertainty:
     def load(cls, content: bytes, channels: int, horizon: int) -> Self:
         """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` if shapes do not fit."""
         arrays = model_files.arrays(content, FILE)
-        uncertainty = cls(
+        quantiles = cls(
             ResidualQuantiles.from_tensors(tensors_under(ERRORS, arrays)),
             *(arrays[name] for name in ("moved", "unconditional", "persistence")),
         )
-        levels = len(uncertainty.percents)
+        levels = len(quantiles.percents)
         shapes = {(levels, channels, horizon)} | {
-            array.shape for array in (uncertainty.unconditional, uncertainty.persistence)
+            array.shape for array in (quantiles.unconditional, quantiles.persistence)
         }
         if (
             len(shapes) > 1
-            or uncertainty.moved.shape != (levels, horizon)
-            or uncertainty.errors.unit.shape != (channels, horizon)
+            or quantiles.moved.shape != (levels, horizon)
+            or quantiles.errors.unit.shape != (channels, horizon)
         ):
             raise ValueError("the quantiles are of other channels or steps")
-        if uncertainty.errors.centre.shape != (SIGNS + horizon,):
-            raise ValueError(f"the quantiles read {uncertainty.errors.centre.shape} features, not {SIGNS + horizon}")
-        return uncertainty
+        if quantiles.errors.centre.shape != (FIXED_FEATURES + horizon,):
+            raise ValueError(
+                f"the quantiles read {quantiles.errors.centre.shape}, not {FIXED_FEATURES + horizon} features"
+            )
+        return quantiles
 
 
 @dataclass(frozen=True)
 class WindowErrors:
     """Errors of a model on some windows of recordings, and what its forecasts and inputs show."""
 
-    signs: Float32s  # (window, channel, feature)
+    features: Float32s  # (window, channel, feature)
     errors: Float32s  # (window, channel, step), true less predicted, counts
     changes: Float32s  # (window, channel, step), true less the last row, counts
     recordings: Int64s  # (window,), the number of the recording
 
 
-def window_signs(
+def window_features(
     windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats, actions: str = "planned"
 ) -> Float32s:
-    """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
+    """Return `error_features` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
 
     The plan is not looked at for a model that reads none or a wrong one.
     """
     windows = windows if actions == "planned" else without_plan(windows)
     arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
-    return signs(past, ahead, arm, finger, scale)
+    return error_features(past, ahead, arm, finger, scale)
 
 
 def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool) -> AnyFloats:
@@ -337,23 +339,11 @@ def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: WindowEr
             sides = {low: -beyond[..., low].ravel(), high: beyond[..., high].ravel()}
             if promised:
                 larger = np.maximum(*sides.values())
-                moved[[low, high], step] = _promise(larger, groups, 2 * level - 1)
+                moved[[low, high], step] = promised_quantile(larger, groups, 2 * level - 1, "recordings")
             else:
                 for at, scores in sides.items():
                     moved[at, step] = conformal_quantile(scores, groups, level)
     return moved
-
-
-def _promise(scores: AnyFloats, groups: Int64s, level: float) -> float:
-    bound = conformal_quantile(scores, groups, level, promised=True)
-    if not np.isfinite(bound):
-        count = len(np.unique(groups))
-        raise TacpipeError(
-            f"{count} calibration recordings can promise a band that holds {100 * most_promised(count):.0f} % at "
-            f"most, not {100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, "
-            f"or leave out --promise."
-        )
-    return bound
 
 
 def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:

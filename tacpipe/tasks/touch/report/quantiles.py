@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,8 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics import intervals
+from tacpipe.metrics import calibration
+from tacpipe.metrics.calibration import Band
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Dot
@@ -34,18 +34,7 @@ ELECTRODES = "Coverage in percent. Blue: more than asked for; orange: less."
 STRONGEST = 0.2  # difference of coverage that has the strongest colour
 
 
-@dataclass(frozen=True)
-class Band:
-    """A predictor's band on one target."""
-
-    values: int
-    coverage: tuple[float, float, float]  # mean and the ends of its 95 % interval
-    width: float  # counts
-    pinball: float  # counts
-    gain: tuple[float, float, float]  # 1 - pinball / pinball of the constant, with its 95 % interval
-
-
-def uncertainty_folds(methods: Sequence[Method]) -> list[Fold]:
+def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return how good quantiles are, of calibrated models; nothing without any."""
     folds: list[Fold] = []
     has_several_splits = (
@@ -89,29 +78,8 @@ def uncertainty_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def measure_bands(rows: pd.DataFrame, known_objects: bool) -> dict[tuple[str, str], Band]:
-    """Return what each predictor's band is worth on each target, of grasps of known objects or of novel ones."""
-    bands = {}
-    for target, same in rows.groupby("target"):
-        clustered = same.groupby(["predictor", "recording" if known_objects else "object"])
-        sums = clustered[["covered", "pinball"]].sum().join(clustered.size().rename("values"))
-        constant = sums.loc[CONSTANT]
-        for predictor, predictor_rows in same.groupby("predictor"):
-            predictor_sums = sums.loc[predictor]
-            lost, constant_loss = (
-                loss_sums["pinball"].to_numpy(float)[:, None] for loss_sums in (predictor_sums, constant)
-            )
-            gain = intervals.skill_interval(lost, constant_loss).first
-            share = intervals.share_interval(
-                *(predictor_sums[[part]].to_numpy(float) for part in ("covered", "values"))
-            ).first
-            bands[str(target), str(predictor)] = Band(
-                len(predictor_rows),
-                share,
-                float(predictor_rows.width.mean()),
-                float(predictor_rows.pinball.mean()),
-                gain,
-            )
-    return bands
+    """Return the worth of each predictor's band on each target, over grasps of known objects or over novel objects."""
+    return calibration.measure_bands(rows, "target", "recording" if known_objects else "object", CONSTANT)
 
 
 def coverage_by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
