@@ -21,10 +21,10 @@ SCHEMA_VERSION = 1
 RATE_OFF = 0.1  # Largest relative deviation from the rig file's rate that is not reported
 
 
-def add(program: typer.Typer) -> None:
+def add(program: typer.Typer, help_text: str) -> None:
     """Add the command to ``program``."""
 
-    @program.command("acquire", help=registry.group_help("acquire"))
+    @program.command("acquire", help=help_text)
     def acquire(
         rig: Annotated[
             Path | None, typer.Argument(help="Rig file, in TOML; its format is documented under Rig file.")

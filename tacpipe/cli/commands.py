@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -194,52 +195,13 @@ def _version(program: typer.Typer) -> None:
         _print(versions.of_parts(), versions.to_text, as_json=as_json)
 
 
-def _store(program: typer.Typer) -> None:
-    from tacpipe.cli import store
+def _from_module(name: str) -> Callable[[typer.Typer], None]:
+    """Return the function that adds the command of a module of its own, which is imported when the command is needed."""
 
-    store.add(program, SUMMARIES["store"])
+    def add(program: typer.Typer) -> None:
+        importlib.import_module(f"tacpipe.cli.{name}").add(program, SUMMARIES.get(name) or registry.group_help(name))
 
-
-def _sensors(program: typer.Typer) -> None:
-    from tacpipe.cli import sensors
-
-    sensors.add(program, SUMMARIES["sensors"])
-
-
-def _candidates(program: typer.Typer) -> None:
-    from tacpipe.cli import candidates
-
-    candidates.add(program, SUMMARIES["candidates"])
-
-
-def _limits(program: typer.Typer) -> None:
-    from tacpipe.cli import limits
-
-    limits.add(program, SUMMARIES["limits"])
-
-
-def _view(program: typer.Typer) -> None:
-    from tacpipe.cli import view
-
-    view.add(program, SUMMARIES["view"])
-
-
-def _run(program: typer.Typer) -> None:
-    from tacpipe.cli import run
-
-    run.add(program, SUMMARIES["run"])
-
-
-def _acquire(program: typer.Typer) -> None:
-    from tacpipe.cli import acquire
-
-    acquire.add(program)
-
-
-def _live(program: typer.Typer) -> None:
-    from tacpipe.cli import live
-
-    live.add(program, SUMMARIES["live"])
+    return add
 
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
@@ -262,19 +224,19 @@ def _ends_with_its_reader() -> Iterator[None]:
 
 
 NAMES: dict[str, Callable[[typer.Typer], None]] = {
-    "acquire": _acquire,
-    "live": _live,
+    "acquire": _from_module("acquire"),
+    "live": _from_module("live"),
     "label": _label,
     "show": _show,
     "compare": _compare,
     "track": _track,
-    "view": _view,
-    "run": _run,
+    "view": _from_module("view"),
+    "run": _from_module("run"),
     "explain": _explain,
-    "sensors": _sensors,
-    "store": _store,
-    "candidates": _candidates,
-    "limits": _limits,
+    "sensors": _from_module("sensors"),
+    "store": _from_module("store"),
+    "candidates": _from_module("candidates"),
+    "limits": _from_module("limits"),
     "demo": _demo,
     "version": _version,
 }

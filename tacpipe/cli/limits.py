@@ -67,30 +67,20 @@ def limits(
 def text(found: Limits) -> str:
     """Return the limits as three tables of text."""
     grasps = sum(found.counts.values())
-    lines = [
-        f"{grasps} grasps of {len(found.counts)} objects",
-        "",
-        "pairs of grasps: skill of a predictor that errs as pairs differ",
-    ]
-    rows = [
-        [
-            _bounds(low, high),
-            str(max(estimates.pairs for estimates in by_target.values())),
-            *(_cell(by_target[name].pair_skill) for name in TARGETS),
+    lines = [f"{grasps} grasps of {len(found.counts)} objects"]
+    for title, measure in (
+        ("skill of a predictor that errs as pairs differ", "pair_skill"),
+        ("likeness of readings within an object", "likeness"),
+    ):
+        rows = [
+            [
+                _bounds(low, high),
+                str(max(estimates.pairs for estimates in by_target.values())),
+                *(_cell(getattr(by_target[name], measure)) for name in TARGETS),
+            ]
+            for low, high, by_target in found.near
         ]
-        for low, high, by_target in found.near
-    ]
-    lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
-    lines += ["", "pairs of grasps: likeness of readings within an object"]
-    rows = [
-        [
-            _bounds(low, high),
-            str(max(estimates.pairs for estimates in by_target.values())),
-            *(_cell(by_target[name].likeness) for name in TARGETS),
-        ]
-        for low, high, by_target in found.near
-    ]
-    lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
+        lines += ["", f"pairs of grasps: {title}", *_table(["distance (mm)", "pairs", *TARGETS], rows)]
     lines += ["", "learning curve: skill on known objects"]
     rows = [
         [str(point.grasps), f"{point.trained:.0f}", *(_cell(point.skill[name]) for name in TARGETS)]

@@ -8,15 +8,11 @@ times since the start.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.datasets import paths
-from tacpipe.errors import TacpipeError
-from tacpipe.formats.published import published_attribute, require, text, valid
-from tacpipe.io.files import walk
+from tacpipe.formats.published import by_object, published_attribute, require
 from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
@@ -39,27 +35,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     Files are named as they lie, ``lemon/exp_num_3/camera_0.avi``, so that the object is part of a key. Raises
     `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` if two trials share a name.
     """
-    if not source.is_dir():
-        raise TacpipeError(
-            f"{source} is not a folder; give the folder that holds those of the objects, lemon and so on."
-        )
-    files_by_trial: dict[str, dict[str, Path]] = {}
-    named_folders: list[tuple[str, Path]] = []
-    for place, _, names in walk(source):
-        present_names = [name for name in NAMES if name in names]
-        if not present_names:
-            continue
-        above, folder = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
-        label, trial = text(os.path.basename(above)), text(folder)  # noqa: PTH119
-        name = valid(f"{label}-{trial.removeprefix('exp_num_')}")
-        named_folders.append((name, Path(place)))
-        files_by_trial[name] = {f"{label}/{trial}/{file}": Path(place, file) for file in present_names}
-    paths.refuse_shared_names(named_folders)
-    if not files_by_trial:
-        raise TacpipeError(
-            f"{source} holds no trial: no folder in it has {', '.join(VIDEOS)}. Give the folder of the unpacked data set."
-        )
-    return dict(sorted(files_by_trial.items()))
+    return by_object(source, NAMES, "trial", example="lemon", described=tuple(VIDEOS), prefix="exp_num_")
 
 
 @stage(version=1, discover=discover)

@@ -70,6 +70,38 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
     }
 
 
+def by_object(
+    source: Path, names: Sequence[str], noun: str, *, example: str, described: Sequence[str], prefix: str = ""
+) -> dict[str, dict[str, Path]]:
+    """Return the files of each folder ``OBJECT/FOLDER`` below ``source`` that has a file of ``names``, by recording name.
+
+    Recordings are named ``OBJECT-FOLDER``, without the ``prefix`` of folders; files keep their names from the object on.
+    ``noun``, ``example`` (an object) and ``described`` (some of ``names``) are for errors. Raises `TacpipeError` if
+    ``source`` is not a folder or holds none, `UsageError` if two share a name.
+    """
+    if not source.is_dir():
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds those of the objects, {example} and so on."
+        )
+    files_by_recording: dict[str, dict[str, Path]] = {}
+    named_folders: list[tuple[str, Path]] = []
+    for place, _, files in walk(source):
+        present_names = [name for name in names if name in files]
+        if present_names:
+            above, folder = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
+            label, folder = text(os.path.basename(above)), text(folder)  # noqa: PTH119
+            recording = valid(f"{label}-{folder.removeprefix(prefix)}")
+            named_folders.append((recording, Path(place)))
+            files_by_recording[recording] = {f"{label}/{folder}/{name}": Path(place, name) for name in present_names}
+    paths.refuse_shared_names(named_folders)
+    if not files_by_recording:
+        raise TacpipeError(
+            f"{source} holds no {noun}: no folder in it has {', '.join(described)}. Give the folder of the unpacked data "
+            f"set."
+        )
+    return dict(sorted(files_by_recording.items()))
+
+
 def require(files: Files, names: Sequence[str]) -> str:
     """Return the name of the trial's folder. Raises `TacpipeError` if one of the files ``names`` is missing."""
     folder = next((path.parent for path in files.values()), None)

@@ -7,7 +7,6 @@ closing (``tactile.tac``).
 
 from __future__ import annotations
 
-import os
 import re
 from collections import defaultdict
 from dataclasses import dataclass
@@ -15,11 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.datasets import paths
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.published import require, text, valid
+from tacpipe.formats.published import by_object, require
 from tacpipe.io import regular
-from tacpipe.io.files import walk
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins.constraints import NonNegativeFloat, Unit
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
@@ -57,29 +54,9 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     key may not depend on other recordings. Raises `TacpipeError` if ``source`` is not a folder, contains no grasp, or
     contains one twice.
     """
-    if not source.is_dir():
-        raise TacpipeError(
-            f"{source} is not a folder; give the folder that holds those of the objects, bleach and so on."
-        )
-    files_by_grasp: dict[str, dict[str, Path]] = {}
-    named_folders: list[tuple[str, Path]] = []
-    for place, _, names in walk(source):
-        present_names = [name for name in NAMES if name in names]
-        if not present_names:
-            continue
-        above, time_s = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
-        label, time_s = text(os.path.basename(above)), text(time_s)  # noqa: PTH119
-        files = {f"{label}/{time_s}/{name}": Path(place, name) for name in present_names}
-        name = valid(f"{label}-{time_s}")
-        named_folders.append((name, Path(place)))
-        files_by_grasp[name] = files
-    paths.refuse_shared_names(named_folders)
-    if not files_by_grasp:
-        raise TacpipeError(
-            f"{source} holds no grasp: no folder in it has {', '.join(NAMES)}. Give the folder of the unpacked data set."
-        )
+    files_by_grasp = by_object(source, NAMES, "grasp", example="bleach", described=NAMES)
     _add_twins(files_by_grasp)
-    return dict(sorted(files_by_grasp.items()))
+    return files_by_grasp
 
 
 @stage(version=2, discover=discover)

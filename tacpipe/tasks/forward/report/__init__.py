@@ -51,115 +51,107 @@ class ForwardReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return the skill by step and errors with channels in other units."""
-        return columns(context, comparison)
+        """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
+        steps, known_objects = _steps(context), _known(comparison.question)
+        unit = comparison.measure.unit
+
+        @functools.cache
+        def skills(row: ComparisonRow, group: str) -> Interval | None:
+            sums = skill.sums_of_row(row, steps, known_objects, group)
+            return skill.skill_intervals(sums) if sums else None
+
+        def squared(group: str) -> Callable[[ComparisonRow], Cell]:
+            return lambda row: number(
+                skill.mean_squared(skill.sums_of_row(row, _all_steps(context), known_objects, group))
+            )
+
+        def at(place: int) -> Callable[[ComparisonRow], Cell]:
+            return lambda row: skill.skill_cell(skills(row, "both"), place)
+
+        def windows(row: ComparisonRow) -> Cell:
+            counts: dict[str, int] = {}
+            for run in row.method.of(comparison.question):
+                errors = run.details.errors
+                for name, count, is_known in zip(errors.recordings, errors.windows, errors.known, strict=True):
+                    if known_objects is None or bool(is_known) == known_objects:
+                        counts[name] = max(int(count), counts.get(name, 0))
+            return Cell(f"{sum(counts.values()):,}", value=sum(counts.values()))
+
+        return [
+            *((f"skill over persistence t+{step}", at(place)) for place, step in enumerate(steps)),
+            (
+                "skill over persistence, channels standardised",
+                lambda row: skill.skill_cell(skills(row, "standard"), -1),
+            ),
+            (f"MSE ({unit}²)", squared("both")),
+            ("MSE (standardised)", squared("standard")),
+            ("windows", windows),
+        ]
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what forecasts have of their own."""
-        return folds(context)
+        if not context.comparisons:
+            return representations.representation_folds(context)
+        return [
+            *_ahead(context),
+            *_channels(context),
+            *_ablations(context),
+            *skill.band_folds(context),
+            *events.anticipation_folds(context),
+            *events.slip_folds(context),
+            *skill.situation_folds(context),
+            *events.live_folds(context),
+            *representations.representation_folds(context),
+            *figures.prediction_folds(context),
+            *figures.training_folds(context),
+            *figures.single_run_folds(context),
+        ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about the numbers."""
-        return caveats(context)
+        """Return what must be known about these numbers."""
+        runs = [run.details for run in context.runs]
+        known_by_recording: dict[str, set[bool]] = {}
+        values: dict[str, set[Any]] = {}
+        for run in runs:
+            for name, setting_values in zip(run.errors.recordings, run.errors.known, strict=True):
+                known_by_recording.setdefault(name, set()).add(bool(setting_values))
+            for name in SETTINGS:
+                if run.config["params"].get(name) is not None:
+                    values.setdefault(name, set()).add(run.config["params"][name])
+        settings = "; ".join(
+            f"{name} {', '.join(map(str, sorted(setting_values, key=str)))}" for name, setting_values in values.items()
+        )
+        counts = [run.metrics.get("counts", {}) for run in runs[:1]]
+        mixed = "Objects of some recordings are known to one run and unseen to another."
+        effective = [
+            f"{setting_values['windows']:,} windows overlap and are worth about {setting_values['effective_windows']:,}"
+            for setting_values in counts
+            if "windows" in setting_values
+        ]
+        return [
+            f"Settings: {settings}." if settings else "",
+            *_look_ahead(context),
+            "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
+            "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before "
+            "it is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
+            f"In the first run, {effective[0]}." if effective else "",
+            mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
+            "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it "
+            "perfectly."
+            if any(run.actions == "planned" for run in runs)
+            else "",
+            "; ".join(f"{figures.predictor_title(name)}: {figures.EXPLAINED[name]}" for name in _predictors(context)) + ".",
+        ]  # fmt: skip
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
-        return run_columns(run)
+        epochs = len(run.details.history)
+        return {"epochs": str(epochs) if epochs else NONE}
 
 
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
-
-
-def folds(context: Context) -> list[Fold]:
-    """Return what forecasts have of their own."""
-    if not context.comparisons:
-        return representations.representation_folds(context)
-    return [
-        *_ahead(context),
-        *_channels(context),
-        *_ablations(context),
-        *skill.band_folds(context),
-        *events.anticipation_folds(context),
-        *events.slip_folds(context),
-        *skill.situation_folds(context),
-        *events.live_folds(context),
-        *representations.representation_folds(context),
-        *figures.prediction_folds(context),
-        *figures.training_folds(context),
-        *figures.single_run_folds(context),
-    ]
-
-
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
-    """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
-    steps, known_objects = _steps(context), _known(comparison.question)
-    unit = comparison.measure.unit
-
-    @functools.cache
-    def skills(row: ComparisonRow, group: str) -> Interval | None:
-        sums = skill.sums_of_row(row, steps, known_objects, group)
-        return skill.skill_intervals(sums) if sums else None
-
-    def squared(group: str) -> Callable[[ComparisonRow], Cell]:
-        return lambda row: number(skill.mean_squared(skill.sums_of_row(row, _all_steps(context), known_objects, group)))
-
-    def at(place: int) -> Callable[[ComparisonRow], Cell]:
-        return lambda row: skill.skill_cell(skills(row, "both"), place)
-
-    def windows(row: ComparisonRow) -> Cell:
-        counts: dict[str, int] = {}
-        for run in row.method.of(comparison.question):
-            errors = run.details.errors
-            for name, count, is_known in zip(errors.recordings, errors.windows, errors.known, strict=True):
-                if known_objects is None or bool(is_known) == known_objects:
-                    counts[name] = max(int(count), counts.get(name, 0))
-        return Cell(f"{sum(counts.values()):,}", value=sum(counts.values()))
-
-    return [
-        *((f"skill over persistence t+{step}", at(place)) for place, step in enumerate(steps)),
-        ("skill over persistence, channels standardised", lambda row: skill.skill_cell(skills(row, "standard"), -1)),
-        (f"MSE ({unit}²)", squared("both")),
-        ("MSE (standardised)", squared("standard")),
-        ("windows", windows),
-    ]
-
-
-def caveats(context: Context) -> list[str]:
-    """Return what must be known about these numbers."""
-    runs = [run.details for run in context.runs]
-    known_by_recording: dict[str, set[bool]] = {}
-    values: dict[str, set[Any]] = {}
-    for run in runs:
-        for name, setting_values in zip(run.errors.recordings, run.errors.known, strict=True):
-            known_by_recording.setdefault(name, set()).add(bool(setting_values))
-        for name in SETTINGS:
-            if run.config["params"].get(name) is not None:
-                values.setdefault(name, set()).add(run.config["params"][name])
-    settings = "; ".join(
-        f"{name} {', '.join(map(str, sorted(setting_values, key=str)))}" for name, setting_values in values.items()
-    )
-    counts = [run.metrics.get("counts", {}) for run in runs[:1]]
-    mixed = "Objects of some recordings are known to one run and unseen to another."
-    effective = [
-        f"{setting_values['windows']:,} windows overlap and are worth about {setting_values['effective_windows']:,}"
-        for setting_values in counts
-        if "windows" in setting_values
-    ]
-    return [
-        f"Settings: {settings}." if settings else "",
-        *_look_ahead(context),
-        "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
-        "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before it "
-        "is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
-        f"In the first run, {effective[0]}." if effective else "",
-        mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
-        "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
-        if any(run.actions == "planned" for run in runs)
-        else "",
-        "; ".join(f"{figures.predictor_title(name)}: {figures.EXPLAINED[name]}" for name in _predictors(context)) + ".",
-    ]  # fmt: skip
 
 
 def _look_ahead(context: Context) -> list[str]:
@@ -174,12 +166,6 @@ def _look_ahead(context: Context) -> list[str]:
         note if len(names) == len(context.methods) else f"{blocks.listed(names)}: {note}"
         for note, names in methods.items()
     ]
-
-
-def run_columns(run: ComparedRun) -> dict[str, Cell | str]:
-    """Return more columns of the table of runs."""
-    epochs = len(run.details.history)
-    return {"epochs": str(epochs) if epochs else NONE}
 
 
 def _ahead(context: Context) -> list[Fold]:

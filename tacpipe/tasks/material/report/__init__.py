@@ -45,15 +45,63 @@ class MaterialReport(TaskReport):
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return counts, the last epoch, the skill over the mean level and the numbers of the paper."""
-        return columns(context, comparison)
+        runs = [run for run in context.runs if comparison.question in run.questions]
+        sensors = (
+            sensor for run in runs for sensor in run.details.sensors if question_on(run, sensor) == comparison.question
+        )
+        sensor = next(sensors)
+
+        def runs_of(row: ComparisonRow) -> list[ComparedRun]:
+            return row.method.of(comparison.question)
+
+        def named_right(row: ComparisonRow) -> Cell:
+            counted = row.predictor != headline.CHANCE  # chance names no material
+            return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
+
+        def last(row: ComparisonRow) -> Cell:
+            counted = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
+            return Cell(scores.format_percent(counted.fraction), value=counted.fraction) if counted else Cell(NONE)
+
+        def paper(row: ComparisonRow) -> Cell:
+            value = joint.ACCURACIES.get(row.family, {}).get(sensor) if row.kind == "model" else None
+            return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
+
+        more_columns: list[tuple[str, Callable[[ComparisonRow], Cell]]] = [
+            ("slides named right", named_right),
+            (
+                "skill over the mean level",
+                lambda row: blocks.number(scores.level_skill(runs_of(row), sensor, row.predictor), 3),
+            ),
+        ]
+        if any(LAST in run.details.predictions.predicted for run in runs):
+            more_columns.append(("last epoch (%)", last))
+        return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what materials have of their own."""
-        return folds(context)
+        methods = context.methods
+        return [
+            *blocks.fold(
+                "Joint learning",
+                *map(SmallPrint, joint.joint_effects(methods)),
+                joint.difference_table(methods),
+                joint.swap_table(methods),
+                SmallPrint(PAIRED),
+            ),
+            *blocks.fold("Fewer slides of one sensor", *joint.reduction_tables(methods)),
+            *figures.few_slides_folds(methods),
+            *joint.zero_shot_folds(methods),
+            *figures.confusion_folds(context),
+            *probabilities.probability_folds(methods),
+            *figures.latent_folds(methods),
+            *figures.training_folds(methods),
+            *figures.profile_folds(context.others),
+        ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about the numbers."""
-        return caveats(context)
+        """Return what must be known about these numbers."""
+        methods = context.methods
+        return [_basis(methods), _pooled(methods), scores.caution(methods), _not_run(methods)] if methods else []
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
@@ -65,69 +113,6 @@ PAIRED = (
     "slides anew. McNemar's test takes a slide for right where at least half of the runs are; the t test pairs accuracies "
     "of the same fold."
 )
-
-
-def folds(context: Context) -> list[Fold]:
-    """Return what materials have of their own."""
-    methods = context.methods
-    return [
-        *blocks.fold(
-            "Joint learning",
-            *map(SmallPrint, joint.joint_effects(methods)),
-            joint.difference_table(methods),
-            joint.swap_table(methods),
-            SmallPrint(PAIRED),
-        ),
-        *blocks.fold("Fewer slides of one sensor", *joint.reduction_tables(methods)),
-        *figures.few_slides_folds(methods),
-        *joint.zero_shot_folds(methods),
-        *figures.confusion_folds(context),
-        *probabilities.probability_folds(methods),
-        *figures.latent_folds(methods),
-        *figures.training_folds(methods),
-        *figures.profile_folds(context.others),
-    ]
-
-
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
-    """Return more columns of the table of all methods: counts, the last epoch, skill over the mean level, the paper's."""
-    runs = [run for run in context.runs if comparison.question in run.questions]
-    sensors = (
-        sensor for run in runs for sensor in run.details.sensors if question_on(run, sensor) == comparison.question
-    )
-    sensor = next(sensors)
-
-    def runs_of(row: ComparisonRow) -> list[ComparedRun]:
-        return row.method.of(comparison.question)
-
-    def named_right(row: ComparisonRow) -> Cell:
-        counted = row.predictor != headline.CHANCE  # chance names no material
-        return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
-
-    def last(row: ComparisonRow) -> Cell:
-        counted = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
-        return Cell(scores.format_percent(counted.fraction), value=counted.fraction) if counted else Cell(NONE)
-
-    def paper(row: ComparisonRow) -> Cell:
-        value = joint.ACCURACIES.get(row.family, {}).get(sensor) if row.kind == "model" else None
-        return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
-
-    more_columns: list[tuple[str, Callable[[ComparisonRow], Cell]]] = [
-        ("slides named right", named_right),
-        (
-            "skill over the mean level",
-            lambda row: blocks.number(scores.level_skill(runs_of(row), sensor, row.predictor), 3),
-        ),
-    ]
-    if any(LAST in run.details.predictions.predicted for run in runs):
-        more_columns.append(("last epoch (%)", last))
-    return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
-
-
-def caveats(context: Context) -> list[str]:
-    """Return what must be known about these numbers."""
-    methods = context.methods
-    return [_basis(methods), _pooled(methods), scores.caution(methods), _not_run(methods)] if methods else []
 
 
 def _pooled(methods: Sequence[Method]) -> str:

@@ -51,23 +51,100 @@ class TouchReport(TaskReport):
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return R², skill over the constant, mean absolute error and batch means."""
-        return columns(context, comparison)
+        target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
+        known_objects = comparison.question.part.startswith(headlines.PARTS[True])
+
+        @functools.cache
+        def score(row: ComparisonRow) -> Score | None:
+            runs = [run.details.predictions for run in row.method.of(comparison.question)]
+            return predictions.score(runs, target, known_objects, row.predictor)
+
+        def cell(value: Callable[[Score], Cell]) -> Callable[[ComparisonRow], Cell]:
+            return lambda row: value(found) if (found := score(row)) else Cell(NONE)
+
+        return [
+            (
+                "R²",
+                cell(
+                    lambda scored: Cell(blocks.fixed(scored.r2, 2), value=None if math.isnan(scored.r2) else scored.r2)
+                ),
+            ),
+            ("skill over the constant", cell(lambda scored: blocks.interval(*scored.skill))),
+            ("RMSE over runs", cell(lambda scored: blocks.with_sd(scored.each.mean, scored.each.sd))),
+            ("batch mean", cell(lambda scored: Cell(blocks.fixed(scored.batch_mean, 4), value=scored.batch_mean))),
+            ("MAE (counts)", cell(lambda scored: blocks.number(predictions.to_counts(scored.target, scored.mae), 3))),
+        ]
 
     def sentence(self, context: Context) -> tuple[str, str]:
-        """Return how the best method compares, and whether any is better than the baselines on novel objects."""
-        return sentence(context)
+        """Return the general sentence, and whether any method is better than the baselines on novel objects."""
+        text, verdict = screen.sentence(context)
+        novel = [comparison for comparison in context.comparisons if comparison.question.part.startswith("novel")]
+        better = [
+            comparison for comparison in novel if any(row.gain.verdict == headline.BETTER for row in comparison.models)
+        ]
+        if novel and not better:
+            text = f"{text.removesuffix('.')}: {NO_EVIDENCE}."
+        return text, verdict
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what touch has of its own."""
-        return folds(context)
+        methods = context.methods
+        if not methods:
+            return figures.cloud_folds(context.others, {})
+        parted = grouped_by_split(methods)
+        first = (context.winner(next(iter(context.parts))) if context.parts else None) or default_method(parted[0])
+        chosen = {
+            grasp.recording: f"{grasp.place} by error" for grasp in figures.choose_grasps(first.details[0].predictions)
+        }
+        folds: list[Fold] = []
+        for group in parted:
+            result = group[0].details[0]
+            place = f": {describe_split(result.split, result.simulated)}" if len(parted) > 1 else ""
+            folds += blocks.fold(f"By object{place}", *tables_by_object(group))
+            drawn = figures.loss_charts(group)
+            folds += blocks.fold(f"Training{place}", Charts(drawn)) if drawn else []
+        published = all(grasp.published for grasp in methods)
+        paper = [*setting_tables(methods), *generalisation_tables(methods), *figures.figure_8(methods)]
+        return [
+            *figures.pressure_folds(first),
+            *figures.electrode_folds(first),
+            *quantiles.quantile_folds(methods),
+            *figures.cloud_folds(context.others, chosen),
+            *blocks.fold("The paper's tables and figures" if published else "What settings change", *paper),
+            *folds,
+        ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about the numbers."""
-        return caveats(context)
+        """Return what must be known about these numbers."""
+        methods = context.methods
+        if not methods:
+            return []
+        mixed = MIXED if len({method.simulated for method in methods}) > 1 else ""
+        return [
+            POOLED,
+            *map(describe_training, grouped_by_split(methods)),
+            caution(methods),
+            mixed,
+        ]
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
-        return run_columns(run)
+        trained = run.details.trained
+        rsquared = []
+        for known_objects in (True, False):
+            for target in run.details.predictions.targets:
+                scored = predictions.score([run.details.predictions], target, known_objects)
+                rsquared += (
+                    [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(scored.r2, 2)}"]
+                    if scored
+                    else []
+                )
+        return {
+            "split": methods.split_name(run.details.split),
+            "trained on": NONE if trained is None else f"{trained:,}",
+            "epochs": str(len(run.details.history) or NONE),
+            "R²": Cell("; ".join(rsquared) or NONE),
+        }
 
 
 POOLED = (
@@ -78,103 +155,3 @@ POOLED = (
 )
 NO_EVIDENCE = "there is no evidence of generalisation"
 MIXED = "What is marked simulated is not evidence about a real sensor."
-
-
-def sentence(context: Context) -> tuple[str, str]:
-    """Return the general sentence, and where no method is better than the baselines on novel objects, that this is so."""
-    text, verdict = screen.sentence(context)
-    novel = [comparison for comparison in context.comparisons if comparison.question.part.startswith("novel")]
-    better = [
-        comparison for comparison in novel if any(row.gain.verdict == headline.BETTER for row in comparison.models)
-    ]
-    if novel and not better:
-        text = f"{text.removesuffix('.')}: {NO_EVIDENCE}."
-    return text, verdict
-
-
-def folds(context: Context) -> list[Fold]:
-    """Return what touch has of its own."""
-    methods = context.methods
-    if not methods:
-        return figures.cloud_folds(context.others, {})
-    parted = grouped_by_split(methods)
-    first = (context.winner(next(iter(context.parts))) if context.parts else None) or default_method(parted[0])
-    chosen = {
-        grasp.recording: f"{grasp.place} by error" for grasp in figures.choose_grasps(first.details[0].predictions)
-    }
-    folds: list[Fold] = []
-    for group in parted:
-        result = group[0].details[0]
-        place = f": {describe_split(result.split, result.simulated)}" if len(parted) > 1 else ""
-        folds += blocks.fold(f"By object{place}", *tables_by_object(group))
-        drawn = figures.loss_charts(group)
-        folds += blocks.fold(f"Training{place}", Charts(drawn)) if drawn else []
-    published = all(grasp.published for grasp in methods)
-    paper = [*setting_tables(methods), *generalisation_tables(methods), *figures.figure_8(methods)]
-    return [
-        *figures.pressure_folds(first),
-        *figures.electrode_folds(first),
-        *quantiles.quantile_folds(methods),
-        *figures.cloud_folds(context.others, chosen),
-        *blocks.fold("The paper's tables and figures" if published else "What settings change", *paper),
-        *folds,
-    ]
-
-
-def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[ComparisonRow], Cell]]]:
-    """Return more columns of the table of all methods: R², skill over the constant, mean absolute error and batch means."""
-    target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
-    known_objects = comparison.question.part.startswith(headlines.PARTS[True])
-
-    @functools.cache
-    def score(row: ComparisonRow) -> Score | None:
-        runs = [run.details.predictions for run in row.method.of(comparison.question)]
-        return predictions.score(runs, target, known_objects, row.predictor)
-
-    def cell(value: Callable[[Score], Cell]) -> Callable[[ComparisonRow], Cell]:
-        return lambda row: value(found) if (found := score(row)) else Cell(NONE)
-
-    return [
-        (
-            "R²",
-            cell(lambda scored: Cell(blocks.fixed(scored.r2, 2), value=None if math.isnan(scored.r2) else scored.r2)),
-        ),
-        ("skill over the constant", cell(lambda scored: blocks.interval(*scored.skill))),
-        ("RMSE over runs", cell(lambda scored: blocks.with_sd(scored.each.mean, scored.each.sd))),
-        ("batch mean", cell(lambda scored: Cell(blocks.fixed(scored.batch_mean, 4), value=scored.batch_mean))),
-        ("MAE (counts)", cell(lambda scored: blocks.number(predictions.to_counts(scored.target, scored.mae), 3))),
-    ]
-
-
-def caveats(context: Context) -> list[str]:
-    """Return what must be known about these numbers."""
-    methods = context.methods
-    if not methods:
-        return []
-    mixed = MIXED if len({method.simulated for method in methods}) > 1 else ""
-    return [
-        POOLED,
-        *map(describe_training, grouped_by_split(methods)),
-        caution(methods),
-        mixed,
-    ]
-
-
-def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
-    """Return more columns of the table of runs."""
-    trained = run.details.trained
-    rsquared = []
-    for known_objects in (True, False):
-        for target in run.details.predictions.targets:
-            scored = predictions.score([run.details.predictions], target, known_objects)
-            rsquared += (
-                [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(scored.r2, 2)}"]
-                if scored
-                else []
-            )
-    return {
-        "split": methods.split_name(run.details.split),
-        "trained on": NONE if trained is None else f"{trained:,}",
-        "epochs": str(len(run.details.history) or NONE),
-        "R²": Cell("; ".join(rsquared) or NONE),
-    }
