@@ -122,6 +122,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "acquire can.toml -o {o}": "devices",
     "acquire camera.toml -o {o}": "clouds",
     "acquire lsl.toml -o {o}": "lsl",
+    "sensors emulate gel.toml -o {o} --duration-s 1": "video",
     "sensors probe lsl:wrist": "lsl",
     "sensors probe": "devices",
     "sensors probe /dev/null": "devices",
@@ -138,6 +139,7 @@ RIGS = {
     "can": ("icub-skin", "can:virtual:none"),
     "camera": ("clouds", "camera:0"),
     "lsl": ("lsl", "lsl:wrist"),
+    "gel": ("camera", "mjpeg:http://127.0.0.1:1/stream"),
 }
 INPUTS = (
     "simulate material --trials 2 -o data/touched",

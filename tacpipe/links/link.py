@@ -24,6 +24,8 @@ SCHEMES = {
     "can": "can:socketcan:can0",
     "folder": "folder:/data/clouds",
     "camera": "camera:0",
+    "v4l2": "v4l2:/dev/video0",
+    "mjpeg": "mjpeg:http://192.168.1.20:8080/stream",
     "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
 LONGEST = 4096  # characters of a place, the limit of a path

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from tacpipe.errors import DeviceError
-from tacpipe.links import camera, can, folder, hid, lsl, network, ports, websocket
+from tacpipe.links import camera, can, folder, hid, lsl, mjpeg, network, ports, v4l2, websocket
 from tacpipe.links.link import Address, Arrived, Link
 from tacpipe.sensors.sensor import Ask, Dialogue, Sensor
 
@@ -21,6 +21,8 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
     "folder": folder.open_folder,
     "camera": camera.open_camera,
     "lsl": lsl.open_lsl,
+    "mjpeg": mjpeg.open_mjpeg,
+    "v4l2": v4l2.open_v4l2,
 }
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.errors import DeviceError, TacpipeError
-from tacpipe.links import ports
+from tacpipe.links import ports, v4l2
 from tacpipe.links.link import Address, Arrived, Link, parse
 from tacpipe.links.opening import open_link, run_dialogue
 from tacpipe.plugins import params, registry
@@ -21,7 +21,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Dialogue, Sensor, SerialLine
 
 # Kinds of links whose entries are packets, whose size is evidence too
-PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl")
+PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl", "v4l2", "mjpeg")
 MOST = 1 << 18  # number of bytes that are examined
 CERTAIN = 0.8  # fraction of the bytes beyond chance above which there is no doubt
 POSSIBLE = 0.2  # smallest fraction that is evidence for a driver
@@ -144,7 +144,7 @@ def _count_frames(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
 def _first(data: Chunks) -> Chunks:
     if len(data.data) <= MOST:
         return data
-    count = max(1, int(np.searchsorted(np.cumsum(data.size), MOST, side="right")))
+    count = max(FEWEST + 1, int(np.searchsorted(np.cumsum(data.size), MOST, side="right")))
     return Chunks(data.t_ns[:count], data.size[:count], data.data[: int(data.size[:count].sum())])
 
 
@@ -312,6 +312,6 @@ def _with_short_timeouts(dialogue: Dialogue) -> Dialogue:
 
 
 def list_addresses() -> Iterator[tuple[Address, str]]:
-    """Yield the address and the USB identity of each serial port and HID device."""
-    for port in [*ports.serial_ports(), *ports.hid_ports()]:
+    """Yield the address and the USB identity of each serial port, HID device and camera."""
+    for port in [*ports.serial_ports(), *ports.hid_ports(), *v4l2.cameras()]:
         yield parse(port.address), port.usb_id

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from tacpipe.sensors import lines_guess, lsl
+from tacpipe.sensors import camera, lines_guess, lsl
 from tacpipe.sensors.framing import Chunks
 
 Options = dict[str, Any]
@@ -34,6 +34,8 @@ def of(kind: str, data: Chunks) -> list[Options]:
         return lines_guess.of(data)
     if kind == "lsl":
         return lsl.options(data)
+    if kind == "camera":
+        return camera.options(data)
     return VARIANTS[kind](data.data) if kind in VARIANTS else [{}]
 
 

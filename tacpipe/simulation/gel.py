@@ -9,7 +9,6 @@ is imported to encode.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -18,10 +17,11 @@ import numpy as np
 
 from tacpipe.arrays import Bytes, Floats, Times
 from tacpipe.channels import schema
+from tacpipe.plugins import extras
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import faults, pick_and_move
 from tacpipe.simulation.pick_and_move import PickRig, PickScene
-from tacpipe.video.encoding import encode_images, jpeg_format
+from tacpipe.video.encoding import ENCODED_BY, encode_images, jpeg_format
 from tacpipe.video.files import packet_stream
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ LIGHTS = np.array(
 )  # direction from which each colour comes (colour, xy)
 DENT_N, SHADE = 1 / 8.0, 900.0  # dent in image units per newton, and grey levels per unit of slope
 NOISE = 1.5  # standard deviation of a pixel, grey levels
+NOISE_IMAGES, NOISE_STEP = 4, 256_889  # noise is drawn for so many images; distance of its parts, a prime
 CAMERA_STREAM = 2  # seeds of the cameras, next to those of the rig's devices
 
 
@@ -80,26 +81,41 @@ def gel_states(scene: PickScene, finger: int, true_ns: Times) -> GelStates:
     return GelStates(moved_m * [1, -1] * PX_M, total, centre, scene.skins[finger].sigma_m * PX_M)
 
 
-def render(states: GelStates, row: int, rng: np.random.Generator, noise_scale: float = 1.0) -> Bytes:
-    """Return the image of one row of ``states``, uint8 (height, width, rgb)."""
-    x, y = np.arange(WIDTH_PX, dtype=np.float32), np.arange(HEIGHT_PX, dtype=np.float32)
-    along_x, along_y = (
-        (axis - centre) / states.sigma_px for axis, centre in zip((x, y), states.centre_px[row], strict=True)
-    )
-    dent = DENT_N * states.force_n[row] * np.outer(np.exp(-(along_y**2) / 2), np.exp(-(along_x**2) / 2))
-    slopes = np.stack([-dent * along_x, -dent * along_y[:, None]], axis=-1) / states.sigma_px  # (height, width, xy)
-    fall_off = 1.15 - 0.3 * x / WIDTH_PX  # the gel is brighter at the left
-    image = BRIGHTNESS * fall_off[:, None] + SHADE * (slopes.astype(np.float32) @ LIGHTS.T)  # (height, width, rgb)
-    for marker_x, marker_y in rest_places_px() + states.displacement_px[row]:
-        left, top = max(0, round(marker_x) - PATCH_PX), max(0, round(marker_y) - PATCH_PX)
-        columns = x[left : max(0, round(marker_x) + PATCH_PX + 1)]
-        rows = y[top : max(0, round(marker_y) + PATCH_PX + 1)]
-        distance = np.hypot(columns - marker_x, (rows - marker_y)[:, None])
-        covered = 1 / (1 + np.exp((distance - MARKER_PX) / EDGE_PX))
-        image[top : top + len(rows), left : left + len(columns)] *= (1 - MARKER_DARKNESS * covered)[..., None]
-    image += np.float32(noise_scale * NOISE) * rng.standard_normal(image.shape, np.float32)
-    pixels: Bytes = np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8)
-    return pixels
+class GelCamera:
+    """Draws images. The noise of each is a part of random numbers that are drawn once, other parts in turn."""
+
+    def __init__(self, rng: np.random.Generator, noise_scale: float = 1.0) -> None:
+        self._size = HEIGHT_PX * WIDTH_PX * len(BRIGHTNESS)
+        self._noise = noise_scale * NOISE * rng.standard_normal(NOISE_IMAGES * self._size).astype(np.float32)
+
+    def render(self, states: GelStates, row: int, number: int) -> Bytes:
+        """Return the image of one row of ``states``, uint8 (height, width, rgb). ``number`` chooses its noise."""
+        x, y = np.arange(WIDTH_PX), np.arange(HEIGHT_PX)
+        along_x, along_y = (
+            (axis - centre) / states.sigma_px for axis, centre in zip((x, y), states.centre_px[row], strict=True)
+        )
+        bell_x, bell_y = np.exp(-(along_x**2) / 2), np.exp(-(along_y**2) / 2)
+        shade = (
+            -SHADE * DENT_N * states.force_n[row] / states.sigma_px
+        )  # the dent's slope is this, its offset and its bells
+        fall_off = 1.15 - 0.3 * x / WIDTH_PX  # the gel is brighter at the left
+        rows = np.column_stack([np.ones(HEIGHT_PX), shade * bell_y, shade * along_y * bell_y])  # (height, 3)
+        columns = np.stack(
+            [np.outer(fall_off, BRIGHTNESS), np.outer(along_x * bell_x, LIGHTS[:, 0]), np.outer(bell_x, LIGHTS[:, 1])]
+        )  # (3, width, rgb)
+        image = (rows.astype(np.float32) @ columns.reshape(3, -1).astype(np.float32)).reshape(HEIGHT_PX, WIDTH_PX, -1)
+        for marker_x, marker_y in rest_places_px() + states.displacement_px[row]:
+            left, top = max(0, round(marker_x) - PATCH_PX), max(0, round(marker_y) - PATCH_PX)
+            near_x = x[left : max(0, round(marker_x) + PATCH_PX + 1)]
+            near_y = y[top : max(0, round(marker_y) + PATCH_PX + 1)]
+            distance = np.hypot(near_x - marker_x, (near_y - marker_y)[:, None])
+            covered = 1 / (1 + np.exp((distance - MARKER_PX) / EDGE_PX))
+            patch = image[top : top + len(near_y), left : left + len(near_x)]
+            patch *= (1 - MARKER_DARKNESS * covered)[..., None]
+        first = number * NOISE_STEP % (len(self._noise) - self._size)
+        image += self._noise[first : first + self._size].reshape(image.shape)
+        pixels: Bytes = np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8)
+        return pixels
 
 
 @dataclass(frozen=True)
@@ -122,6 +138,7 @@ def simulate_trial(seed: int, index: int, rig: GelRig = GelRig()) -> RecordingOu
     The same seed, index and rig give the same values. Raises `TacpipeError` for a trial too short to lift anything,
     `MissingModuleError` without PyAV.
     """
+    extras.require(ENCODED_BY, "av")
     pick_rig = PickRig(
         duration_s=rig.duration_s,
         effort=rig.effort,
@@ -152,13 +169,12 @@ def _video(
     """Return the frames of a camera, drawn and encoded as they are taken."""
     video_format = jpeg_format(WIDTH_PX, HEIGHT_PX, Fraction(rig.frame_rate_hz))
 
-    def images() -> Iterator[Bytes]:
-        for row in range(len(t_ns)):
-            yield render(states, row, rng, rig.noise_scale)
+    camera = GelCamera(rng, rig.noise_scale)
+    images = (camera.render(states, row, row) for row in range(len(t_ns)))
 
     pts = samples.true_ns // 1000
     clocks = (pts, pts, np.ones(len(pts), bool))
-    return packet_stream(video_format, encode_images(video_format, images()), clocks, t_ns, samples.seq, None)
+    return packet_stream(video_format, encode_images(video_format, images), clocks, t_ns, samples.seq, None)
 
 
 def _truth(name: str, states: GelStates, true_ns: Times) -> pa.Table:

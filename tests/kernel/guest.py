@@ -1,7 +1,7 @@
 """Inside the virtual machine, make a HID device with the kernel's uhid and read it through `open_link`.
 
 Prints one line, ``RESULT`` and JSON. Run as ``guest.py board`` it is the device: it reads commands as
-`tests/links/hid_board.py` does.
+`tests/links/hid_board.py` does. Run as ``guest.py camera`` it reads the kernel's ``vivid`` camera.
 """
 
 from __future__ import annotations
@@ -118,6 +118,89 @@ def reader() -> dict[str, Any]:
     return result
 
 
+SIZE_PX, CAMERA_HZ, FRAMES, GAIN_VALUE = (320, 180), 10, 40, 77
+DROPPED, DISCONNECT = 0xF0F000 + 64, 0xF0F000 + 65  # controls of vivid
+
+
+def camera() -> dict[str, Any]:
+    """Return what a recorder of vivid's camera sees."""
+    from dataclasses import replace
+
+    from tacpipe.errors import DeviceError
+    from tacpipe.links import v4l2
+    from tacpipe.links.link import LinkLostError, parse
+    from tacpipe.links.opening import open_link
+    from tacpipe.recording.reading import LinkReader
+    from tacpipe.sensors import variants
+    from tacpipe.sensors.camera import Camera, read_shape, unpack_frame, unpack_settings
+    from tacpipe.sensors.framing import Chunks
+
+    until = time.monotonic() + 30
+    while not (ports := v4l2.cameras()) and time.monotonic() < until:
+        time.sleep(0.1)
+    address = parse(ports[0].address)
+    result: dict[str, Any] = {"kernel": os.uname().release, "ports": [str(port) for port in ports]}
+    width_px, height_px = SIZE_PX
+    sensor = Camera(width_px=width_px, height_px=height_px, rate_hz=CAMERA_HZ, encoding="yuyv", gain=GAIN_VALUE)
+    refused = {}
+    for name, refused_sensor in (
+        ("mjpeg", replace(sensor, encoding="mjpeg")),
+        ("size", replace(sensor, width_px=333)),
+        ("led", replace(sensor, led=3)),
+    ):
+        try:
+            open_link(address, refused_sensor, "gel").close()
+        except Exception as error:
+            refused[name] = f"{type(error).__name__}: {error}"
+    link = open_link(address, sensor, "gel")
+    try:
+        open_link(address, sensor, "other").close()
+    except DeviceError as error:
+        refused["busy"] = str(error)
+    result["refused"] = refused
+
+    def read(count: int) -> list[tuple[int, bytes]]:
+        entries: list[tuple[int, bytes]] = []
+        while len(entries) < count:
+            entries += link.read(5.0)
+        return entries
+
+    busy, start_s = time.process_time(), time.monotonic()
+    entries = read(FRAMES + 1)
+    result["busy_share"] = round((time.process_time() - busy) / (time.monotonic() - start_s), 3)
+    result["settings"] = unpack_settings(entries[0][1])
+    result["options"] = variants.of("camera", Chunks.of(entries))[0]
+    frames = [frame for _, packet in entries if (frame := unpack_frame(packet)) is not None]
+    result["numbers"] = [frame.number for frame in frames]
+    result["stamps_ns"] = [t_ns for t_ns, _ in entries[1:]]
+    result["now_ns"] = time.monotonic_ns()
+    result["shapes"] = sorted({str(read_shape(frame.content)) for frame in frames})
+
+    complete = Camera(**result["options"])
+    reading = LinkReader(complete)
+    batches = [reading.feed(Chunks.of(entries))]
+    controls = v4l2.V4l2Device(address.place)
+    controls.write_control(DROPPED, 50)
+    batches.append(reading.feed(Chunks.of(read(FRAMES))))
+    controls.write_control(DROPPED, 0)
+    time.sleep(3.0)  # more frames come than the kernel has buffers for
+    batches.append(reading.feed(Chunks.of(read(FRAMES))))
+    batches.append(reading.finish())
+    numbers = [int(number) for batch in batches if batch.seq is not None for number in batch.seq]
+    result["skipped"] = numbers[-1] - numbers[0] + 1 - len(numbers)
+    result["lost"] = reading.lost
+
+    controls.write_control(DISCONNECT, 1)
+    try:
+        for _ in range(100):
+            link.read(0.1)
+        result["gone"] = ""
+    except LinkLostError as error:
+        result["gone"] = str(error)
+    link.close()
+    return result
+
+
 def _await_node() -> None:
     until = time.monotonic() + 30
     while not list(Path("/dev").glob("hidraw*")) and time.monotonic() < until:
@@ -131,5 +214,7 @@ def _counters(received: list[tuple[int, bytes]]) -> list[int]:
 if __name__ == "__main__":
     if sys.argv[1:] == ["board"]:
         board()
+    elif sys.argv[1:] == ["camera"]:
+        print("RESULT", json.dumps(camera()), flush=True)
     else:
         print("RESULT", json.dumps(reader()), flush=True)

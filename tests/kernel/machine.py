@@ -16,7 +16,8 @@ MODULES = (
     "9p",
     "hid_generic",
     "uhid",
-)  # The machine needs these modules for its root, and for HID devices.
+    "vivid",
+)  # The machine needs these modules for its root, for HID devices, and for a camera that is none.
 BOOT_S = 300
 TRAILER = "TRAILER!!!"
 INIT = """#!/bin/busybox sh

@@ -145,8 +145,12 @@ def rows(samples: Samples) -> list[bytes]:
 def _bits(values: Sequence[AnyArray]) -> Bytes:
     if not len(values[0]):
         return np.zeros((0, 0), dtype=np.uint8)
-    values = [block.astype("U64") if block.dtype.kind == "O" else block for block in values]
+    values = [np.vectorize(_text)(block).astype("U64") if block.dtype.kind == "O" else block for block in values]
     return np.hstack([np.ascontiguousarray(block).view(np.uint8).reshape(len(block), -1) for block in values])
+
+
+def _text(value: str | bytes) -> str:
+    return value.decode("latin-1") if isinstance(value, bytes) else value
 
 
 def _counted(modulus: int | None, step: int, count: int) -> Int64s | None:
@@ -204,6 +208,16 @@ def _one_part_at_a_time(columns: Columns, sensor: Sensor) -> Columns:
     return columns
 
 
+def _images(columns: Columns, sensor: Sensor) -> Columns:
+    """Return frames with the heads and ends of JPEG images, each with a text of its own, one microsecond apart."""
+    head = bytes.fromhex("ffc000110800f0014003012100021101031101")  # 320 x 240 pixels, 4:2:2
+    count = len(columns["packet"])
+    packets = np.empty(count, object)
+    packets[:] = [b"\xff\xd8\xff\xfe\x00\x08" + b"%06d" % row + head + b"\xff\xd9" for row in range(count)]
+    t_us = np.arange(1, count + 1)
+    return {"packet": packets, "pts": t_us, "dts": t_us, "key_frame": np.ones(count, bool)}
+
+
 TEXT = "word"
 LIMITS: dict[str, Limits] = {  # Limits by the start of a field's name, where a device uses less than the type's range.
     "biotac": {"": (0, 4095)},
@@ -213,6 +227,7 @@ LIMITS: dict[str, Limits] = {  # Limits by the start of a field's name, where a 
     "franka": {"errors": (0, (1 << 41) - 1), "last_errors": (0, (1 << 41) - 1)},
 }
 CONSTRAINED: dict[str, Callable[[Columns, Sensor], Columns]] = {
+    "camera": _images,
     "spacemouse": _one_part_at_a_time,
     "tap": _records,
     "teraranger": _each_once,

@@ -19,8 +19,11 @@ from tacpipe.sensors.spacemouse import StateFramer
 from tests.sensors import described, harm, made
 
 KINDS = list(registry.sensors())
+SIZE = {"width_px": 320, "height_px": 240, "pixel_format": "yuvj422p"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # settings that change a sensor's frames
     "biotac of three fingers": ("biotac", {"fingers": 3}),
+    "camera with the kernel's numbers": ("camera", {**SIZE, "stamps": "kernel", "rate_hz": 25}),
+    "camera with a server's clock": ("camera", {**SIZE, "stamps": "server"}),
     "contactile with slip": ("contactile", {"slip": True}),
     "icub-skin of the older configuration": ("icub-skin", {"old": True, "triangles": [0, 3]}),
     "lines of NMEA": (

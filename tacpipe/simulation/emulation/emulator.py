@@ -23,6 +23,7 @@ import numpy as np
 from tacpipe.errors import DeviceError
 from tacpipe.plugins import params
 from tacpipe.recording.rig import Rig, RigStream
+from tacpipe.sensors.camera import Camera
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation import faults as clocks
 from tacpipe.simulation import pick_and_move
@@ -33,7 +34,7 @@ from tacpipe.simulation.emulation.source import Sampled, SampleSource, Timing
 from tacpipe.simulation.emulation.transmission import FramePace, Transmission, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
-PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder")  # links that keep frames apart
+PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "mjpeg", "v4l2")  # links that keep frames apart
 
 
 def endpoint(stream: RigStream, folder: Path) -> Endpoint:
@@ -66,6 +67,10 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
         from tacpipe.simulation.emulation.endpoint import Folder
 
         return Folder(stream.sensor, folder / "files" / stream.name)
+    if scheme in ("mjpeg", "v4l2"):
+        from tacpipe.simulation.emulation.http_camera import HttpCamera
+
+        return HttpCamera(stream.sensor)
     if scheme == "hid":
         from tacpipe.simulation.emulation.hid import Hid
 
@@ -93,6 +98,7 @@ def _device(folder: Path, name: str) -> Path:
 LOOK_NS = 20_000_000  # period of checks for events without a descriptor
 FILL_S = 0.1  # period of checks whether to plan more frames
 MAX_WAIT_S = 0.02  # longest wait
+CAMERA_HZ = 25.0  # rate of cameras whose rig file states none
 UNPACED_HZ = 2.0  # rate of sensors that state none, such as clouds
 
 
@@ -182,7 +188,7 @@ class Emulator:
 
     def _transmission(self, stream: RigStream, its_pace: FramePace, endpoint: Endpoint) -> Transmission:
         packets = stream.address.scheme in PACKETS
-        rate_hz = stream.sensor.rate_hz or UNPACED_HZ
+        rate_hz = stream.sensor.rate_hz or (CAMERA_HZ if isinstance(stream.sensor, Camera) else UNPACED_HZ)
 
         def planned(rate: float, start_ns: int) -> TransmissionPlan:
             source = self.source(stream.name, its_pace, rate, start_ns)
@@ -204,11 +210,17 @@ class Emulator:
 
             return SlideSource(sensor, timing, self.seed)
         last = name[-1] if name[-1] in "12" else "1"
+        finger = (its_pace.finger or int(last)) - 1
+        if isinstance(sensor, Camera):
+            from tacpipe.simulation.emulation.http_camera import CameraSource, complete_camera
+
+            camera = complete_camera(sensor, its_pace.video)
+            return CameraSource(camera, self.world, timing, seed, finger, its_pace.video)
         if stream_of_clouds(sensor):
             from tacpipe.simulation.emulation.source import CloudSource
 
             return CloudSource(sensor, timing, seed)
-        return SampleSource(sensor, self.world, timing, seed, (its_pace.finger or int(last)) - 1)
+        return SampleSource(sensor, self.world, timing, seed, finger)
 
     def _seed(self, name: str) -> list[int]:
         return [self.seed, zlib.crc32(name.encode())]

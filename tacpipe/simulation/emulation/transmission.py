@@ -31,6 +31,7 @@ class FramePace:
     skew_ppm: float | None = None  # excess rate of the device's clock; None: random within 50
     offset_ms: float | None = None  # lead of the device's clock; None: random within 80
     slides: bool = False  # a biotac sends the slides of `tacpipe simulate material` instead of the rig's grasps
+    video: str = ""  # video file that a camera shows again and again; empty: the gel of its finger
     finger: int | None = None  # finger of the gripper with the sensor, 1 or 2; None: the last digit of its name, or 1
 
     def __post_init__(self) -> None:

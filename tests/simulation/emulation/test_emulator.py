@@ -97,7 +97,7 @@ while len(found) < 50:
 print(b"".join(data for _, data in found).hex())
 """
 HID = ("rawhid", "spacemouse")
-OVER_LINKS = [name for name in ALL_SENSORS.streams if name not in (*HID, "clouds", "tap")]
+OVER_LINKS = [name for name in ALL_SENSORS.streams if name not in (*HID, "clouds", "tap", "camera")]
 
 
 @pytest.mark.parametrize("name", OVER_LINKS)

@@ -12,12 +12,14 @@ from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.sensors.biotac import BioTac
+from tacpipe.sensors.camera import Camera
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.signals import kinematics
 from tacpipe.simulation import pick_and_move, taxels
 from tacpipe.simulation.emulation import ledger, world
+from tacpipe.simulation.emulation.http_camera import CameraSource, complete_camera
 from tacpipe.simulation.emulation.quantities import unit_scale
 from tacpipe.simulation.emulation.source import SampleSource, SlideSource, Timing
 from tacpipe.simulation.emulation.world import CYCLE_NS, World
@@ -140,6 +142,9 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
         from tacpipe.simulation.emulation.source import CloudSource
 
         samples = CloudSource(sensor, Timing(2), (0,)).block(0)
+    elif isinstance(sensor, Camera):
+        sensor = complete_camera(sensor, "")
+        samples = CameraSource(sensor, WORLD, Timing(sensor.rate_hz), (0,), 0, "").block(8)
     else:
         samples = SampleSource(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
     decoded_samples = ledger.decoded(sensor, sensor.encode(samples))

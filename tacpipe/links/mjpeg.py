@@ -1,0 +1,198 @@
+"""Read a stream of JPEG images by HTTP (multipart/x-mixed-replace), as mjpg-streamer and ustreamer serve it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from urllib.parse import urlsplit
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.links import network
+from tacpipe.links.link import Arrived, Descriptor
+from tacpipe.printable import excerpt, plain
+from tacpipe.sensors.camera import Frame, pack_frame, pack_settings, read_shape
+from tacpipe.sensors.sensor import Sensor
+
+MAX_HEAD_BYTES = 1 << 14  # limit of the head of a response or of an image
+MAX_IMAGE_BYTES = 1 << 25
+READ_BYTES = 1 << 18
+ANSWER_S = 5.0  # limit for the head of the response
+HEAD_END = b"\r\n\r\n"
+STAMP = "x-timestamp"  # seconds, which mjpg-streamer and ustreamer send with each image
+MAX_STAMP_S = 1e10  # a later stamp is none
+Head = dict[str, str]  # fields by name in lower case; the first line stands under ""
+
+
+def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
+    """Return the open stream of an address such as ``http://192.168.1.20:8080/?action=stream``.
+
+    Raises `UsageError` for an address that is none, and `DeviceError` for a host that is unknown, unreachable or serves
+    something else.
+    """
+    address = urlsplit(place)
+    try:
+        host, port = address.hostname, address.port or 80
+    except ValueError:
+        host, port = None, 0
+    if address.scheme != "http" or not host:
+        raise UsageError(
+            f"mjpeg:{plain(place)} names no stream; it should read like mjpeg:http://192.168.1.20:8080/stream."
+        )
+    path = (address.path or "/") + (f"?{address.query}" if address.query else "")
+    connection = network.connect(host, port, name)
+    try:
+        request = f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\nAccept: multipart/x-mixed-replace\r\n\r\n"
+        connection.sendall(request.encode("ascii", "replace"))
+        parser, images = MultipartParser(), []
+        until_s = time.monotonic() + ANSWER_S
+        connection.settimeout(ANSWER_S)
+        while parser.boundary is None and time.monotonic() < until_s:
+            data = connection.recv(READ_BYTES)
+            if not data:
+                break
+            images = parser.feed(data)
+        connection.setblocking(False)
+    except TimeoutError:
+        parser.fault = f"it did not answer within {ANSWER_S:g} s"
+    except OSError as error:
+        connection.close()
+        raise network.failed(error, host, port, name) from error
+    if parser.boundary is None:
+        connection.close()
+        reason = parser.fault or "it ended the connection"
+        raise DeviceError(f"{name}: {place} serves no stream of images: {reason}. Open the address in a browser.")
+    return MjpegLink(name, connection, parser, images)
+
+
+class MultipartParser:
+    """Cuts the bytes of a response into images."""
+
+    def __init__(self) -> None:
+        self.boundary: bytes | None = None  # None until the head of the response came
+        self.fault = ""  # why the bytes are no stream of images
+        self._bytes = bytearray()
+        self._head: Head | None = None  # of the image that is coming
+
+    def feed(self, data: bytes) -> list[tuple[Head, bytes]]:
+        """Return the images that are complete now, each with the fields of its head."""
+        self._bytes += data
+        if self.boundary is None and not self._begin():
+            return []
+        images: list[tuple[Head, bytes]] = []
+        while not self.fault and (image := self._next_image()) is not None:
+            images.append(image)
+        return images
+
+    def _begin(self) -> bool:
+        """Read the head of the response; return whether images follow."""
+        head = self._take_head()
+        if head is None:
+            return False
+        kind, _, parameters = head.get("content-type", "").partition(";")
+        boundary = parameters.partition("boundary=")[2].partition(";")[0].strip().strip('"')
+        if " 200" not in head[""] or kind.strip().lower() != "multipart/x-mixed-replace" or not boundary:
+            self.fault = f"the answer is {excerpt(head[''])}, {excerpt(head.get('content-type', 'of no type'))}"
+            return False
+        self.boundary = b"--" + boundary.encode("ascii", "replace").removeprefix(b"--")
+        return True
+
+    def _take_head(self) -> Head | None:
+        """Take a head off the front of the bytes; None while it is not complete."""
+        stop = self._bytes.find(HEAD_END)
+        if stop < 0:
+            if len(self._bytes) > MAX_HEAD_BYTES:
+                self.fault = f"a head has more than {MAX_HEAD_BYTES} bytes"
+            return None
+        lines = self._bytes[:stop].decode("latin-1").strip("\r\n").split("\r\n")
+        del self._bytes[: stop + len(HEAD_END)]
+        fields = (line.partition(":") for line in lines[1:])
+        return {"": lines[0]} | {key.strip().lower(): value.strip() for key, _, value in fields}
+
+    def _next_image(self) -> tuple[Head, bytes] | None:
+        """Take the next image off the front of the bytes; None while it is not complete."""
+        assert self.boundary is not None
+        if self._head is None:
+            start = self._bytes.find(self.boundary)
+            if start < 0:
+                return None
+            del self._bytes[:start]
+            self._head = self._take_head()
+            if self._head is None:
+                return None
+        stated = self._head.get("content-length", "")
+        size = int(stated) if stated.isdigit() else self._bytes.find(self.boundary)
+        if size > MAX_IMAGE_BYTES or (size < 0 and len(self._bytes) > MAX_IMAGE_BYTES):
+            self.fault = f"an image has more than {MAX_IMAGE_BYTES} bytes"
+            return None
+        if size < 0 or len(self._bytes) < size:
+            return None
+        head, image = self._head, bytes(self._bytes[:size])
+        del self._bytes[:size]
+        self._head = None
+        return head, image if stated.isdigit() else image.rstrip(b"\r\n")
+
+
+class MjpegLink(Descriptor):
+    """A connection to a server of images. Each entry is the settings or a frame, as `tacpipe.sensors.camera` packs them.
+
+    The stamps of the first image state whether the server sends them.
+    """
+
+    packets = True
+
+    def __init__(
+        self, name: str, connection: socket.socket, parser: MultipartParser, images: list[tuple[Head, bytes]]
+    ) -> None:
+        """Take a connection, and the images that came with the head of the response."""
+        super().__init__(name, connection.fileno())
+        self.socket, self._parser, self._first_images = connection, parser, images
+        self._last_us = 0
+        self._is_described = False
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        images, self._first_images = self._first_images, []
+        return self._entries(images) if images else super()._receive(timeout_s)
+
+    def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        try:
+            data = self.socket.recv(READ_BYTES)
+        except BlockingIOError:
+            return []
+        except OSError as error:
+            raise self.lost(error.strerror or str(error)) from error
+        if not data:
+            raise self.lost("the server ended the connection", "the program that serves the images")
+        images = self._parser.feed(data)
+        if self._parser.fault:
+            raise self.lost(self._parser.fault, "the program that serves the images")
+        return self._entries(images)
+
+    def _entries(self, images: list[tuple[Head, bytes]]) -> Arrived:
+        t_ns = time.monotonic_ns()
+        entries: Arrived = []
+        for head, image in images:
+            stamp_ns = _stamp_ns(head)
+            if not self._is_described and read_shape(image) is not None:
+                self._is_described = True
+                entries.append((t_ns, pack_settings({"stamps": "server" if stamp_ns else "arrival"})))
+            self._last_us = max(t_ns // 1000, self._last_us + 1)
+            entries.append((t_ns, pack_frame(Frame(0, self._last_us, stamp_ns, image))))
+        return entries
+
+    def _release(self) -> None:
+        super()._release()
+        with contextlib.suppress(OSError):
+            self.socket.close()
+
+
+def _stamp_ns(head: Head) -> int:
+    """Return the server's stamp of an image in ns, 0 where there is none.
+
+    >>> _stamp_ns({"x-timestamp": "1700000000.25"}), _stamp_ns({})
+    (1700000000250000000, 0)
+    """
+    whole, _, part = head.get(STAMP, "").partition(".")
+    if not whole.isascii() or not whole.isdigit() or (part and not part.isdigit()) or int(whole) > MAX_STAMP_S:
+        return 0
+    return int(whole) * 10**9 + int((part + "0" * 9)[:9])

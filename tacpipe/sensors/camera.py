@@ -1,0 +1,211 @@
+"""A camera behind a gel, or any other: each frame is a JPEG image, stored as it came.
+
+The links (`tacpipe.links.v4l2`, `tacpipe.links.mjpeg`) give packets with a head. A packet of `SETTINGS` holds what the
+camera reported when it was opened, as JSON; it is part of the spool and holds no sample. A packet of `FRAME` holds one
+image. Frames that are no whole JPEG image of the stated size are losses.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors.byte_framer import TextFramer
+from tacpipe.sensors.framing import Chunks, Framer
+from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.video.encoding import jpeg_format
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MAGIC = b"TPCF"
+FRAME, SETTINGS = b"F", b"S"
+HEAD = struct.Struct("<4scxxxIIqq")  # magic, kind, size of the content, number, stamp in us, device's time in ns
+COUNTS = 1 << 32  # modulus of the number of a frame
+START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
+END_BYTES = 4096  # cameras pad an image by up to so many bytes behind its end
+PIXEL_FORMATS = {
+    (1, 1): "yuvj444p",
+    (2, 1): "yuvj422p",
+    (2, 2): "yuvj420p",
+    (1, 2): "yuvj440p",
+}  # by ratio of luma to chroma
+STATED = ("rate_hz", "stamps", "read_back", "encoding")  # options that a packet of settings may state
+Stamps = Literal["", "kernel", "server", "arrival"]
+
+
+class Frame(NamedTuple):
+    """One image as a link gives it."""
+
+    number: int  # modulo `COUNTS`; 0 where frames are not numbered
+    t_us: int  # on the monotonic clock of this computer
+    t_device_ns: int  # on the device's clock; 0 where it is not stated
+    content: bytes
+
+
+class ImageShape(NamedTuple):
+    """What the head of a JPEG image states."""
+
+    width_px: int
+    height_px: int
+    pixel_format: str  # FFmpeg's name
+
+
+def pack_frame(frame: Frame) -> bytes:
+    """Return the packet of a frame."""
+    head = HEAD.pack(MAGIC, FRAME, len(frame.content), frame.number, frame.t_us, frame.t_device_ns)
+    return head + frame.content
+
+
+def pack_settings(settings: Mapping[str, Any]) -> bytes:
+    """Return the packet of what a camera reported."""
+    content = json.dumps(settings).encode()
+    return HEAD.pack(MAGIC, SETTINGS, len(content), 0, 0, 0) + content
+
+
+def unpack_frame(packet: bytes) -> Frame | None:
+    """Return the frame of a packet, None for any other packet."""
+    if packet[: len(MAGIC) + 1] != MAGIC + FRAME or len(packet) < HEAD.size:
+        return None
+    _, _, size, number, t_us, t_device_ns = HEAD.unpack_from(packet)
+    return Frame(number, t_us, t_device_ns, packet[HEAD.size :]) if len(packet) == HEAD.size + size else None
+
+
+def unpack_settings(packet: bytes) -> dict[str, Any] | None:
+    """Return what a camera reported, None for any other packet."""
+    if packet[: len(MAGIC) + 1] != MAGIC + SETTINGS:
+        return None
+    try:
+        settings = json.loads(packet[HEAD.size :])
+    except ValueError:
+        return None
+    return settings if isinstance(settings, dict) else None
+
+
+def read_shape(image: bytes) -> ImageShape | None:
+    """Return the size and the pixel format of a JPEG image, None for bytes that are no whole JPEG image."""
+    if image[:2] != START or image.rfind(END, max(2, len(image) - END_BYTES)) < 0:
+        return None
+    place = 2
+    while place + 4 <= len(image) and image[place] == 0xFF:
+        marker, size = image[place + 1], int.from_bytes(image[place + 2 : place + 4])
+        if 0xC0 <= marker <= 0xC2:
+            return _shape_of_frame(image[place + 4 : place + 2 + size])
+        place += 2 + size
+    return None
+
+
+def _shape_of_frame(segment: bytes) -> ImageShape | None:
+    """Return what the segment of a frame states: bits, height, width, components, and the sampling of each."""
+    if len(segment) < 6 or segment[0] != 8 or len(segment) < 6 + 3 * segment[5]:
+        return None
+    height, width, components = int.from_bytes(segment[1:3]), int.from_bytes(segment[3:5]), segment[5]
+    pixel_format = "gray" if components == 1 else ""
+    if components == 3:
+        (luma_x, luma_y), (chroma_x, chroma_y) = (divmod(segment[place], 16) for place in (7, 10))
+        ratio = (luma_x // max(chroma_x, 1), luma_y // max(chroma_y, 1))
+        pixel_format = PIXEL_FORMATS.get(ratio, "")
+    return ImageShape(width, height, pixel_format) if pixel_format and width and height else None
+
+
+def options(data: Chunks) -> list[dict[str, Any]]:
+    """Return the options that the packets of a camera state, as a list of one, empty until there is a frame."""
+    packets = data.packets()
+    settings = next((values for packet in packets if (values := unpack_settings(packet)) is not None), None)
+    frames = (frame for packet in packets if (frame := unpack_frame(packet)) is not None)
+    shape = next((shape for frame in frames if (shape := read_shape(frame.content)) is not None), None)
+    if shape is None:
+        return []
+    stated: dict[str, Any] = {name: settings[name] for name in STATED if name in settings} if settings else {}
+    return [{**shape._asdict(), **stated}]
+
+
+@dataclass(frozen=True)
+class Camera(Sensor):
+    """A camera. Size, pixel format and stamps that are left out are as the camera states when `tacpipe acquire` begins."""
+
+    summary: ClassVar[str] = "Cameras behind a gel (GelSight, DIGIT) and others: MJPEG by V4L2 or by HTTP."
+    links: ClassVar[tuple[str, ...]] = ("v4l2", "mjpeg")
+    guesses: ClassVar[Mapping[str, str]] = {
+        "width_px": "as the camera sends now",
+        "height_px": "as the camera sends now",
+    }
+
+    width_px: int = 0  # width of a frame; 0: as the camera is set
+    height_px: int = 0  # height of a frame; 0: as the camera is set
+    rate_hz: float = 0.0  # frames a second; 0: as a V4L2 camera is set, unknown of one by HTTP
+    encoding: Literal["mjpeg", "yuyv"] = "mjpeg"  # what the camera sends; yuyv is encoded as JPEG, with some loss
+    exposure: int | None = None  # exposure time in 100 us; none: as the camera is set
+    gain: int | None = None  # gain in the camera's units; none: as the camera is set
+    white_balance_k: int | None = None  # colour temperature in kelvin; none: as the camera is set
+    led: int | None = None  # brightness of a DIGIT's light, 0 to 15, or 256 r + 16 g + b; none: as it is set
+    pixel_format: str = ""  # FFmpeg's name of the pixel format; comes from the camera
+    stamps: Stamps = ""  # clock of the stamps and whether frames are numbered; comes from the camera
+    read_back: str = ""  # controls as the camera reported them when it was opened; comes from the camera
+
+    def __post_init__(self) -> None:
+        if not (self.width_px >= 0 <= self.height_px and 0 <= self.rate_hz < float("inf")):
+            raise UsageError(
+                f"camera: {self.width_px} x {self.height_px} pixels at {self.rate_hz:g} Hz cannot be a video. Give "
+                f"sizes and a rate of 0 or above."
+            )
+
+    @property
+    def incomplete(self) -> bool:  # type: ignore[override]
+        """True where the camera must state its format."""
+        return not (self.width_px and self.height_px and self.pixel_format and self.stamps)
+
+    @property
+    def counter(self) -> int | None:  # type: ignore[override]
+        """Modulus of the kernel's number of a frame; None where nobody counts."""
+        return COUNTS if self.stamps == "kernel" else None
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``packet``, ``pts``, ``dts`` and ``key_frame``."""
+        rate_hz = Fraction(self.rate_hz).limit_denominator(1001) if self.rate_hz else None
+        video_format = jpeg_format(self.width_px or 1, self.height_px or 1, rate_hz, self.pixel_format)
+        packet, *clocks = video_format.fields()
+        return [packet.with_metadata({**packet.metadata, b"unit": b"1"}), *clocks]
+
+    def framer(self) -> Framer:
+        """Return a framer that takes frames of the stated size, and settings."""
+        return TextFramer(self._is_right)
+
+    def decode(self, frames: Sequence[bytes]) -> Samples:
+        """Return one sample per frame; settings hold none."""
+        images = [(row, frame) for row, packet in enumerate(frames) if (frame := unpack_frame(packet)) is not None]
+        packets = np.empty((len(images), 1), object)
+        packets[:, 0] = [frame.content for _, frame in images]
+        t_us = np.array([frame.t_us for _, frame in images], np.int64)
+        return Samples(
+            (packets, np.column_stack([t_us, t_us]), np.ones((len(images), 1), bool)),
+            np.array([frame.number for _, frame in images], np.int64) if self.counter else None,
+            np.array([frame.t_device_ns for _, frame in images], np.int64) if self.stamps == "server" else None,
+            rows=np.array([row for row, _ in images], np.int64),
+        )
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return the packets that hold these images."""
+        packets, clocks, _ = samples.values
+        counts = np.zeros(len(samples), np.int64) if samples.seq is None else samples.seq
+        device_ns = np.zeros(len(samples), np.int64) if samples.t_device_ns is None else samples.t_device_ns
+        return [
+            pack_frame(Frame(int(number), int(t_us), int(t_device_ns), image))
+            for number, t_us, t_device_ns, image in zip(counts, clocks[:, 0], device_ns, packets[:, 0], strict=True)
+        ]
+
+    def _is_right(self, packet: bytes) -> bool:
+        frame = unpack_frame(packet)
+        if frame is None:
+            return unpack_settings(packet) is not None
+        shape = read_shape(frame.content)
+        if shape is None or self.incomplete:
+            return shape is not None
+        return shape == (self.width_px, self.height_px, self.pixel_format)
