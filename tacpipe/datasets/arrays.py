@@ -1,4 +1,4 @@
-"""Return recordings as arrays, tensors and frames, every value as its Parquet file holds it."""
+"""Read recordings as arrays, tensors and data frames, with every value as in its Parquet file."""
 
 from __future__ import annotations
 
@@ -25,25 +25,32 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute
 
 TIME = "t_ns"
-CLOCKS = (TIME, "t_device_ns", "seq", "device_seq")  # clocks and counters, where no metadata states what a column is
-NOT_CHANNELS = ("time", "sequence", "mask", "label", "status", "text")  # quantities of columns that no sensor measured
-EXACT = 1 << 53  # up to here a float64 holds every whole number
+CLOCKS = (TIME, "t_device_ns", "seq", "device_seq")  # clocks and counters, for columns without metadata
+NOT_CHANNELS = (
+    "time",
+    "sequence",
+    "mask",
+    "label",
+    "status",
+    "text",
+)  # quantities of columns that are not measurements
+EXACT = 1 << 53  # a float64 represents every integer up to this
 
 
 @dataclass(frozen=True, eq=False)
 class Arrays:
     """A stream of one recording: each column as an array of its own type, and its channels as one matrix.
 
-    A channel is a column of numbers that was measured: no clock, counter, mask, label, status or text, and no ground
-    truth of a simulation (``gt_…``). Which columns are channels follows from their types, names and field metadata
-    ``quantity``, never from their values.
+    A channel is a numeric column that was measured: not a clock, counter, mask, label, status or text, and not ground
+    truth of a simulation (``gt_…``). Types, names and the field metadata ``quantity`` determine which columns are
+    channels, never the values.
     """
 
-    by_column: Mapping[str, AnyArray]  # name -> (time,), in the column's own type; a masked array where it has nulls
-    columns: tuple[str, ...]  # the channels: names of the columns of `values`, in order
+    by_column: Mapping[str, AnyArray]  # array (time,) by name, in the column's own type; a masked array if it has nulls
+    columns: tuple[str, ...]  # the channels: column names of `values`, in order
 
     def __getitem__(self, name: str) -> AnyArray:
-        """Return one column, channel or not, in its own type (time,). Raises `KeyError` if it was not read."""
+        """Return any column in its own type (time,). Raises `KeyError` if it was not read."""
         return self.by_column[name]
 
     @property
@@ -53,9 +60,9 @@ class Arrays:
 
     @cached_property
     def values(self) -> AnyArray:
-        """The channels side by side (time, channel), in the smallest type that holds each of them; null becomes NaN.
+        """The channels as columns (time, channel), in the smallest type that represents each of them; null becomes NaN.
 
-        Raises `UsageError` if no common type holds every value: an integer beyond 2^53 next to a float.
+        Raises `UsageError` if no common type represents every value: an integer beyond 2^53 next to a float.
         """
         channels = {name: self.by_column[name] for name in self.columns}
         kinds: list[Any] = [array.dtype for array in channels.values()]
@@ -70,7 +77,7 @@ class Arrays:
                     f"The channel {name} ({array.dtype}) holds integers beyond 2^53, which {common} would round, so "
                     f"there is no one matrix of these channels. Read it alone: arrays[{name!r}] has its own type."
                 )
-            with np.errstate(invalid="ignore"):  # A signalling NaN is NaN in any type
+            with np.errstate(invalid="ignore"):  # a signalling NaN is NaN in any type
                 values[:, index] = np.ma.getdata(array)
             if np.ma.isMaskedArray(array):
                 values[np.ma.getmaskarray(array), index] = np.nan
@@ -79,15 +86,15 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Tensors:
-    """A stream of one recording as tensors: times apart from the channels, as in `Arrays`, with the same types."""
+    """A stream of one recording as tensors: times and channels, with the types of `Arrays`."""
 
     t_ns: torch.Tensor | None  # int64 (time,), nanoseconds, or None if the stream has none or they were not read
     values: torch.Tensor  # (time, channel)
-    columns: tuple[str, ...]  # the channels: names of the columns of `values`, in order
+    columns: tuple[str, ...]  # the channels: column names of `values`, in order
 
 
 def arrays_of_table(table: pa.Table) -> Arrays:
-    """Return the columns of ``table`` as arrays, in its order."""
+    """Return the columns of ``table`` as arrays, in order."""
     by_column = {field.name: _array(column) for field, column in zip(table.schema, table.columns, strict=True)}
     return Arrays(by_column, tuple(field.name for field in table.schema if is_channel(field)))
 
@@ -120,7 +127,7 @@ def is_channel(field: pa.Field) -> bool:
 
 
 def _array(column: pa.ChunkedArray) -> AnyArray:
-    """Return a column in its own type (time,): pyarrow alone would make floats of integers with nulls."""
+    """Return a column in its own type (time,); pyarrow would convert integers with nulls to floats."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -138,13 +145,14 @@ def _beyond(array: AnyArray) -> bool:
     return values.dtype.itemsize == 8 and bool(((values > EXACT) | (values < -EXACT)).any())
 
 
-ONE_TABLE, LABELS_TABLE = "data", "labels"  # views of `connected`
+ONE_TABLE, LABELS_TABLE = "data", "labels"  # views of `connect_duckdb`
 
 
 def labels_frame(dataset: Dataset) -> pd.DataFrame:
-    """Return the attributes of the recordings: one row a recording (index ``recording``), one column an attribute.
+    """Return the attributes as a frame with one row per recording (index ``recording``) and one column per attribute.
 
-    Integers and booleans that some recordings lack are pandas' nullable types; else a column has the type of its values.
+    Integers and booleans that some recordings lack have pandas' nullable types; other columns have the type of their
+    values.
     """
     import pandas as pd
 
@@ -161,17 +169,17 @@ def _series(values: pd.Series[Any]) -> pd.Series[Any]:
 
 
 def _names(dataset: Dataset) -> list[str]:
-    """Return the names of all attributes, in the order in which recordings have them."""
+    """Return the names of all attributes, in the order of the recordings' attributes."""
     return list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
 
 
 def labelled_frame(
     dataset: Dataset, tables: Mapping[str, pa.Table], names: Sequence[str] | None = None
 ) -> dict[str, pa.Table]:
-    """Return the tables of recordings with one more column per attribute: all (None) or those in ``names``.
+    """Return the tables of recordings with an added column per attribute: all (None) or those in ``names``.
 
-    A recording without an attribute has nulls there. Raises `UsageError` for an attribute that no recording has, and for
-    one that shares its name with a column.
+    Missing attributes are null. Raises `UsageError` for an attribute that no recording has, and for one with the name
+    of a column.
     """
     import pyarrow as pa
 
@@ -196,7 +204,7 @@ def labelled_frame(
 
 
 def _kind(values: Sequence[Attribute]) -> pa.DataType:
-    """Return the arrow type that holds all of these values: text where they are of several kinds."""
+    """Return the arrow type that represents all of these values, which is text if they have several types."""
     import pyarrow as pa
 
     types = {type(value) for value in values if value is not None}
@@ -214,7 +222,7 @@ def _as(value: Attribute, kind: pa.DataType) -> Any:
 
 
 def to_pandas(table: pa.Table) -> pd.DataFrame:
-    """Return an arrow table as a frame in which integers with nulls are pandas' nullable integers."""
+    """Return an arrow table as a frame. Integers with nulls become pandas' nullable integers."""
     import pandas as pd
     import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""A dataset opened for reading: recordings and files by name, their bytes verified when they are read."""
+"""Open datasets for reading: recordings and files by name, verified when they are read."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from tacpipe.datasets.windows import Windows
     from tacpipe.io.columns import Columns
 
-Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
-Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # value of a label, values, or a test of one
-LARGE_BYTES = 1 << 24  # A shard of this size or more is read from its file
-_NAMED = 5  # recordings that an error names
+Reader = Callable[[str, str], bytes]  # (digest, path in the dataset's directory) -> verified content
+Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # a label's value, several values, or a predicate
+LARGE_BYTES = 1 << 24  # minimum size of a shard that is read from its file instead of memory
+_NAMED = 5  # number of recordings named in an error
 
 
 class Recording:
-    """One recording of a dataset: its attributes, and its tables when asked for."""
+    """One recording of a dataset: its attributes, and its tables, which are read on demand."""
 
     def __init__(self, name: str, entry: RecordingEntry, read: Reader, dataset: Dataset | None = None) -> None:
         self.name = name
@@ -64,7 +64,7 @@ class Recording:
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """The names of the recording's streams; ``("",)`` where one table holds all."""
+        """The names of the recording's streams; ``("",)`` if it is a single table."""
         return tuple(sorted(self._shards))
 
     @property
@@ -74,7 +74,7 @@ class Recording:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The bytes of each stream as it is stored."""
+        """The stored size of each stream in bytes."""
         return {stream: shard["bytes"] for stream, shard in self._shards.items()}
 
     @property
@@ -90,9 +90,9 @@ class Recording:
 
     @property
     def alone(self) -> Dataset:
-        """The dataset that it was opened from, with this recording alone.
+        """The recording's dataset, reduced to this recording.
 
-        Raises `UsageError` for one that a stage was given: what it is part of is unknown there.
+        Raises `UsageError` for a recording passed to a stage, where its dataset is unknown.
         """
         if self._dataset is None:
             raise UsageError(
@@ -101,11 +101,11 @@ class Recording:
         return self._dataset.only([self.name])
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        """Return a stream as an arrow table with field metadata; its bytes are verified first.
+        """Return a stream as an arrow table with field metadata, after verifying its bytes.
 
-        Of a synchronized recording, whose streams lie side by side in one table, ``stream`` names those columns: ``t_ns``
-        and the columns of that stream, under the names with which they were recorded; masks and ground truth are left
-        out. Without ``stream`` the table is as stored. Raises `UsageError` for a stream that is not there.
+        A synchronized recording is one table with the columns of all streams. There, ``stream`` selects ``t_ns`` and
+        the columns of that stream under their recorded names, without masks and ground truth. Without ``stream`` the
+        table is returned as stored. Raises `UsageError` if the stream does not exist.
         """
         from tacpipe.io.parquet import from_parquet
 
@@ -123,10 +123,10 @@ class Recording:
         return stored.read(list(names.values())).rename_columns(list(names))
 
     def columns(self, stream: str = "") -> Columns:
-        """Return a stream whose columns are decoded when asked for, some at a time; its bytes are verified first.
+        """Return a stream whose columns are decoded on demand, after verifying its bytes.
 
-        It reads like an arrow table (``schema``, ``num_rows``, ``column_names``, ``column(name)``), and of a long
-        recording it takes a fraction of the memory. As long as the result is in use, the next call returns it again.
+        It has the interface of an arrow table (``schema``, ``num_rows``, ``column_names``, ``column(name)``) and needs
+        a fraction of the memory for a long recording. While the result is in use, further calls return the same object.
         """
         from tacpipe.io.columns import Columns
 
@@ -136,7 +136,7 @@ class Recording:
         return columns
 
     def _content(self, stream: str) -> bytes | Path:
-        """Return the verified bytes of a stream, or the path of a large one in the store, which memory need not hold."""
+        """Return the verified bytes of a stream, or the path of a large one in the store, which need not fit in memory."""
         if stream not in self._shards:
             raise self._without(stream, [])
         name, path = self._shards[stream]["digest"], shard_path(self.name, stream)
@@ -158,7 +158,7 @@ class Recording:
 
 
 class LazyFiles(Mapping[str, bytes]):
-    """The files of a dataset by name; their content is read and verified when asked for."""
+    """The files of a dataset by name; their content is read and verified on access."""
 
     def __init__(self, files: Mapping[str, Content], read: Reader) -> None:
         self._files, self._read = files, read
@@ -176,9 +176,9 @@ class LazyFiles(Mapping[str, bytes]):
 class Dataset:
     """A dataset opened for reading: recordings by name, files by name.
 
-    ``len(dataset)`` counts its recordings, iteration yields them in the order of their names, ``dataset["trial-003"]`` is
-    one of them and ``"trial-003" in dataset`` tests for its name. A dataset without recordings, as a model, counts as true.
-    It can be pickled; what is read then comes from the same place.
+    ``len(dataset)`` is the number of recordings, iteration yields them in the order of their names,
+    ``dataset["trial-003"]`` returns one, and ``"trial-003" in dataset`` tests for its name. A dataset without
+    recordings, such as a model, is true. Datasets can be pickled; the copy reads from the same location.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class Dataset:
         opener: Callable[[Path | str], Dataset] | None = None,
     ) -> None:
         self.source = manifest
-        self.path = directory  # Its directory; None for the input of a stage
+        self.path = directory  # its directory, or None for the input of a stage
         self.recordings: Mapping[str, Recording] = _Recordings(self, manifest.included, read, names)
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
         self._read, self._opener = read, opener
@@ -203,7 +203,7 @@ class Dataset:
         return iter(self.recordings.values())
 
     def __getitem__(self, name: str) -> Recording:
-        """Return the recording of this name. Raises `UsageError` if there is none."""
+        """Return the recording with this name. Raises `UsageError` if there is none."""
         if name not in self.recordings:
             raise UsageError(
                 f"There is no recording {name!r} in {self._place}; it has {listed(self.recordings, _NAMED)}."
@@ -236,16 +236,16 @@ class Dataset:
 
     @property
     def labels(self) -> pd.DataFrame:
-        """The attributes of the recordings, one row a recording by its name, one column an attribute.
+        """The attributes of the recordings, with one row per recording name and one column per attribute.
 
-        Attributes are what the recordings carry: labels set on them, sensor, sizes of gaps and whatever their stages add.
+        Attributes include hand-set labels, the sensor, sizes of gaps and whatever stages add.
         """
         from tacpipe.datasets import arrays
 
         return arrays.labels_frame(self)
 
     def only(self, names: Iterable[str]) -> Dataset:
-        """Return the dataset with the recordings of these names alone."""
+        """Return the dataset reduced to the recordings with these names."""
         return Dataset(self.source, self._read, names, directory=self.path, opener=self._opener)
 
     def select(
@@ -257,14 +257,15 @@ class Dataset:
         labels: Mapping[str, Wanted] | None = None,
         **conditions: Wanted,
     ) -> Dataset:
-        """Return the dataset with only the recordings that meet every condition; only the split is read.
+        """Return the dataset reduced to the recordings that meet every condition; only the split is read.
 
-        ``names`` are names or patterns (``"trial-00?"``), of which one must match. ``split`` and ``role`` choose by the
-        role in ``fold`` of a split, or, without ``role``, all recordings that have one. Each further keyword is a label: its
-        value, a collection of values, or a function of the value, as in ``select(object="cup", speed_m_s=lambda v: v < 1)``;
-        ``labels`` holds those that share a name with a parameter. A recording without the label does not match.
+        ``names`` are names or patterns (``"trial-00?"``), at least one of which must match. ``split`` and ``role``
+        select by the role in ``fold`` of a split; without ``role``, all recordings that have one. Each further keyword
+        is a label with a value, a collection of values, or a predicate, as in ``select(object="cup", speed_m_s=lambda
+        v: v < 1)``; ``labels`` is for labels that share a name with a parameter. A recording without the label does not
+        match.
 
-        Raises `UsageError` for a label that no recording has, and where no recording meets the conditions.
+        Raises `UsageError` for a label that no recording has, and if no recording meets the conditions.
         """
         from tacpipe.datasets import selection
 
@@ -281,7 +282,7 @@ class Dataset:
 
     @property
     def manifest(self) -> ManifestJson:
-        """The manifest as plain values, the recordings of all pages included."""
+        """The manifest as plain values, with the recordings of all pages."""
         value: ManifestJson = json.loads(self.source.content)
         value.pop("pages", None)
         recordings, labels, sources = (
@@ -303,10 +304,10 @@ class Dataset:
         *,
         labels: bool | Sequence[str] = False,
     ) -> pa.Table:
-        """Return all recordings in one arrow table, after a first column ``recording`` (but where it has one already).
+        """Return all recordings in one arrow table, with a first column ``recording`` unless the tables have one.
 
-        ``stream`` may be left out where the recordings have one table each. ``labels`` adds attributes of the recordings
-        as last columns: all of them, or those named.
+        ``stream`` is optional if each recording is a single table. ``labels`` appends attributes of the recordings as
+        columns: all of them, or those named.
         """
         from tacpipe.io.parquet import one_after_another
 
@@ -329,10 +330,10 @@ class Dataset:
         *,
         labels: bool | Sequence[str] = False,
     ) -> pd.DataFrame:
-        """Return all recordings in one frame, after a categorical column ``recording``; arguments are those of `table`.
+        """Return all recordings in one frame after a categorical column ``recording``. Arguments are those of `table`.
 
-        Integers with nulls, as where only some recordings have the column, are pandas' nullable integers: a column of
-        floats would round those beyond 2^53.
+        Integers with nulls, for example because only some recordings have the column, become pandas' nullable integers:
+        a column of floats would round values beyond 2^53.
         """
         from tacpipe.datasets import arrays
 
@@ -345,7 +346,7 @@ class Dataset:
         *,
         labels: bool | Sequence[str] = False,
     ) -> pl.DataFrame:
-        """Return all recordings in one polars frame; arguments are those of `table`."""
+        """Return all recordings in one polars frame. Arguments are those of `table`."""
         with extras.explain_missing("to_polars"):
             import polars as pl
 
@@ -354,10 +355,10 @@ class Dataset:
         return frame
 
     def duckdb(self) -> duckdb.DuckDBPyConnection:
-        """Return a DuckDB connection, in memory, that has a view a stream, named as it, and a view ``labels``.
+        """Return an in-memory DuckDB connection with one view per stream, named after it, and a view ``labels``.
 
-        Of recordings with one table each that view is named ``data``. Each view begins with a column ``recording``, by which
-        it joins ``labels``. All streams are read and verified at once.
+        If recordings are single tables, their view is named ``data``. Each view has a first column ``recording``, for
+        joins with ``labels``. All streams are read and verified immediately.
         """
         from tacpipe.datasets import arrays
 
@@ -380,13 +381,13 @@ class Dataset:
     ) -> Windows:
         """Return the windows of all recordings as a map-style torch dataset; see `tacpipe.datasets.windows.Windows`.
 
-        Each is ``context`` past rows of the ``inputs`` and ``horizon`` future ones of the ``targets``; the next one begins
-        ``stride`` rows later. None crosses a gap or the end of a recording. Channels are given by names or patterns
-        (``"xela1_*"``); ``columns`` are inputs and targets at once, and without any of them all channels are both.
+        Each window has ``context`` past rows of the ``inputs`` and ``horizon`` future rows of the ``targets``; the next
+        one starts ``stride`` rows later. No window crosses a gap or the end of a recording. Channels are given by names
+        or patterns (``"xela1_*"``); ``columns`` are both inputs and targets, and by default all channels are both.
 
-        ``rest_s`` subtracts from each tactile channel its level at rest, the median over the first ``rest_s`` seconds of the
-        recording. ``scale`` subtracts each channel's mean and divides by its standard deviation: of these windows (True), or
-        of other ones, such as those to train on.
+        ``rest_s`` subtracts from each tactile channel its level at rest, the median over the first ``rest_s`` seconds
+        of the recording. ``scale`` subtracts each channel's mean and divides by its standard deviation, computed from
+        these windows (True) or taken from others, such as the training windows.
         """
         with extras.explain_missing("windows"):
             from tacpipe.datasets.windows import Windows
@@ -406,10 +407,10 @@ class Dataset:
         )
 
     def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Arrays]:
-        """Return the arrays of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
+        """Return the arrays of each recording by name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
 
-        ``columns`` chooses what is read and in which order. Clocks, counters, masks and labels are never mixed with the
-        channels: ``arrays["contact"]`` is any column (time,) in its own type. See `tacpipe.datasets.arrays.Arrays`.
+        ``columns`` selects and orders what is read. Clocks, counters, masks and labels are not part of ``values``;
+        ``arrays["contact"]`` returns any column (time,) in its own type. See `tacpipe.datasets.arrays.Arrays`.
         """
         from tacpipe.datasets import arrays
 
@@ -422,9 +423,9 @@ class Dataset:
         }
 
     def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Tensors]:
-        """Return the tensors of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
+        """Return the tensors of each recording by name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
 
-        As `to_numpy`, with the same types; torch computes little in uint16, so ``values.float()`` comes first there.
+        Types are those of `to_numpy`. torch supports few operations on uint16, so call ``values.float()`` first there.
         """
         from tacpipe.datasets import arrays
 
@@ -442,7 +443,7 @@ class Dataset:
 
 
 class _Recordings(Mapping[str, Recording]):
-    """Recordings by name, in the order of names, each made when it is asked for."""
+    """Recordings by name, in the order of names, created on access."""
 
     def __init__(
         self, dataset: Dataset, entries: Mapping[str, RecordingEntry], read: Reader, names: Iterable[str] | None
@@ -480,5 +481,5 @@ def _reopened(
     return Dataset(manifest, read, names, directory=directory, opener=opener)
 
 
-Model = Dataset  # A dataset whose files hold weights and configuration
+Model = Dataset  # a dataset whose files contain weights and configuration
 Datasets = tuple[Dataset, ...]

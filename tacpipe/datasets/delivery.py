@@ -1,4 +1,4 @@
-"""Datasets of a store that lies in a bucket: what a command writes here is kept there, under the name of its project."""
+"""Upload the datasets that commands write to the bucket of their store, under the name of their project."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tacpipe.store.store import MissingError, Store
 def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool = False) -> None:
     """Upload the dataset that ``directory`` (or one file) is about to show, if the store has a bucket.
 
-    Recordings cannot be recomputed, so they are kept locally if the bucket cannot be reached, and a note reports that.
-    For computed datasets `StorageError` is raised. Call this before the root of the directory is set.
+    If the bucket cannot be reached, recordings, which cannot be recomputed, are kept locally and a note reports that;
+    for computed datasets `StorageError` is raised. Call this before setting the root of the directory.
     """
     if not store.distant:
         return

@@ -1,4 +1,4 @@
-"""The directory of a dataset: shards linked beside the manifest, for programs that read files."""
+"""The directory of a dataset: its manifest and links to its shards, for programs that read files."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}
 class DirectoryChange:
     """Planned content of a directory.
 
-    Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
-    Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes. Where it
-    was found ``whole`` what it shows already is not looked at again. Files of an export that somebody edited are refused
-    unless ``replace``: then their content stays in the store. ``key`` names the run that gave the manifest.
+    Damaged shards at the paths ``may_lack`` are left as they are, because a lost recording must not block the next one.
+    If a dataset was only ``relabelled``, nothing is removed and no shard is checked, so a label costs only its change.
+    If it was found ``whole``, existing files are not checked again. Edited files of an export raise an error unless
+    ``replace`` is set, which keeps their content in the store. ``key`` names the run that produced the manifest.
     """
 
     manifest: Manifest
@@ -48,7 +48,7 @@ class DirectoryChange:
 
 
 def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool = False) -> None:
-    """Make ``directory`` show ``manifest``, as `change` does; where it does already, only its root is set again."""
+    """Make ``directory`` show ``manifest``, as `change` does; if it already does, only set its root again."""
     directory = directory.absolute()
     if shows(store, manifest, directory):
         deliver(store, directory, manifest)
@@ -58,15 +58,15 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool 
 
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
-    """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
+    """Return whether ``directory`` already shows ``manifest`` with all of its files."""
     return bool(showing(store, manifest, directory))
 
 
 def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "files", "links"]:
-    """Return how ``directory`` shows ``manifest`` and all its files; empty if it does not.
+    """Return how ``directory`` shows ``manifest`` and all of its files, or "" if it does not.
 
-    ``links``: all files are directly in the directory, as links to objects of the store. ``files``: some are copies or in
-    folders.
+    ``links``: all files are directly in the directory, as links to objects of the store. ``files``: some are copies or
+    in folders.
     """
     if not _current(directory, manifest):
         return ""
@@ -80,12 +80,13 @@ def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "f
 
 
 def change(store: Store, directory: Path, decide: Callable[[], DirectoryChange]) -> Manifest:
-    """Make ``directory`` show what ``decide`` returns, and return its manifest: whatever is changed there goes this way.
+    """Make ``directory`` show what ``decide`` returns, and return its manifest; all changes of a directory use this.
 
-    ``decide`` is called once nobody else changes the directory, so it may read what is there first. Then come a root in
-    the store, which marks as ours what a killed run leaves behind, the shards, linked (recordings copied), and the manifest
-    last. What the dataset before held and cannot be computed again stays in the store, and so does its manifest; what it
-    named and this one does not is removed. Raises `UsageError` if the directory holds something that tacpipe did not write.
+    ``decide`` is called while no other process can change the directory, so it may read the current content. A root in
+    the store is written first, which marks files of a killed run as ours, then the shards are linked (recordings are
+    copied), and the manifest is written last. Irreplaceable content of the previous dataset stays in the store with its
+    manifest; its other files are removed. Raises `UsageError` if the directory contains something that tacpipe did not
+    write.
     """
     directory = directory.absolute()
     with changing(store, directory):
@@ -98,7 +99,7 @@ def change(store: Store, directory: Path, decide: Callable[[], DirectoryChange])
 
 @contextlib.contextmanager
 def changing(store: Store, directory: Path) -> Iterator[None]:
-    """Change what ``directory`` shows while nobody else does, whoever reads its manifest first to change it included."""
+    """Hold the lock for changing ``directory``, including reading its manifest in order to change it."""
     directory = directory.absolute()
     with store.leases.hold(digest(["output", *store.roots.kind_and_name(directory)]), f"the output {directory}"):
         yield
@@ -110,14 +111,16 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     current = _current(directory, manifest)
     stale: dict[str, str] = {}
     removed: set[str] = set()
-    if current or (manifest.exported and not relabelled):  # Files of an export are large copies: correct ones stay
+    if current or (
+        manifest.exported and not relabelled
+    ):  # files of an export are large copies, so correct ones are kept
         stale = dict(_stale(store, manifest, directory))
     if not current and relabelled:
         stale, removed = _pages_compared(_current_manifest(directory), manifest, directory)
-    elif not current:  # Existing files stay, so a new recording costs only itself
+    elif not current:  # existing files are kept, so a new recording costs only itself
         before = _current_manifest(directory)
         unlike, removed = _compared(before, manifest, directory, is_complete=planned.is_complete)
-        if before is None:  # Its pages have other names than those of the former manifest
+        if before is None:  # its pages have other names than those of the previous manifest
             removed |= _pages_compared(replacing.former(store, directory), manifest, directory)[1]
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *removed})
@@ -151,7 +154,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
 
 
 def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
-    """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
+    """Store the objects of ``manifest`` that exist only in its directory, for example after a copy without its store."""
     for path, name, size in manifest.contents():
         content = None if store.has(name) else verified_copy(name, path, (str(directory),), size)
         if content is not None:
@@ -159,7 +162,7 @@ def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
 
 
 def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]:
-    """Return the files in ``directory`` that were edited, and that making it show the export ``manifest`` would replace."""
+    """Return the edited files in ``directory`` that the export ``manifest`` would replace."""
     directory = directory.absolute()
     stale = dict(_stale(store, manifest, directory))
     _, removed = _compared(_current_manifest(directory), manifest, directory, is_complete=False)
@@ -167,9 +170,9 @@ def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]
 
 
 def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
-    """Return the files of an export that hold neither what was written there last nor an object of the store."""
+    """Return the files of an export that match neither what was last written there nor an object of the store."""
     current = _current_manifest(directory)
-    if not (current or manifest).exported:  # shards are links: what differs is damage
+    if not (current or manifest).exported:  # shards are links, so a difference is damage
         return []
     digests_written = {} if current is None else {path: file["digest"] for path, file in current.files.items()}
     present = [path for path in sorted(paths) if (directory / path).is_file()]
@@ -178,7 +181,7 @@ def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[s
 
 
 def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> None:
-    """Have the store hold the export as it was edited, as the dataset that was last written in ``directory``."""
+    """Store the edited export as the dataset that was last written in ``directory``."""
     files = {}
     for path in paths:
         with regular.opened(directory / path) as file:
@@ -191,9 +194,9 @@ def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Itera
 
 
 def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
-    """Remove what a process left that was killed while it wrote here: drafts by our names for them, and nothing else.
+    """Remove drafts that killed processes left in a directory, recognized by their names, and nothing else.
 
-    Without ``shards`` those of the manifest alone; ``deep``: in folders at any depth, as exports have them.
+    Without ``shards``, only drafts of the manifest; with ``deep``, in folders at any depth, as in exports.
     """
     if deep:
         folders = [Path(place) for place, _, _ in walk(directory, links=False)]
@@ -206,7 +209,7 @@ def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Return the folders in a folder without links; files are not opened, because there may be a hundred thousand."""
+    """Return the folders in a folder, without links. Files are not opened, because there may be a hundred thousand."""
     try:
         with os.scandir(folder) as entries:
             return sorted(folder / entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
@@ -215,7 +218,7 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def sweep_beside(path: Path) -> None:
-    """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
+    """Remove drafts of the file ``path`` that killed processes left; other files in its folder are not touched."""
     for draft in listed(path.parent, f".*{_DRAFT}"):
         ours = _OURS.fullmatch(draft.name)
         if ours and ours["name"] == path.name[:100]:
@@ -228,7 +231,7 @@ def _remove_draft(path: Path) -> None:
 
 
 def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
-    """Have what was written in ``directory`` outlast a loss of power: recordings and their labels cannot be recomputed."""
+    """Make the files written in ``directory`` survive a power loss, because recordings and labels cannot be recomputed."""
     for folder in {(directory / path).parent for path in paths} - {directory}:
         sync_folder(str(folder))
     project = store.root.parent
@@ -237,7 +240,7 @@ def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the file system reports about an output into a sentence."""
+    """Convert file system errors about an output to a sentence."""
     try:
         yield
     except OSError as error:
@@ -248,7 +251,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[str, str]]:
-    """Yield path and digest of the objects that ``directory`` lacks or holds differently."""
+    """Yield path and digest of the objects that ``directory`` lacks or that differ there."""
     return (item for item in manifest.objects() if not _matches(f"{directory}/{item[0]}", store, item[1]))
 
 
@@ -257,8 +260,8 @@ def _compared(
 ) -> tuple[dict[str, str], set[str]]:
     """Return path and digest of the files to place in ``directory``, and the paths to remove.
 
-    Placed are files that it lacks in this size, and those that differ in ``current``, its current manifest. If all files of
-    ``current`` exist (``is_complete``), pages that both manifests have are skipped.
+    Placed are files that are missing or have another size, and those that differ from ``current``, its current
+    manifest. If all files of ``current`` exist (``is_complete``), pages in both manifests are skipped.
     """
     stale, removed = _pages_compared(current, manifest, directory)
     files = {} if current is None else current.files
@@ -278,7 +281,7 @@ def _compared(
 
 
 def _pages_compared(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
-    """Do as `_compared` for the pages of a manifest only."""
+    """Return the result of `_compared` for the pages of a manifest only."""
     before, now = (
         {} if side is None or side.pages is None else {page.path: page for page in side.pages.pages}
         for side in (current, manifest)
@@ -292,7 +295,7 @@ def _same(before: Content | None, now: Content) -> bool:
 
 
 def refuse_links(directory: Path, paths: Iterable[str]) -> None:
-    """Refuse folders within a dataset that are links: what is written or removed there may be anybody's."""
+    """Raise an error for folders in a dataset that are links, because files behind them may not belong to the dataset."""
     for folder in {folder for path in paths for folder in list(Path(path).parents)[:-1]}:
         if (directory / folder).is_symlink():
             raise UsageError(
@@ -306,12 +309,12 @@ def _remove(directory: Path, paths: set[str]) -> None:
             (directory / path).unlink()
     folders = {directory / folder for path in paths for folder in list(Path(path).parents)[:-1]}
     for folder in sorted(folders, key=lambda path_: len(path_.parts), reverse=True):  # the deepest first
-        with contextlib.suppress(OSError):  # not empty, or gone already
+        with contextlib.suppress(OSError):  # not empty, or already removed
             folder.rmdir()
 
 
 def check_output(store: Store, directory: Path) -> None:
-    """Refuse to write a dataset over something that tacpipe did not write."""
+    """Raise an error if the directory contains something that tacpipe did not write."""
     directory = directory.absolute()
     layout.refuse_within(directory)
     if directory.is_file():
@@ -324,7 +327,7 @@ def check_output(store: Store, directory: Path) -> None:
     if not directory.is_dir():
         return
     below = (Path(place, name) for place, _, names in walk(directory, links=False) for name in names)
-    for path in below:  # a project that was moved: its shards are known, its path is not
+    for path in below:  # the project was moved: its shards are known, but its path is not
         if path.name == NAME and path.is_file():
             raise UsageError(f"{directory} holds the dataset {path.parent}. Give -o a directory of its own.")
         if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):
@@ -335,12 +338,12 @@ def check_output(store: Store, directory: Path) -> None:
 
 
 def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
-    """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``.
+    """Put the object ``name`` at ``path`` as a reflink, hard link or copy, in this order; only as a copy if ``copy``.
 
-    It is verified first. Raises `MissingError` if it is not in the store, or was damaged there.
+    The object is verified first. Raises `MissingError` if it is missing or damaged in the store.
     """
     if not copy:
-        for _ in store.blocks(name):  # reads all of it, which verifies it
+        for _ in store.blocks(name):  # reading all blocks verifies the object
             pass
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex[:12]}{_DRAFT}")
@@ -353,7 +356,7 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
     except FileNotFoundError:
         raise MissingError(f"Object {name[:12]} vanished from the store; run the same command again.") from None
     finally:
-        with contextlib.suppress(OSError):  # one that stays is swept up by the next who writes here
+        with contextlib.suppress(OSError):  # a remaining draft is removed by the next process that writes here
             draft.unlink()
 
 
@@ -371,11 +374,11 @@ def _link(source: str, target: Path) -> bool:
 
 
 def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"]:
-    """Return whether ``path`` holds the object ``name``: a link by its inode, otherwise by its content."""
+    """Return how ``path`` matches the object ``name``: a link by its inode, a file by its content; "" if it does not."""
     try:
         status = os.lstat(path)
         symbolic = stat.S_ISLNK(status.st_mode)
-        if symbolic:  # Its target may change without a change of the directory
+        if symbolic:  # its target may change without a change of the directory
             status = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
     except (FileNotFoundError, NotADirectoryError):
@@ -390,7 +393,7 @@ def _current(directory: Path, manifest: Manifest) -> bool:
         file = directory / NAME
         status = file.stat()
         regular.require(file, status.st_mode)
-        if len(manifest.content) != status.st_size <= regular.JSON_BYTES:  # Larger files are refused below
+        if len(manifest.content) != status.st_size <= regular.JSON_BYTES:  # larger files are rejected below
             return False
         return regular.content(file, regular.JSON_BYTES) == manifest.content
     except (FileNotFoundError, NotADirectoryError):
@@ -398,7 +401,7 @@ def _current(directory: Path, manifest: Manifest) -> bool:
 
 
 def _lies(directory: Path, path: str, size: int) -> bool:
-    """Return whether a regular file of this size lies at a path of a dataset."""
+    """Return whether a path of a dataset is a regular file of this size."""
     try:
         status = os.lstat(f"{directory}/{path}")
     except (FileNotFoundError, NotADirectoryError):
@@ -407,7 +410,7 @@ def _lies(directory: Path, path: str, size: int) -> bool:
 
 
 def _current_manifest(directory: Path) -> Manifest | None:
-    """Return the manifest in ``directory``; None if there is no readable one."""
+    """Return the manifest in ``directory``, or None if there is no readable one."""
     try:
         return find(directory).manifest
     except StorageError:

@@ -17,11 +17,11 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 from tacpipe.store.location import locate
 
-_NAMED = 5  # recordings that a refusal names
+_NAMED = 5  # number of recordings named in an error
 
 
 def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
-    """Return the labels of ``name=value`` texts; numbers and true, false, null are read as YAML does."""
+    """Return the labels in ``name=value`` texts; numbers and true, false, null are parsed as in YAML."""
     labels: dict[str, Attribute] = {}
     for text in sets:
         name, equals, value = text.partition("=")
@@ -40,7 +40,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
 
 
 def of_text(text: str) -> Attribute:
-    """Return the value of a text that is a number, true, false or null; otherwise the text."""
+    """Return the value of a text that is a number, true, false or null, or else the text."""
     from tacpipe.io import config_text
 
     try:
@@ -54,7 +54,7 @@ def of_text(text: str) -> Attribute:
 
 @dataclass(frozen=True)
 class Changed:
-    """The dataset whose labels were changed, and the recordings that have new ones."""
+    """A dataset with changed labels, and the recordings whose labels changed."""
 
     directory: Path
     recordings: list[str]
@@ -72,7 +72,7 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
 
 
 def change_each(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> Changed:
-    """Set different labels on each recording: ``new_labels`` maps the attributes of all recordings to labels by name.
+    """Set different labels on each recording. ``new_labels`` maps the attributes of all recordings to labels by name.
 
     Recordings that already have the labels are not changed, so nothing is recomputed for them.
     """
@@ -82,7 +82,7 @@ def change_each(path: Path, new_labels: Callable[[ByRecording], ByRecording]) ->
 
 
 def planned(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> tuple[ByRecording, ByRecording]:
-    """Return the attributes of all recordings and the labels that `change_each` would set, by name; nothing is changed."""
+    """Return the attributes of all recordings and the labels that `change_each` would set, by name. Changes nothing."""
     dataset = manifest_of.find(path)
     _refuse_made(dataset.manifest, dataset.directory)
     now = attributes(dataset.manifest)
@@ -119,7 +119,7 @@ def _change(path: Path, new_labels: Callable[[Found], ByRecording]) -> Changed:
     names: list[str] = []
 
     def labelled() -> directory_of.DirectoryChange:
-        current = manifest_of.find(directory)  # Read again: another process may have changed it meanwhile
+        current = manifest_of.find(directory)  # read again, because another process may have changed it
         labels = {name: dict(values) for name, values in new_labels(current).items()}
         names.extend(labels)
         current.manifest.keep(store)
@@ -142,7 +142,7 @@ def _matching(dataset: Found, patterns: Sequence[str]) -> list[str]:
     recordings = dataset.manifest.recordings
     names: set[str] = set()
     for pattern in patterns:
-        if pattern in recordings:  # Reads only one page of a large dataset
+        if pattern in recordings:  # reads only one page of a large dataset
             names.add(pattern)
             if not any(mark in pattern for mark in "*?["):
                 continue

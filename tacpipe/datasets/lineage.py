@@ -24,7 +24,7 @@ from tacpipe.store.roots import Root
 from tacpipe.store.store import Store
 
 V = TypeVar("V")
-_SHOWN = 5  # names listed before the rest is counted
+_SHOWN = 5  # number of names listed before the others are counted
 
 
 @final
@@ -33,19 +33,19 @@ class LostNode(TypedDict):
 
     manifest: str  # digest
     digest: str
-    lost: str  # why it cannot be read
+    lost: str  # reason why it cannot be read
 
 
 @final
 class LineageNode(TypedDict):
-    """A dataset of a lineage, and those that it was made from."""
+    """A dataset of a lineage, and the datasets that it was computed from."""
 
     stage: str
     version: int
     params: Values
     digest: str
     manifest: str  # digest
-    path: str | None  # where it lies now
+    path: str | None  # present location
     recordings: int
     rows: int
     files: dict[str, str]  # digests
@@ -54,7 +54,7 @@ class LineageNode(TypedDict):
     skipped: dict[str, str]  # reasons by recording
     sources: dict[str, dict[str, str]]  # digests of raw files by recording
     inputs: dict[str, list[LineageNode | LostNode]]  # by name of the argument
-    provenance: NotRequired[Provenance | None]  # of the dataset that is traced only
+    provenance: NotRequired[Provenance | None]  # only for the traced dataset
     changes: NotRequired[list[str] | None]  # since its previous run; None if there was none
 
 
@@ -109,9 +109,9 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
 
 
 def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Provenance | None:
-    """Return how a manifest was made, which was written at its path at ``written_s``, or None if no record states it.
+    """Return the provenance of a manifest written at its path at ``written_s``, or None if no record contains it.
 
-    ``key`` names the run that made it or what it was labelled in, if its root states that: then no other record is read.
+    ``key`` names the run that produced or labelled it, if its root contains that; then no other record is read.
     """
     of_run = store.record(key) if key else None
     for record in records.naming(store, manifest, written_s) if of_run is None else [of_run]:
@@ -122,7 +122,7 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Proven
 
 
 def _changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None:
-    """Return in words what is other than in the run before; None if there was none."""
+    """Describe the differences from the previous run; None if there was none."""
     previous = None if root is None else root.get("previous")
     if previous is None:
         return None
@@ -158,7 +158,7 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
 
 
 def _alike(before: Manifest, now: Manifest) -> bool:
-    """Return whether a manifest with pages and one without hold the same content."""
+    """Return whether a manifest with pages and one without have the same content."""
     if (before.pages is None) == (now.pages is None) or len(before.recordings) != len(now.recordings):
         return False
     entries = pages.compared(before.recordings, now.recordings)
@@ -195,7 +195,7 @@ def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, RecordingE
 def _recordings_compared(
     subject: str, before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> list[str]:
-    """Describe in which recordings two datasets differ; recordings in shared pages are equal."""
+    """Describe which recordings of two datasets differ; recordings in shared pages are equal."""
     new: list[str] = []
     removed: list[str] = []
     shards: list[str] = []
@@ -241,7 +241,7 @@ def to_text(tree: LineageNode) -> str:
 
 
 def _nested(value: Any) -> Values | None:
-    """Return a param that has parts, such as a layout, which is stored as JSON; None for a plain value."""
+    """Return a param with parts, such as a layout, which is stored as JSON, or None for a plain value."""
     if isinstance(value, str) and value.startswith("{"):
         try:
             value = json.loads(value)
@@ -251,7 +251,7 @@ def _nested(value: Any) -> Values | None:
 
 
 def _rows(value: Any) -> list[Values]:
-    """Return the rows of a list of mappings; nothing for any other value."""
+    """Return the rows of a list of mappings, or an empty list for other values."""
     return value if isinstance(value, list) and all(isinstance(row, Mapping) for row in value) else []
 
 
@@ -288,7 +288,7 @@ def _nested_lines(name: str, tree: Values) -> list[str]:
 
 
 def _files(node: LineageNode) -> str:
-    """Return the names of a few files, or how many there are with the first of them."""
+    """Return the names of the files if there are few, or their number with the first names."""
     names = list(node["files"])
     if len(names) <= _SHOWN:
         return ", ".join(names)

@@ -1,4 +1,4 @@
-"""The manifest: what a dataset is, as one deterministic JSON file."""
+"""The manifest of a dataset: its description as one deterministic JSON file."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from tacpipe.printable import excerpt, plain
 from tacpipe.store.records import Content, RecordingEntry, Step
 from tacpipe.store.store import Object, Store
 
-FORMAT, PAGED_FORMAT = 1, 2  # 1: the manifest holds its recordings; 2: it lists pages of them
+FORMAT, PAGED_FORMAT = 1, 2  # 1: the manifest contains its recordings; 2: it lists pages of them
 NAME = MANIFEST
-VALUES = "{values}"  # Name for the digest of a source's other values, such as labels
-EXPORT = "export."  # begins the names of stages whose result is other tools' files
-ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
+VALUES = "{values}"  # name for the digest of a source's other values, such as labels
+EXPORT = "export."  # prefix of the names of export stages
+ACQUIRE = "acquire"  # the command that records a rig, which takes the place of a stage and has no key
 V = TypeVar("V")
 _REMEMBERED = 3
-_PER_RECORDING = ("recordings", "labels", "sources")  # fields that pages hold
-_parsed: dict[tuple[str, str], Manifest] = {}  # keys: digest, place of pages; the last verified ones
+_PER_RECORDING = ("recordings", "labels", "sources")  # fields stored in pages
+_parsed: dict[tuple[str, str], Manifest] = {}  # most recently verified manifests, by digest and location of pages
 
 
 class InputDataset(TypedDict):
@@ -42,7 +42,7 @@ class InputDataset(TypedDict):
 
 
 class ManifestJson(TypedDict):
-    """A manifest as ``manifest.json`` states it; the fields are those of `Manifest`."""
+    """The content of ``manifest.json``; the fields are those of `Manifest`."""
 
     format: int
     digest: str
@@ -70,13 +70,13 @@ class Manifest:
     chain: Sequence[Step] = ()
     recordings: Mapping[str, RecordingEntry] = field(default_factory=dict)
     files: Mapping[str, Content] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons by name of recording
+    skipped: Mapping[str, str] = field(default_factory=dict)  # reason by recording
     sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # digests of raw files by recording
     labels: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @cached_property
     def pages(self) -> Pages | None:
-        """The pages of a large dataset, or None if the manifest holds the recordings itself."""
+        """The pages of a large dataset, or None if the manifest contains the recordings itself."""
         recordings, labels, sources = self.recordings, self.labels, self.sources
         if len(recordings) <= pages_of.INLINE:
             return None
@@ -92,7 +92,7 @@ class Manifest:
 
     @cached_property
     def digest(self) -> str:
-        """The dataset's digest: of names, attributes, shards and files, and not of how they were made."""
+        """The dataset's digest, computed from names, attributes, shards and files, but not from their provenance."""
         if self.pages is not None:
             files = {name: file["digest"] for name, file in self.files.items()}
             return digest({"files": files, "pages": [page.content for page in self.pages.pages]})
@@ -100,7 +100,7 @@ class Manifest:
 
     @cached_property
     def content(self) -> bytes:
-        """The bytes of ``manifest.json``: the same manifest gives the same bytes."""
+        """The bytes of ``manifest.json``; equal manifests have equal bytes."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__} | {"digest": self.digest}
         if self.pages is None:
             inline = {name: dict(values[name]) for name in _PER_RECORDING}
@@ -119,29 +119,29 @@ class Manifest:
         return bytes_digest(self.content)
 
     def keep(self, store: Store, *, durable: bool = False) -> Object:
-        """Have a store hold the manifest, after its pages. Raises `MissingPageError` for a page that is nowhere."""
+        """Store the manifest, after its pages. Raises `MissingPageError` for a page that cannot be found."""
         if self.pages is not None:
             self.pages.keep(store, durable=durable)
         return store.put(self.content, durable=durable)
 
     @property
     def recorded(self) -> bool:
-        """Return whether this is a dataset of recordings, made from no other dataset."""
+        """Whether this is a dataset of recordings that was not computed from other datasets."""
         return bool(self.recordings) and not self.inputs
 
     @property
     def exported(self) -> bool:
-        """Return whether its files are exports for other tools."""
+        """Whether its files are exports for other tools."""
         return self.stage.startswith(EXPORT)
 
     @property
     def copied(self) -> bool:
-        """Return whether its directory holds copies instead of links, as for recordings and exports."""
+        """Whether its directory contains copies instead of links, as for recordings and exports."""
         return self.recorded or self.exported
 
     @cached_property
     def included(self) -> Mapping[str, RecordingEntry]:
-        """The recordings that nobody excluded."""
+        """The recordings that are not excluded."""
         excluded = self.excluded
         if not excluded:
             return self.recordings
@@ -151,7 +151,7 @@ class Manifest:
 
     @cached_property
     def excluded(self) -> Mapping[str, Attribute]:
-        """Reasons for exclusion by name of recording."""
+        """Reason for exclusion by recording."""
         recordings = self.recordings
         parts: Iterable[Mapping[str, RecordingEntry]] = [recordings]
         if isinstance(recordings, pages_of.Recordings):
@@ -161,7 +161,7 @@ class Manifest:
         return {name: reason for name, reason in reasons if reason}
 
     def with_recordings(self, items: Mapping[str, Item | None]) -> Manifest:
-        """Return the manifest with recordings added or replaced; None leaves one out."""
+        """Return the manifest with recordings added or replaced; None removes one."""
         if isinstance(self.recordings, pages_of.Recordings) and self.pages is not None:
             pages = self.pages.changed(items)
             return replace(
@@ -182,7 +182,7 @@ class Manifest:
         return Item(self.recordings[name], self.labels.get(name), self.sources.get(name))
 
     def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
-        """Return the manifest with attributes set by hand; labels of recordings that are not here are dropped."""
+        """Return the manifest with hand-set attributes; labels of missing recordings are dropped."""
         items = {}
         for name, values in sorted(labels.items()):
             if name not in self.recordings:
@@ -215,9 +215,9 @@ class Manifest:
         return ((name, size) for _, name, size in self.contents())
 
     def reached(self, walked: dict[str, set[str]], *, lenient: bool = False) -> set[str]:
-        """Return the digests of all pages, shards and files; ``walked`` has those of pages that were read, by digest.
+        """Return the digests of all pages, shards and files. ``walked`` caches those of pages already read, by digest.
 
-        ``lenient``: what a missing page names is left out. Raises `MissingPageError` without that.
+        If ``lenient``, the content of missing pages is skipped; otherwise they raise `MissingPageError`.
         """
         pages = self.pages
         if pages is None:
@@ -250,32 +250,32 @@ class Manifest:
         return next((shard for shard in shards if shard is not None), None)
 
     def size_of(self, name: str, path: str) -> int | None:
-        """Return the size in bytes of the page, shard or file of this digest at ``path``; None if there is none."""
+        """Return the size in bytes of the page, shard or file with this digest at ``path``, or None if there is none."""
         content = self.at(path)
         return content["bytes"] if content is not None and content["digest"] == name else None
 
     @cached_property
     def shard_bytes(self) -> int:
-        """How many bytes all shards have together."""
+        """The total size of all shards in bytes."""
         if self.pages is not None:
             return self.pages.total("shard_bytes")
         return sum(shard["bytes"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
     @cached_property
     def rows(self) -> int:
-        """How many rows all shards have together."""
+        """The total number of rows in all shards."""
         if self.pages is not None:
             return self.pages.total("rows")
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
 
 def _changed(before: Mapping[str, V], changes: Mapping[str, V | None]) -> dict[str, V]:
-    """Return values by name, in the order of names, with some added or replaced; None leaves one out."""
+    """Return values by name, sorted by name, with some added or replaced; None removes one."""
     return {name: value for name, value in sorted({**before, **changes}.items()) if value is not None}
 
 
 def _same_pages(view: Mapping[str, Mapping[str, Attribute]], pages: Pages, count: str) -> bool:
-    """Return whether labels or sources are those that pages hold."""
+    """Return whether labels or sources are those in pages."""
     return getattr(view, "pages", None) is pages or (not view and not pages.total(count))
 
 
@@ -284,13 +284,13 @@ def _indented(value: Values) -> str:
 
 
 def parse(content: bytes, source: str, read: PageReader | None = None, *, verified: bool = False) -> Manifest:
-    """Return the manifest of these bytes, whose pages ``read`` reads; ``verified`` ones come from the store.
+    """Return the manifest with these bytes; ``read`` reads its pages. ``verified`` bytes come from the store.
 
-    Raises `DamagedError` if they are not a manifest, or if what they name does not give their digest.
+    Raises `DamagedError` if the bytes are not a manifest or its content does not match its digest.
     """
     name = bytes_digest(content)
     place = name, "" if read is None else read.place
-    if place in _parsed:  # a command meets the same manifest several times
+    if place in _parsed:  # a command parses the same manifest several times
         return _parsed[place]
     regular.expect_parsed(source, len(content))
     try:
@@ -313,8 +313,8 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
             f"{excerpt(declared)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
-    manifest.__dict__.update(content=content, content_digest=name, digest=declared)  # primes cached properties
-    if not verified:  # all of it was looked at
+    manifest.__dict__.update(content=content, content_digest=name, digest=declared)  # fills cached properties
+    if not verified:  # checks all of its content
         _parsed[place] = manifest
         for oldest in list(_parsed)[:-_REMEMBERED]:
             del _parsed[oldest]
@@ -322,7 +322,7 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
 
 
 def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[Manifest, str]:
-    """Return the manifest in a JSON value, and the digest that it declares."""
+    """Return the manifest in a JSON value, and its declared digest."""
     format_version, declared = value.pop("format"), value.pop("digest")
     if type(format_version) is not int or format_version < FORMAT:
         raise ValueError(f"its format is {excerpt(format_version)}")
@@ -333,7 +333,7 @@ def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[
         )
     if format_version == FORMAT:
         manifest = Manifest(**value)
-        manifest.__dict__["pages"] = None  # however many recordings it holds
+        manifest.__dict__["pages"] = None  # regardless of the number of recordings
         return manifest, declared
     pages = Pages([Page.from_json(page) for page in value.pop("pages")], read, {})
     if pages.total("recordings") <= pages_of.INLINE:
@@ -345,18 +345,18 @@ def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[
 
 
 def stored(store: ObjectReader, name: str, source: str = "") -> Manifest:
-    """Return the manifest of this digest from a store. Raises `MissingError`, and as `parse` does."""
+    """Return the manifest with this digest from a store. Raises `MissingError`, and the errors of `parse`."""
     return parse(store.read(name, regular.JSON_BYTES), source or name, StoredPages(store), verified=True)
 
 
 def _inline_digest(manifest: Manifest) -> str:
-    """Return the digest of a dataset whose manifest holds the recordings itself."""
+    """Return the digest of a dataset whose manifest contains the recordings itself."""
     files = {name: file["digest"] for name, file in manifest.files.items()}
     return digest({"files": files, "recordings": pages_of.described(manifest.recordings)})
 
 
 class Found:
-    """A manifest as it was found: the directory of its dataset, and its bytes. Its pages are in ``store`` if given."""
+    """A manifest file: the directory of its dataset, and its bytes. Its pages are in ``store``, if given."""
 
     def __init__(self, directory: Path, content: bytes, store: ObjectReader | None = None) -> None:
         self.directory, self.content = directory, content
@@ -371,7 +371,7 @@ class Found:
 
 
 def find(path: Path | str) -> Found:
-    """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself).
+    """Return the manifest of the dataset at ``path``, which is its directory or the manifest itself.
 
     Raises `UsageError` if there is none, and `StorageError` if the system fails to read it.
     """
@@ -391,7 +391,7 @@ def find(path: Path | str) -> Found:
 
 
 def check(manifest: Manifest) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` if a manifest holds what none can: it may be untrusted.
+    """Raise `ValueError`, `TypeError` or `KeyError` if a manifest, which may be untrusted, is invalid.
 
     Pages are checked when they are read.
     """
@@ -405,17 +405,17 @@ def check(manifest: Manifest) -> None:
 
 
 def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
-    """Do as `check` for all pages, or for those that were made in this process. Raises as `Pages.load` does too."""
+    """Check all pages, or if ``fresh`` those created in this process. Raises as `check` and `Pages.load` do."""
     check(manifest)
     pages, in_folders = manifest.pages, False
     for number, page in enumerate(() if pages is None else pages.pages):
         assert pages is not None
         if page.digest in pages.fresh or not fresh:
             content = pages.load(number)
-            if page.digest in pages.fresh:  # else it was checked as it was read
+            if page.digest in pages.fresh:  # other pages were checked when they were read
                 content.check()
             in_folders |= any("/" in name for name in content.recordings)
-    if in_folders:  # two pages may name one path
+    if in_folders:  # two pages may contain the same path
         paths.refuse_shared_paths([path for path, _ in manifest.objects()])
 
 

@@ -1,7 +1,7 @@
 """The files of a model or codec, which may be untrusted: JSON and safetensors, validated before they are used.
 
-Neither can hold a program. What a configuration declares is checked against the tensors that are there: a network is built
-without memory first, and gets it once each of its tensors is in the file in the same shape.
+Neither format can contain code. A configuration is checked against the tensors: a network is first built without
+memory, which is allocated only if all of its tensors are in the file with the same shapes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.task import Task
 
 CONFIG = "config.json"
-MAX_SIZE = 100_000  # rows, points, units: what no model of touch comes near
+MAX_SIZE = 100_000  # maximum number of rows, points or units, far above that of any model
 _KINDS = {
     int: "a whole number",
     float: "a number",
@@ -48,7 +48,7 @@ Kind = type | tuple[type, ...]
 
 @contextlib.contextmanager
 def validated(noun: str) -> Iterator[None]:
-    """Turn errors of files that were made or changed by hand into one sentence about ``noun``."""
+    """Convert errors about files that were created or edited by hand to one sentence about ``noun``."""
     try:
         yield
     except TacpipeError:
@@ -62,7 +62,7 @@ def validated(noun: str) -> Iterator[None]:
 
 
 def task(files: Mapping[str, bytes], place: str = "This") -> Task:
-    """Return the task that a model among ``files`` was trained for. Raises `TacpipeError` if none is."""
+    """Return the task of the model among ``files``. Raises `TacpipeError` if there is none."""
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
@@ -71,9 +71,9 @@ def task(files: Mapping[str, bytes], place: str = "This") -> Task:
 
 
 def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> dict[str, Any]:
-    """Return the mapping that a JSON file holds, in which each of ``needed`` (names with dots) is of its kind.
+    """Return the mapping in a JSON file. ``needed`` gives the type of required values by dotted name.
 
-    Raises `TacpipeError` if it holds none, and for what is missing, of another kind, or absurdly large.
+    Raises `TacpipeError` if it is not a mapping, and for missing values, wrong types and absurd sizes.
     """
     try:
         content = json.loads(files[name])
@@ -96,7 +96,7 @@ def to_json(tree: Mapping[str, object]) -> bytes:
 
 
 def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
-    """Return the tensors of a safetensors file, all finite. Raises `TacpipeError` if it is none."""
+    """Return the tensors in a safetensors file, all finite. Raises `TacpipeError` if it is invalid."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -107,9 +107,9 @@ def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
 
 
 def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, AnyArray]:
-    """Return the arrays of a safetensors file, all finite ``but`` those whose names end so.
+    """Return the arrays in a safetensors file, all finite except those whose names end with ``but``.
 
-    Raises `TacpipeError` if it is none.
+    Raises `TacpipeError` if it is invalid.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -122,14 +122,14 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, An
 
 
 def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
-    """Return the network of ``build`` with these ``weights``; it takes no memory until they fit.
+    """Return the network of ``build`` with these ``weights``. Memory is allocated only if they fit.
 
-    Raises `TacpipeError` if a tensor is missing, too many, or of another shape.
+    Raises `TacpipeError` if a tensor is missing, unexpected, or of another shape.
     """
     import torch
 
     with validated("the model"), torch.device("meta"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Layers without width, which are refused below
+        warnings.simplefilter("ignore")  # layers without width, which are rejected below
         network = build()
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     shapes = {name: tuple(value.shape) for name, value in weights.items()}

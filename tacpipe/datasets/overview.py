@@ -1,4 +1,4 @@
-"""Summarize an open dataset in a few lines, and find the streams of a recording, separate or in one synchronized table."""
+"""Summarize an open dataset in a few lines, and find the streams of a recording, in separate tables or in one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
-NO_SIGNALS = (EVENTS, "truth")  # streams of what went wrong, and of what a simulation knows
+NO_SIGNALS = (EVENTS, "truth")  # streams of events, and of ground truth in a simulation
 
 
 def describe_streams(streams: Sequence[str]) -> str:
@@ -31,15 +31,15 @@ def describe_streams(streams: Sequence[str]) -> str:
 
 
 def streams_of(recording: Recording) -> dict[str, pa.Table]:
-    """Return the table of each stream, under the names that its columns had when they were recorded.
+    """Return the table of each stream with the recorded column names.
 
-    Ground truth and the masks of a synchronized table are left out.
+    Ground truth and the masks of a synchronized table are omitted.
     """
     return split_tables({name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS})
 
 
 def split_tables(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
-    """Return the table of each stream of a recording as `streams_of` does, from the tables as they are stored."""
+    """Return the table of each stream of a recording, as `streams_of` does, from the stored tables."""
     if set(tables) != {""}:
         return {name: table for name, table in tables.items() if name not in NO_SIGNALS}
     table = tables[""]
@@ -50,7 +50,7 @@ def split_tables(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
 
 
 def stored_columns(schema: pa.Schema) -> dict[str, dict[str, str]]:
-    """Return the columns of each stream of a synchronized table: recorded name to stored name, times first."""
+    """Return the stored name by recorded name of each stream's columns in a synchronized table, times first."""
     columns: dict[str, dict[str, str]] = {}
     for field in schema:
         metadata = field.metadata or {}
@@ -65,12 +65,16 @@ def _recorded(name: str, stream: str) -> str:
     return name.removeprefix(f"{stream}_") if stream else name
 
 
-_NAMED, _PARAMS, _LABELS = 4, 6, 8  # recordings or files, params and labels that are listed before the rest is counted
-_VALUES = 5  # values of a label, above which it is counted alone
+_NAMED, _PARAMS, _LABELS = (
+    4,
+    6,
+    8,
+)  # number of recordings or files, params and labels listed before the others are counted
+_VALUES = 5  # a label with more values is only counted
 
 
 def lines(dataset: Dataset) -> list[tuple[str, str]]:
-    """Return (title, text) of each line; streams and rates are those of the first recording, the only one that is read."""
+    """Return (title, text) of each line. Streams and rates are those of the first recording, the only one that is read."""
     manifest = dataset.source
     params = listed([f"{name}={value}" for name, value in manifest.params.items()], _PARAMS)
     rows = [("made by", f"{manifest.stage} version {manifest.version}{f' ({params})' if params else ''}")]
@@ -87,13 +91,13 @@ def lines(dataset: Dataset) -> list[tuple[str, str]]:
 
 
 def text(dataset: Dataset) -> str:
-    """Return the overview as plain text, a line each."""
+    """Return the overview as lines of plain text."""
     body = [f"  {title:<11}{line}" for title, line in lines(dataset)]
     return "\n".join([f"<tacpipe.Dataset {_title(dataset)}>", *body])
 
 
 def html(dataset: Dataset) -> str:
-    """Return the overview as a small table for a notebook; every text is escaped."""
+    """Return the overview as a small table for a notebook, with escaped text."""
     rows = "".join(
         f'<tr><th style="text-align:left">{escape(title)}</th><td style="text-align:left">{escape(line)}</td></tr>'
         for title, line in lines(dataset)
@@ -102,7 +106,7 @@ def html(dataset: Dataset) -> str:
 
 
 def recording_html(recording: Recording) -> str:
-    """Return a recording for a notebook: its labels and a small picture of its streams; every text is escaped."""
+    """Return a recording for a notebook: its labels and a small plot of its streams, with escaped text."""
     from tacpipe.traces import curves, drawing, taxels
 
     labels_shown = [
@@ -152,7 +156,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def _labels(dataset: Dataset) -> str:
-    """Return the labels that take few values, with how many recordings have each; the others are counted."""
+    """Return the labels with few values and the number of recordings for each value; other labels are counted."""
     names = list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
     descriptions = []
     for name in names:

@@ -1,7 +1,8 @@
 """The pages of a large dataset: its recordings, divided by name, each page a small JSON object in the store.
 
-The manifest of such a dataset is a root that lists the pages with their digests and counts. A recording that changes costs
-its page and the root. Where a page begins depends on a recording's name alone, so the same recordings give the same pages.
+The manifest of such a dataset is a root that lists the pages with their digests and counts. Changing a recording
+rewrites its page and the root. Page boundaries depend only on the recordings' names, so the same recordings give the
+same pages.
 """
 
 from __future__ import annotations
@@ -27,24 +28,24 @@ from tacpipe.store.records import Content, RecordingEntry, Shard
 from tacpipe.store.store import MissingError, Store
 
 V = TypeVar("V", bound=Mapping[str, Any])
-INLINE = 1000  # recordings up to which a manifest holds them itself
-GROUPED = 256  # recordings per page, in the mean
-PAGE = "page-"  # begins the name of every page's file in the directory of a dataset
-BEGINS = b'{"labels":'  # begins the object of every page
-EXCLUDED = "excluded"  # the attribute of recordings that stages leave out
-_PARSED = 256  # pages that stay parsed: some 80 MB
-_WRITTEN_BYTES = 1 << 25  # JSON of a key that is kept
+INLINE = 1000  # maximum number of recordings that a manifest contains itself
+GROUPED = 256  # average number of recordings per page
+PAGE = "page-"  # prefix of a page's file name in the directory of a dataset
+BEGINS = b'{"labels":'  # prefix of the content of every page
+EXCLUDED = "excluded"  # attribute of recordings that stages skip
+_PARSED = 256  # maximum number of parsed pages in memory, about 80 MB
+_WRITTEN_BYTES = 1 << 25  # maximum size of cached JSON of a key
 _OPTIONAL: tuple[Literal["labelled", "sourced", "excluded"], ...] = (
     "labelled",
     "sourced",
     "excluded",
-)  # counts, often 0
+)  # counts that are often 0
 _COUNTS = ("bytes", "recordings", "rows", "shard_bytes", *_OPTIONAL)
 _ATTRIBUTES = frozenset((str, int, float, bool, type(None)))
 
 
 class Item(NamedTuple):
-    """A recording of a dataset: its entry, the labels that were set by hand, and the digests of its raw files by name."""
+    """A recording of a dataset: its entry, its hand-set labels, and the digests of its raw files by name."""
 
     entry: RecordingEntry
     labels: Mapping[str, Attribute] | None = None
@@ -52,7 +53,7 @@ class Item(NamedTuple):
 
 
 class PageJson(TypedDict):
-    """A page as a root states it; the fields are those of `Page`."""
+    """A page as stored in a root; the fields are those of `Page`."""
 
     first: str
     digest: str
@@ -70,20 +71,20 @@ class PageJson(TypedDict):
 class Page:
     """The entry of a page in a root."""
 
-    first: str  # name of its first recording
-    digest: str  # names the page's object
+    first: str  # name of the first recording
+    digest: str  # name of the page's object
     bytes: int  # size of the page's object
-    content: str  # digest of names, attributes and digests of shards: what the digest of the dataset is made of
+    content: str  # digest of names, attributes and shard digests, from which the dataset's digest is computed
     recordings: int
     rows: int
     shard_bytes: int
-    labelled: int = 0  # recordings with labels set by hand
-    sourced: int = 0  # recordings with raw files
+    labelled: int = 0  # number of recordings with hand-set labels
+    sourced: int = 0  # number of recordings with raw files
     excluded: int = 0
 
     @classmethod
     def from_json(cls, value: PageJson) -> Page:
-        """Return a page from a root. Raises `ValueError`, `TypeError` or `KeyError` for what no root holds."""
+        """Return a page from a root. Raises `ValueError`, `TypeError` or `KeyError` if it is invalid."""
         page = cls(**value)
         if type(page.first) is not str or page.recordings < 1:
             raise ValueError(f"a page begins with {str(page.first)[:80]!r} and has {page.recordings} recordings")
@@ -96,7 +97,7 @@ class Page:
         return page
 
     def to_json(self) -> PageJson:
-        """Return the page as a root states it, without counts that are 0."""
+        """Return the page as stored in a root, without counts of 0."""
         value = cast("PageJson", asdict(self))
         for name in _OPTIONAL:
             if not value[name]:
@@ -111,7 +112,7 @@ class Page:
 
 @dataclass(frozen=True)
 class PageContent:
-    """The recordings of a page, in the order of names, with hand-set labels and raw files of those that have them."""
+    """The recordings of a page, sorted by name, with their hand-set labels and raw files."""
 
     recordings: dict[str, RecordingEntry]
     labels: dict[str, Mapping[str, Attribute]]
@@ -129,18 +130,18 @@ class PageContent:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> PageContent:
-        """Return the content of a page's object. Raises `ValueError`, `TypeError` or `KeyError` for what is not one."""
+        """Return the content of a page's object. Raises `ValueError`, `TypeError` or `KeyError` if it is invalid."""
         page = cls(**json.loads(content))
         if not all(type(part) is dict for part in (page.recordings, page.labels, page.sources)):
             raise TypeError("it is not a page")
         return page
 
     def to_bytes(self) -> bytes:
-        """Return the page's object: the same content gives the same bytes."""
+        """Return the page's object; equal content gives equal bytes."""
         return canonical(vars(self))
 
     def describe(self, stored: bytes, *, name: str = "") -> Page:
-        """Return what a root states of this page, whose object is ``stored``; ``name`` is its digest, if known."""
+        """Return this page's entry in a root. ``stored`` is its object, ``name`` its digest if known."""
         shards = [shard for entry in self.recordings.values() for shard in entry["shards"].values()]
         return Page(
             next(iter(self.recordings)),
@@ -148,7 +149,7 @@ class PageContent:
             len(stored),
             digest(described(self.recordings)),
             len(self.recordings),
-            sum(shard.get("rows", 0) for shard in shards),  # the input of a key has neither
+            sum(shard.get("rows", 0) for shard in shards),  # entries in the input of a key have neither
             sum(shard.get("bytes", 0) for shard in shards),
             len(self.labels),
             len(self.sources),
@@ -162,7 +163,7 @@ class PageContent:
         }
 
     def check(self) -> None:
-        """Raise `ValueError`, `TypeError` or `KeyError` if a page holds what none can: it may be untrusted."""
+        """Raise `ValueError`, `TypeError` or `KeyError` if a page, which may be untrusted, is invalid."""
         names = list(self.recordings)
         if names != sorted(names) or not {*self.labels, *self.sources} <= self.recordings.keys():
             raise ValueError("its recordings are not in the order of their names")
@@ -173,9 +174,9 @@ class PageContent:
 
 
 class PageReader(Protocol):
-    """Reads the object of a page."""
+    """Reads the objects of pages."""
 
-    place: str  # names where it reads
+    place: str  # location of the objects, for messages
 
     def __call__(self, page: Page) -> bytes:
         """Return the verified bytes of a page's object. Raises `MissingPageError`."""
@@ -186,7 +187,7 @@ class MissingPageError(MissingError):
 
 
 class ObjectReader(Protocol):
-    """A store, in a folder or in a bucket, as far as pages are read from it."""
+    """A store, in a folder or a bucket, from which pages are read."""
 
     @property
     def place(self) -> str:
@@ -197,7 +198,7 @@ class ObjectReader(Protocol):
 
 
 class StoredPages:
-    """Reads pages from a store, or from the ``directory`` of their dataset where the store lacks them."""
+    """Reads pages from a store, or from the ``directory`` of their dataset if the store lacks them."""
 
     def __init__(self, store: ObjectReader | None, directory: Path | None = None) -> None:
         self._store, self._directory = store, directory
@@ -223,7 +224,7 @@ class StoredPages:
         if isinstance(self._store, Store) and self._store.check():
             with contextlib.suppress(
                 TacpipeError
-            ):  # the store may be read-only, and the copy in the directory is as good
+            ):  # the store may be read-only, and the copy in the directory is equivalent
                 self._store.put(copy, durable=True)
         return copy
 
@@ -236,9 +237,9 @@ def _pages_at(place: str | None, directory: Path | None) -> StoredPages:
 
 
 class Pages:
-    """The pages of a dataset, in the order of names, each read and checked when it is needed.
+    """The pages of a dataset, sorted by name; each is read and checked when it is needed.
 
-    ``fresh`` are the objects of those pages that were made in this process and may not be in a store yet, by digest.
+    ``fresh`` contains the objects of pages created in this process, by digest, which may not be stored yet.
     """
 
     def __init__(self, pages: Iterable[Page], read: PageReader | None, fresh: Mapping[str, bytes]) -> None:
@@ -249,11 +250,11 @@ class Pages:
         self._read = read
         self.fresh = fresh
         self._parsed: dict[int, PageContent] = {}
-        self._checked: set[int] = set()  # numbers of pages
+        self._checked: set[int] = set()  # indices of checked pages
 
     @classmethod
     def from_items(cls, items: Iterable[tuple[str, Item]], read: PageReader | None = None) -> Pages:
-        """Return the pages of recordings that come in the order of names."""
+        """Return the pages of recordings that are sorted by name."""
         divided: list[Page] = []
         fresh: dict[str, bytes] = {}
 
@@ -276,14 +277,14 @@ class Pages:
 
     @classmethod
     def joined(cls, parts: Iterable[Pages]) -> Pages:
-        """Return the recordings of several parts, which come in the order of names, divided into pages as ever."""
+        """Return the recordings of several parts, sorted by name, divided into pages in the usual way."""
         divided: list[Page] = []
         fresh: dict[str, bytes] = {}
         read: PageReader | None = None
         for part in parts:
             read = read or part._read
             for number, page in enumerate(part.pages):
-                if divided and not begins(page.first):  # the recording that began the page is gone
+                if divided and not begins(page.first):  # the first recording of the page was removed
                     last = cls([divided.pop()], read, fresh).load(0)
                     merged = cls.from_items(sorted((last.items() | part.load(number).items()).items()))
                     divided += merged.pages
@@ -302,13 +303,13 @@ class Pages:
         return Pages, (self.pages, self._read, self.fresh)
 
     def part(self, number: int) -> Pages:
-        """Return one page."""
+        """Return one page as `Pages`."""
         page = self.pages[number]
         fresh = {page.digest: self.fresh[page.digest]} if page.digest in self.fresh else {}
         return Pages([page], self._read, fresh)
 
     def changed(self, items: Mapping[str, Item | None]) -> Pages:
-        """Return the pages with recordings added or replaced; None leaves one out."""
+        """Return the pages with recordings added or replaced; None removes one."""
         if not items:
             return self
         by_page: dict[int, dict[str, Item | None]] = {}
@@ -327,7 +328,7 @@ class Pages:
         return Pages.joined(parts())
 
     def number(self, name: str) -> int:
-        """Return the number of the page on which a recording of this name is, or would be."""
+        """Return the index of the page that contains a recording with this name, or would contain it."""
         return max(0, bisect_right(self._firsts, name) - 1)
 
     def object(self, page: Page) -> bytes:
@@ -339,10 +340,9 @@ class Pages:
         return self._read(page)
 
     def load(self, number: int) -> PageContent:
-        """Return the content of a page, checked.
+        """Return the checked content of a page.
 
-        Raises `MissingPageError` if its object is missing or damaged, and `DamagedError` if it is not what the root
-        states.
+        Raises `MissingPageError` if its object is missing or damaged, and `DamagedError` if it does not match the root.
         """
         content = self._parsed.get(number)
         if content is None:
@@ -377,16 +377,16 @@ class Pages:
         return sum(map(attrgetter(count), self.pages))
 
     def differing(self, before: Pages) -> Pages:
-        """Return the pages that the dataset ``before`` does not have."""
+        """Return the pages that are not in the dataset ``before``."""
         theirs = {page.digest for page in before.pages}
         return Pages([page for page in self.pages if page.digest not in theirs], self._read, self.fresh)
 
     def missing(self, has: Callable[[str, int], bool]) -> list[Page]:
-        """Return the pages whose object a store lacks, given what asks it for digest and bytes of an object."""
+        """Return the pages whose object a store lacks; ``has`` tests for an object by digest and size in bytes."""
         return [page for page in self.pages if not has(page.digest, page.bytes)]
 
     def keep(self, store: Store, *, durable: bool = False) -> None:
-        """Have a store hold the object of every page. Raises `MissingPageError` for one that is nowhere."""
+        """Store the object of every page. Raises `MissingPageError` for one that cannot be found."""
         store.announce([page.digest for page in self.pages])
         for page in self.pages:
             if (durable and page.digest in self.fresh) or not store.has(page.digest, page.bytes):
@@ -394,7 +394,7 @@ class Pages:
 
 
 class _View(Mapping[str, V]):
-    """A part of what pages hold of recordings, by name."""
+    """One field of the recordings in pages, by name."""
 
     part: str  # field of `PageContent`
     count: str  # field of `Page`
@@ -435,7 +435,7 @@ class Recordings(_View[RecordingEntry]):
 
 
 class Labels(_View[Mapping[str, Attribute]]):
-    """The labels set by hand on recordings of a dataset in pages."""
+    """The hand-set labels of the recordings of a dataset in pages."""
 
     part, count = "labels", "labelled"
 
@@ -447,11 +447,11 @@ class SourceDigests(_View[Mapping[str, str]]):
 
 
 class KeyRecordings(Recordings, Written):
-    """The part of each recording that a key holds: attributes and digests of streams. It is written page by page."""
+    """The part of each recording that enters a key: attributes and stream digests. It is encoded page by page."""
 
     def __init__(self, pages: Pages) -> None:
         super().__init__(pages)
-        self._json_by_page: dict[int, bytes] = {}  # JSON by number of the page, up to `_WRITTEN_BYTES`
+        self._json_by_page: dict[int, bytes] = {}  # JSON by page index, up to `_WRITTEN_BYTES`
         self._written_bytes = 0
 
     def __getitem__(self, name: str) -> RecordingEntry:
@@ -478,22 +478,22 @@ class KeyRecordings(Recordings, Written):
 
 
 class RecordGroup(NamedTuple):
-    """Recordings that follow each other in the order of names, whose results have one record together."""
+    """Consecutive recordings in name order whose results share one record."""
 
-    page: str  # digest of the page that holds exactly these, or empty if recordings are not in pages
+    page: str  # digest of the page with exactly these recordings, or empty if there are no pages
     entries: Callable[[], Mapping[str, RecordingEntry]]
 
 
 def begins(name: str) -> bool:
-    """Return whether a page, and a group of recordings that has a record, begins with the recording of this name.
+    """Return whether a page and a group of recordings start at the recording with this name.
 
-    That depends on the name alone, so a recording that comes or goes changes one page, or two.
+    This depends only on the name, so adding or removing a recording changes one or two pages.
     """
     return zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0
 
 
 def group_names(names: Iterable[str]) -> Iterator[list[str]]:
-    """Yield names, sorted, in groups of about `GROUPED`, of which one more or one less name changes one or two.
+    """Yield sorted names in groups of about `GROUPED`; adding or removing a name changes one or two groups.
 
     >>> names = [f"trial-{number:04d}" for number in range(2000)]
     >>> before, now = (set(map(tuple, group_names(some))) for some in (names, [*names, "trial-0500-again"]))
@@ -511,7 +511,7 @@ def group_names(names: Iterable[str]) -> Iterator[list[str]]:
 
 
 def groups(recordings: Mapping[str, RecordingEntry]) -> Iterator[RecordGroup]:
-    """Yield the groups of recordings; of a dataset in pages none is read yet."""
+    """Yield the groups of recordings without reading pages."""
     if isinstance(recordings, Recordings):
         pages = recordings.pages
         for number, page in enumerate(pages.pages):
@@ -522,7 +522,7 @@ def groups(recordings: Mapping[str, RecordingEntry]) -> Iterator[RecordGroup]:
 
 
 def parts(recordings: Mapping[str, V]) -> Iterator[Mapping[str, V]]:
-    """Yield what is known of recordings by name: a page at a time, or all at once where they are not in pages."""
+    """Yield values by recording: one page at a time, or all at once if there are no pages."""
     if isinstance(recordings, _View):
         yield from recordings.parts()
     else:
@@ -530,7 +530,7 @@ def parts(recordings: Mapping[str, V]) -> Iterator[Mapping[str, V]]:
 
 
 def differing(before: Mapping[str, V], now: Mapping[str, V]) -> tuple[Mapping[str, V], Mapping[str, V]]:
-    """Return what is known of those recordings of two datasets that are not on a page which both have."""
+    """Return the values by recording of two datasets, without those on pages that both have."""
     if isinstance(before, _View) and isinstance(now, _View):
         return type(before)(before.pages.differing(now.pages)), type(now)(now.pages.differing(before.pages))
     return before, now
@@ -539,7 +539,7 @@ def differing(before: Mapping[str, V], now: Mapping[str, V]) -> tuple[Mapping[st
 def compared(
     before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> Iterator[tuple[str, RecordingEntry | None, RecordingEntry | None]]:
-    """Yield name, entry before and entry now of all recordings of two datasets, in the order of names."""
+    """Yield name, old entry and new entry of all recordings of two datasets, sorted by name."""
     before_items, now_items = (iter(_in_order(recordings)) for recordings in (before, now))
     old, new = next(before_items, None), next(now_items, None)
     while old is not None or new is not None:
@@ -560,14 +560,14 @@ def _in_order(recordings: Mapping[str, RecordingEntry]) -> Iterator[tuple[str, R
 
 
 class DescribedEntry(TypedDict):
-    """The part of a recording that the digest of a dataset is made of."""
+    """The part of a recording that enters the digest of a dataset."""
 
     attributes: Mapping[str, Attribute]
     shards: dict[str, str]  # digest by stream
 
 
 def described(recordings: Mapping[str, RecordingEntry]) -> dict[str, DescribedEntry]:
-    """Return the part of recordings that the digest of a dataset is made of."""
+    """Return the part of recordings that enters the digest of a dataset."""
     return {
         name: {
             "attributes": entry["attributes"],
@@ -578,13 +578,13 @@ def described(recordings: Mapping[str, RecordingEntry]) -> dict[str, DescribedEn
 
 
 def key_entry(entry: RecordingEntry) -> RecordingEntry:
-    """Return the part of a recording that a key holds: attributes, and the digests of streams."""
+    """Return the part of a recording that enters a key: attributes and stream digests."""
     shards: dict[str, Shard] = {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()}
     return {"attributes": entry["attributes"], "shards": shards}
 
 
 def check_entries(recordings: Mapping[str, RecordingEntry]) -> list[str]:
-    """Return the paths of all shards. Raises `ValueError`, `TypeError` or `KeyError` for an entry that none can be."""
+    """Return the paths of all shards. Raises `ValueError`, `TypeError` or `KeyError` for an invalid entry."""
     for entry in recordings.values():
         if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
             _refuse_attributes(entry["attributes"])
@@ -603,7 +603,7 @@ def _refuse_attributes(attributes: Mapping[str, Attribute]) -> None:
 
 
 def check_contents(contents: Iterable[Content]) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` if shards or files have no digest, or no size in bytes."""
+    """Raise `ValueError`, `TypeError` or `KeyError` if shards or files lack a digest or a size in bytes."""
     contents = list(contents)
     check_counts([content["bytes"] for content in contents])
     for name in (content["digest"] for content in contents):
@@ -612,7 +612,7 @@ def check_contents(contents: Iterable[Content]) -> None:
 
 
 def check_counts(counts: Iterable[Any]) -> None:
-    """Raise `ValueError` for what is not a count of rows or bytes."""
+    """Raise `ValueError` for an invalid count of rows or bytes."""
     for count in counts:
         if type(count) is not int or count < 0:
             raise ValueError(f"{str(count)[:80]!r} is not a count of rows or bytes")

@@ -1,7 +1,8 @@
 """Check the names of recordings and the paths of their files in a dataset's directory.
 
-A recording's name becomes a file and a folder of each dataset down the chain. So it has no separators and no control
-characters, it leaves room for an extension, and no two names of a dataset differ only in case: some file systems fold it.
+A recording's name becomes a file and a folder name of each derived dataset. So it contains no separators or control
+characters, leaves room for an extension, and no two names of a dataset differ only in case, because some file systems
+ignore case.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from tacpipe.io.hashing import bytes_digest
 from tacpipe.printable import plain
 
 MANIFEST = "manifest.json"
-NAME_BYTES = 200  # Longest part of a path; file systems allow 255, and drafts add to it
-_PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # the last: of Zarr
+NAME_BYTES = 200  # maximum length of a path component; file systems allow 255, and drafts append to it
+_PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # or a file of Zarr
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
 _SHARED = f"two of its shards and files share a path, or one is called {MANIFEST}"
 
 
 def shard_path(recording: str, stream: str) -> str:
-    """Return the path of a shard within its dataset directory.
+    """Return the path of a shard in its dataset's directory.
 
     >>> shard_path("trial-01", "xela1"), shard_path("trial-01", "")
     ('trial-01/xela1.parquet', 'trial-01.parquet')
@@ -42,14 +43,14 @@ def safe_path(path: str) -> bool:
     """
     try:
         short = all(len(part.encode()) <= NAME_BYTES for part in path.split("/"))
-    except UnicodeEncodeError:  # half a character: no file has such a name
+    except UnicodeEncodeError:  # a lone surrogate, which no file name contains
         return False
     return short and _PATH.fullmatch(path) is not None
 
 
 def check_paths(paths: Sequence[str], taken_paths: Collection[str]) -> None:
-    """Raise `ValueError` if a path is not safe, or is there twice, or among ``taken_paths``."""
-    text = "\n".join(paths)  # hundreds at once: a hit does not wait for a thousand calls
+    """Raise `ValueError` if a path is not safe, occurs twice, or is among ``taken_paths``."""
+    text = "\n".join(paths)  # checked together, because a hit should not wait for a thousand calls
     plain = text and text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
     if not plain or max(map(len, paths), default=0) > NAME_BYTES:
         for path in paths:
@@ -61,13 +62,13 @@ def check_paths(paths: Sequence[str], taken_paths: Collection[str]) -> None:
 
 
 def refuse_shared_paths(paths: Sequence[str]) -> None:
-    """Raise `ValueError` if two paths are one."""
+    """Raise `ValueError` if a path occurs twice."""
     if len(set(paths)) < len(paths):
         raise ValueError(_SHARED)
 
 
 MAX_NAME_BYTES = NAME_BYTES - len(".parquet")  # bytes of UTF-8
-_MARK = 8  # hex digits of the digest that ends a name that was cut
+_MARK = 8  # hex digits of the digest at the end of a truncated name
 _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._-")
 
 
@@ -90,7 +91,7 @@ def valid_name(text: str) -> str:
 
 
 def folded_name(name: str) -> str:
-    """Return what two names share that are one to a file system without case.
+    """Return a form of a name that is equal for names that a case-insensitive file system treats as one.
 
     >>> folded_name("Cup") == folded_name("cUP"), folded_name("木") == folded_name("石")
     (True, False)
@@ -99,7 +100,7 @@ def folded_name(name: str) -> str:
 
 
 def refuse_shared_names(recordings: Iterable[tuple[str, Path]]) -> None:
-    """Raise `UsageError` if two recordings, each (name, folder or file), have names that differ at most in case."""
+    """Raise `UsageError` if two recordings, given as (name, folder or file), have names that differ at most in case."""
     by_folded_name: dict[str, tuple[str, Path]] = {}
     for recording in recordings:
         earlier = by_folded_name.setdefault(folded_name(recording[0]), recording)
@@ -113,10 +114,10 @@ def refuse_shared_names(recordings: Iterable[tuple[str, Path]]) -> None:
 
 
 def verified_copy(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
-    """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
+    """Return the verified object ``name`` from ``path`` in one of the dataset directories, or None if there is none.
 
-    It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.
-    Raises `StorageError` if none has it and one may: the system failed to read what lies there, or memory is short.
+    The file may be a link, as created by DVC and git-annex; its digest is checked. ``size`` is declared by its
+    manifest. Raises `StorageError` if none was found but a file could not be read, or memory is short.
     """
     failed: StorageError | None = None
     for directory in directories:

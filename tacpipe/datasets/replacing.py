@@ -1,13 +1,13 @@
-"""Decide whether a command may replace its output: recordings and labels cannot be recomputed.
+"""Decide whether a command may replace its output, because recordings and labels cannot be recomputed.
 
 The rules, each with exit code 2:
 
-- an output that is one of the command's inputs is always refused;
-- a dataset of another stage, and recordings or hand-set labels that the new dataset would not hold, need ``--replace``;
-- files of an export that somebody edited need ``--replace``;
-- a stage may write its own dataset again: other params and other inputs are what it is for.
+- an output that is one of the command's inputs is never replaced;
+- a dataset of another stage, and recordings or hand-set labels that the new dataset lacks, require ``--replace``;
+- edited files of an export require ``--replace``;
+- a stage may replace its own dataset, which has other params or other inputs.
 
-What was replaced stays in the store and is listed by `tacpipe store list`.
+Replaced content stays in the store and is listed by `tacpipe store list`.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from tacpipe.printable import listed, plain
 from tacpipe.store import layout
 from tacpipe.store.store import Store
 
-_SHOWN = 5  # names listed before the rest is counted
+_SHOWN = 5  # number of names listed before the others are counted
 _BACK = "What is there now stays in the store, and `tacpipe store list` names it."
 _KEEP = f"Give -o another directory, or --replace. {_BACK}"
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Names of recordings that a new dataset lacks or has with other content, and of those whose labels it lacks."""
+    """Recordings that a new dataset lacks or has with other content, and recordings whose labels it lacks."""
 
     recordings: Sequence[str] = ()
     labels: Sequence[str] = ()
@@ -53,11 +53,11 @@ class ResultPlan:
     stage: str
     version: int
     params: Values = field(default_factory=dict)
-    sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # Digests of raw files by recording
+    sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # digests of raw files by recording
 
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, an address, or within a store."""
+    """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, an address, or inside a store."""
     files.local(output)
     layout.refuse_within(output)
     for path in inputs:
@@ -72,7 +72,7 @@ def _same(output: Path, path: Path) -> bool:
 
 
 def refuse_foreign(path: Path, mark: bytes) -> None:
-    """Raise `UsageError` if the file at ``path`` lacks ``mark`` in its first 64 KiB: another program wrote it."""
+    """Raise `UsageError` if the file at ``path`` lacks ``mark`` in its first 64 KiB, because another program wrote it."""
     if not path.exists():
         return
     beginning = b""
@@ -84,10 +84,10 @@ def refuse_foreign(path: Path, mark: bytes) -> None:
 
 
 def occupant(store: Store, output: Path) -> Manifest | None:
-    """Return the manifest of the dataset at ``output``, None if there is none.
+    """Return the manifest of the dataset at ``output``, or None if there is none.
 
-    A damaged one is read from the store. Raises `DamagedError` if that is not possible, because the content to replace is
-    then unknown.
+    A damaged one is read from the store. Raises `DamagedError` if that is not possible, because the content to replace
+    is then unknown.
     """
     if not (output / manifest_of.NAME).exists():
         return None
@@ -106,7 +106,7 @@ def occupant(store: Store, output: Path) -> Manifest | None:
 
 
 def former(store: Store, output: Path) -> Manifest | None:
-    """Return the manifest that was last written at ``output``, whatever is there now; None if the store has none."""
+    """Return the manifest that was last written at ``output``, whatever is there now, or None if the store has none."""
     root = store.roots.get(output.absolute())
     try:
         if root is not None:
@@ -119,19 +119,19 @@ def former(store: Store, output: Path) -> Manifest | None:
 
 
 def irreplaceable(manifest: Manifest) -> bool:
-    """Return whether the recordings were ingested or acquired: no stage can compute them from anything in the store."""
+    """Return whether the recordings were ingested or acquired, so that no stage can recompute them."""
     return manifest.stage == ACQUIRE or bool(manifest.sources)
 
 
 def lasting(manifest: Manifest) -> bool:
-    """Return whether a dataset holds recordings or labels set by hand, which no stage can compute again."""
+    """Return whether a dataset contains recordings or hand-set labels, which no stage can recompute."""
     return irreplaceable(manifest) or bool(manifest.labels)
 
 
 def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield what ``manifest`` holds that cannot be computed again, in a form in which manifests can be compared.
+    """Yield the irreplaceable content of ``manifest`` in a form that can be compared between manifests.
 
-    Each is (what it is, value): a recording by name and content, and a label by that and its own name, with its value.
+    Each item is (identity, value): a recording is identified by name and content, a label also by its own name.
     """
     lasts = irreplaceable(manifest)
     for name in manifest.recordings if lasts else manifest.labels:
@@ -146,10 +146,10 @@ def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
 
 
 def losses(before: Manifest, after: Manifest) -> Losses:
-    """Return what of ``before`` cannot be computed again and is not in ``after``."""
+    """Return the irreplaceable content of ``before`` that ``after`` lacks."""
     if not lasting(before):
         return Losses()
-    lost: dict[bool, list[str]] = {True: [], False: []}  # names by whether the recording is lost, or labels alone
+    lost: dict[bool, list[str]] = {True: [], False: []}  # names by whether the recording is lost, or only labels
     for name in pages.differing(before.recordings, after.recordings)[0]:
         if irreplaceable(before) and _is_gone(name, before, after):
             lost[True].append(name)
@@ -159,9 +159,9 @@ def losses(before: Manifest, after: Manifest) -> Losses:
 
 
 def _is_gone(name: str, before: Manifest, after: Manifest) -> bool:
-    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name.
+    """Return whether ``after`` has neither the content nor the raw files of a recording under its name.
 
-    An acquired recording has no raw files: its source is the rig file, which it shares with others.
+    An acquired recording has no raw files of its own: its source is the rig file, which it shares with others.
     """
     if name not in after.recordings:
         return True
@@ -171,12 +171,12 @@ def _is_gone(name: str, before: Manifest, after: Manifest) -> bool:
 
 
 def _raw(source: Mapping[str, str]) -> dict[str, str]:
-    """Return the digests of a recording's raw files, without the digest of its labels."""
+    """Return the digests of a recording's raw files, without that of its labels."""
     return {file: digest for file, digest in source.items() if file != VALUES}
 
 
 def refuse_plan(before: Manifest | None, output: Path, plan: ResultPlan) -> None:
-    """Raise `UsageError` if ``plan`` would replace recordings or labels; this is checked before anything is computed."""
+    """Raise `UsageError` if ``plan`` would replace recordings or labels. This is checked before anything is computed."""
     if before is None:
         return
     if before.stage != plan.stage:
@@ -201,7 +201,7 @@ def refuse_plan(before: Manifest | None, output: Path, plan: ResultPlan) -> None
 
 
 def _refuse_alike(before: Manifest, output: Path, plan: ResultPlan, hint: str) -> None:
-    """Raise `UsageError` if a new recording has the raw files of an existing one, or its name except for case."""
+    """Raise `UsageError` if a new recording has the raw files of an existing one, or its name in other case."""
     new = [name for name in plan.sources if name not in before.recordings]
     if not new:
         return
@@ -239,7 +239,7 @@ def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> Non
 
 
 def edited(output: Path, paths: Sequence[str]) -> UsageError:
-    """Return the error for files of an export that somebody edited."""
+    """Return the error for edited files of an export."""
     plural = len(paths) > 1
     return UsageError(
         f"{output} holds {'files' if plural else 'a file'} that {'were' if plural else 'was'} edited after the export "
@@ -251,7 +251,7 @@ def edited(output: Path, paths: Sequence[str]) -> UsageError:
 def appended(before: Manifest, ingested: Manifest) -> Manifest:
     """Return the recordings of ``before`` and ``ingested``, which takes precedence.
 
-    Recordings that could not be read this time stay as they were.
+    Recordings that could not be read this time are kept unchanged.
     """
     items = {name: Item(entry, None, ingested.sources.get(name)) for name, entry in ingested.recordings.items()}
     combined = before.with_recordings(items)
@@ -268,9 +268,9 @@ def appended(before: Manifest, ingested: Manifest) -> Manifest:
 def returning_labels(
     store: Store, output: Path, before: Manifest | None, result: Manifest
 ) -> dict[str, Mapping[str, Attribute]]:
-    """Return the hand-set labels of recordings that return to ``output``: they were there earlier, but not in ``before``.
+    """Return the hand-set labels of recordings that return to ``output``, which had them earlier, but not in ``before``.
 
-    A recording returns if it has the same content or raw files; it gets the labels that it had last.
+    A recording returns if it has the same content or raw files; it gets its last labels.
     """
     coming = {
         name
@@ -280,7 +280,7 @@ def returning_labels(
     root = store.roots.get(output.absolute()) if coming else None
     if root is None:
         return {}
-    # The successor of a manifest that is not lasting holds the same recordings
+    # the successor of a manifest that is not lasting contains the same recordings
     names = [root["manifest"], *(version["manifest"] for version in root.get("history", []) if version["lasting"])]
     labels: dict[str, Mapping[str, Attribute]] = {}
     for name in names if before is None else [name for name in names if name != before.content_digest]:
@@ -302,9 +302,9 @@ def returning_labels(
 
 
 def outgoing(store: Store, directory: Path) -> Manifest | None:
-    """Return the manifest that a publication at ``directory`` replaces, None if there is none.
+    """Return the manifest that a publication at ``directory`` replaces, or None if there is none.
 
-    The store has it afterwards, so that it can be checked out: a manifest from git, or a copy, is stored.
+    It is stored, even if it comes from git or from a copy, so that it can be checked out later.
     """
     try:
         dataset = manifest_of.find(directory)

@@ -1,7 +1,7 @@
-"""Select recordings of a dataset by names, roles and labels, and read several datasets as one.
+"""Select recordings of a dataset by names, roles and labels, and merge datasets.
 
-The attributes of a result state whether its recordings were simulated, or belong to a published set. What a paper printed
-stands next to results on its data only, and a lab's recordings have no such mark.
+The attributes of a result record whether its recordings were simulated or belong to a published set. Figures of a paper
+are shown only next to results on its data; a lab's own recordings are not marked.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Wanted
 
 SPLIT_FILE = "split.parquet"
-_RECORDING = "split"  # the name of a split's only recording
+_RECORDING = "split"  # name of a split's only recording
 
 
 def split_digest(manifest: Manifest, place: str) -> str:
-    """Return the digest of the table of a split. Raises `UsageError`, which names ``place``, for any other dataset."""
+    """Return the digest of a split's table. Raises `UsageError`, which names ``place``, for any other dataset."""
     if set(manifest.recordings) != {_RECORDING}:
         raise UsageError(f"{place} is not a split; make one with `tacpipe split`.")
     return manifest.recordings[_RECORDING]["shards"][""]["digest"]
 
 
 def read_roles(content: bytes) -> dict[tuple[str, int], str]:
-    """Return (recording, fold) to role from the Parquet bytes of a split."""
+    """Return the role by (recording, fold) from the Parquet bytes of a split."""
     from tacpipe.io.parquet import from_parquet
 
     rows = from_parquet(content, ["recording", "fold", "role"]).to_pydict()
@@ -40,18 +40,18 @@ def read_roles(content: bytes) -> dict[tuple[str, int], str]:
 
 
 def roles_in_fold(roles: Mapping[tuple[str, int], str], fold: int, place: str) -> dict[str, str]:
-    """Return recording to role in a fold of the split ``place``. Raises `UsageError` if it has no such fold."""
+    """Return the role by recording in a fold of the split ``place``. Raises `UsageError` if it has no such fold."""
     folds = sorted({number for _, number in roles})
     if fold not in folds:
         raise UsageError(f"The split {place} has the folds {folds}, not {fold}.")
     return {recording: role for (recording, number), role in roles.items() if number == fold}
 
 
-_SHOWN, _LABELS = 5, 12  # names or values, and labels, that an error lists
+_SHOWN, _LABELS = 5, 12  # number of names or values, and of labels, in an error
 
 
 def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, str] | None:
-    """Return recording to role in ``fold`` of an opened split, None without one.
+    """Return the role by recording in ``fold`` of an opened split, or None without a split.
 
     Raises `UsageError` if it is not a split or has no such fold, and for a role or a fold without a split.
     """
@@ -78,7 +78,7 @@ def chosen(
 ) -> list[str]:
     """Return the names of the recordings that match a pattern, have the role and meet each condition on a label.
 
-    Raises `UsageError` if none does, and for a label that no recording has.
+    Raises `UsageError` if there are none, and for a label that no recording has.
     """
     names = [
         name for name in dataset.recordings if not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
@@ -128,7 +128,7 @@ def _test(condition: Wanted) -> Callable[[Attribute], Any]:
 
 
 class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
-    """The attributes of each recording by name, in the order of names; of a large dataset each is read when asked for."""
+    """The attributes of each recording, sorted by name; for a large dataset they are read on access."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._recordings = dataset.recordings
@@ -147,7 +147,7 @@ PUBLISHED, SIMULATED = "published", "simulated"
 
 
 def combine_origins(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
-    """Return the attributes of a result of several recordings: simulated if any is, published if all are.
+    """Return the attributes of a result of several recordings: simulated if any of them is, published if all are.
 
     >>> combine_origins([{"published": "b"}, {"published": "a"}]), combine_origins([{"published": "a"}, {"simulated": True}])
     ({'published': 'a,b'}, {'simulated': True})
@@ -163,9 +163,9 @@ def combine_origins(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, 
 
 
 def merge_manifests(manifests: Sequence[Manifest]) -> Manifest:
-    """Return several datasets of one kind read as one.
+    """Return several datasets of the same kind merged into one.
 
-    Raises `UsageError` if two recordings share a name, if the files differ, or if other chains of stages lie behind them.
+    Raises `UsageError` if two recordings share a name, or if files or chains of stages differ.
     """
     if len(manifests) == 1:
         return manifests[0]

@@ -1,7 +1,7 @@
-"""Assign roles of training, validation and test to whole recordings, never to windows.
+"""Assign the roles train, val, calibration and test to whole recordings, never to windows.
 
-Windows of one recording overlap and resemble each other, so a split among them would test on what was trained on.
-Everything here follows from names, attributes and a seed; the order in which names are given does not matter.
+Windows of one recording overlap and resemble each other, so splitting them would test on training data. Roles depend
+only on names, attributes and a seed, not on the order of the names.
 """
 
 from __future__ import annotations
@@ -19,63 +19,65 @@ from tacpipe.plugins.stage import ROLES, Attribute
 from tacpipe.printable import listed, plain, suggestion
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
-SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # Fractions of validation recordings that errors suggest
-_NAMED = 12  # attributes that an error names
-UNUSED = "unused"  # role of those that a few-shot split takes out of training
+SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # fractions of validation recordings that errors suggest
+_NAMED = 12  # number of attributes named in an error
+UNUSED = "unused"  # role of recordings that a few-shot split removes from training
 Attributes = Mapping[str, Attribute]
 Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """How recordings are dealt out."""
+    """How recordings are assigned to roles."""
 
     name: str = "random"
-    val: float = 0.15  # fraction of the recordings, or of those left for training where the scheme picks the test ones
-    calibration: float = 0.0  # fraction to calibrate on, of the same recordings as val
-    test: float = 0.15  # fraction of the recordings; of no effect where the scheme picks them
-    seed: int = 0
-    folds: int = 5  # Number of folds of kfold
-    by: str = "object"  # attribute whose values leave-one-out leaves out one by one
-    stratify: str = ""  # attributes, with commas between, whose values are spread evenly over the roles; empty for none
-    apart: str = (
-        ""  # For kfold: attribute whose values are divided among the folds too, unknown in their fold; empty for none
+    val: float = (
+        0.15  # fraction of the recordings, or of the training recordings if the scheme selects the test recordings
     )
-    repeats: int = 1  # For random: number of folds, each another draw
-    reverse: bool = False  # For blocked: test the first and train on the last
-    few: int = 0  # Number of training recordings, others are unused; 0 for all
-    few_by: str = ""  # attribute of whose every value ``few`` train; empty for ``few`` altogether
-    few_of: str = ""  # attribute=value of those that ``few`` is about, as sensor=roboskin; empty for all
+    calibration: float = 0.0  # fraction for calibration, of the same recordings as val
+    test: float = 0.15  # fraction of the recordings; ignored if the scheme selects them
+    seed: int = 0
+    folds: int = 5  # kfold: number of folds
+    by: str = "object"  # leave-one-out: attribute whose values are left out one by one
+    stratify: str = ""  # comma-separated attributes whose values are spread evenly over the roles; empty for none
+    apart: str = ""  # kfold: attribute whose values are divided among the folds, each unknown in one; empty for none
+    repeats: int = 1  # random: number of folds, each drawn independently
+    reverse: bool = False  # blocked: test the first recordings and train on the last
+    few: int = 0  # number of training recordings, the others are unused; 0 for all
+    few_by: str = ""  # attribute with ``few`` training recordings per value; empty for ``few`` in total
+    few_of: str = (
+        ""  # attribute=value of the recordings that ``few`` applies to, such as sensor=roboskin; empty for all
+    )
 
 
 def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
-    """Return the role of each recording in each fold; ``attributes`` holds those of each recording by name.
+    """Return the role of each recording in each fold. ``attributes`` contains the attributes of each recording by name.
 
     ============== =====================================================================================
-    random         shares ``test``, ``val`` and ``calibration`` drawn at random, anew in each of ``repeats`` folds
-    kfold          in fold k the k-th of ``folds`` even parts is tested, ``val`` of the others drawn at random
-    blocked        in the order of names, which is that of time for most sets: train, then calibration, val, test;
-                   with ``reverse`` the other way round
-    leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
-    authors        what the attribute ``authors_role`` states; with no val among them, ``val`` of train is drawn.
-                   Where some have ``authors_fold``, a fold a block: see below
+    random         fractions ``test``, ``val`` and ``calibration``, drawn independently in each of ``repeats`` folds
+    kfold          in fold k the k-th of ``folds`` equal parts is tested, ``val`` of the others is drawn at random
+    blocked        in the order of names, which for most sets is that of time: train, then calibration, val, test;
+                   reversed with ``reverse``
+    leave-one-out  in fold k the recordings with the k-th value of ``by`` are tested
+    authors        the attribute ``authors_role``; if none of them is val, ``val`` of train is drawn.
+                   If recordings have ``authors_fold``, there is one fold per block: see below
     ============== =====================================================================================
 
-    In all schemes ``calibration`` is a fraction, of the same recordings as ``val``.
+    In all schemes ``calibration`` is a fraction of the same recordings as ``val``.
 
-    Blocks of ``authors_fold`` take turns: where some recordings have the ``authors_role`` test, these are tested in every
-    fold, and the k-th block is val in fold k. Where none has, the k-th block is tested, and ``val`` of the others is
-    drawn. Recordings with neither attribute are dealt into as many even parts, which take the same turns.
+    Blocks of ``authors_fold`` take turns. If recordings have the ``authors_role`` test, these are tested in every fold,
+    and the k-th block is val in fold k. Otherwise the k-th block is tested, and ``val`` of the others is drawn.
+    Recordings with neither attribute are divided into as many equal parts, which take the same turns.
 
-    With ``apart``, fold k of kfold tests all recordings of the k-th even part of that attribute's values, so that nothing
-    of these values is in train or val, and of the other recordings those of their own k-th part. So unknown and known
-    values are tested side by side, and over the folds every value is unknown once.
+    With ``apart``, fold k of kfold tests all recordings with the attribute's values in its k-th part, so that none of
+    these values is in train or val, and in addition the k-th part of the other recordings. So unknown and known values
+    are tested together, and every value is unknown in one fold.
 
-    With ``few``, so many of those that would train do, spread evenly over the values of ``stratify``, and the others get
-    the role ``unused``. Those of a smaller ``few`` are among those of a larger one.
+    With ``few``, only this number of the training recordings is used, spread evenly over the values of ``stratify``;
+    the others have the role ``unused``. The recordings of a smaller ``few`` are a subset of those of a larger one.
 
-    ``keep`` holds roles of an older split: they stay, and only recordings without any are dealt out. Raises
-    `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
+    ``keep`` contains the roles of an older split, which are not changed; only recordings without a role are assigned.
+    Raises `TacpipeError` for an invalid scheme, fraction or attribute, and if no recording is left for training.
     """
     _check(attributes, scheme)
     fresh = sorted(set(attributes).difference(name for name, _ in keep))
@@ -115,7 +117,7 @@ def without_val(roles: Mapping[tuple[str, int], str]) -> list[int]:
 def sufficient_val(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}
 ) -> float | None:
-    """Return the smallest of some larger shares ``val`` that leaves no fold without validation recordings, or None.
+    """Return the smallest of some larger fractions ``val`` with validation recordings in each fold, or None.
 
     Arguments are those of `assign`.
     """
@@ -123,7 +125,7 @@ def sufficient_val(
         try:
             if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep)):
                 return val
-        except TacpipeError:  # Such a large share leaves nothing to train on
+        except TacpipeError:  # such a large fraction leaves no training recordings
             continue
     return None
 
@@ -169,13 +171,13 @@ def _check_options(scheme: Scheme) -> None:
 
 
 def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
-    """Return roles with the fractions that the scheme states, each value of ``stratify`` spread evenly over them."""
+    """Return roles with the fractions of the scheme, with the values of ``stratify`` spread evenly over them."""
     order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
     return _in_turn(order, scheme, ("test", "val", "calibration", "train"))
 
 
 def _in_turn(order: Sequence[str], scheme: Scheme, roles: Sequence[str]) -> dict[str, str]:
-    """Return the role of each recording: the first recordings of the order have the first role, and so on."""
+    """Return the role of each recording: the first recordings in ``order`` have the first role, and so on."""
     shares = {"val": scheme.val, "calibration": scheme.calibration, "test": scheme.test}
     counts = {role: round(share * len(order)) for role, share in shares.items()}
     counts["train"] = len(order) - sum(counts.values())
@@ -185,9 +187,9 @@ def _in_turn(order: Sequence[str], scheme: Scheme, roles: Sequence[str]) -> dict
 def _order(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, rng: np.random.Generator
 ) -> list[str]:
-    """Return the names in an order that, cut anywhere, cuts every stratum at the same share, to within one recording.
+    """Return the names in an order in which every prefix has the same fraction of each stratum, to within one recording.
 
-    Recordings are shuffled within their stratum and put at (rank + 1/2) / size of it.
+    Recordings are shuffled in their stratum and placed at (rank + 1/2) / size.
     """
     places: dict[str, float] = {}
     for stratum in _strata(names, attributes, scheme).values():
@@ -200,7 +202,7 @@ def _order(
 def _limit_training(
     roles: Roles, older_roles: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> Roles:
-    """Return the role ``unused`` for those that would train beyond ``few``; what an older split trains on counts."""
+    """Assign the role ``unused`` to training recordings beyond ``few``; training recordings of an older split are kept."""
     attribute, _, value = scheme.few_of.partition("=")
     candidates = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
     if not candidates:
@@ -299,7 +301,7 @@ def _kfold(
 
 
 def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int) -> dict[str, int]:
-    """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
+    """Assign shuffled recordings to parts in turn, stratum by stratum, so that part sizes differ by at most one."""
     rng = np.random.default_rng(scheme.seed)
     strata = _strata(names, attributes, scheme).values()
     order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
@@ -309,9 +311,9 @@ def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: S
 def _unknown(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> dict[str, int]:
-    """Return, by recording, the fold in which the recording's value of ``apart`` is unknown.
+    """Return the fold in which each recording's value of ``apart`` is unknown.
 
-    Values are shuffled, and each goes to the fold that has fewest; those of an older split stay where they were.
+    Values are shuffled, and each is assigned to the fold with the fewest; values of an older split keep their fold.
     """
     values = {name: _value(name, attributes, scheme.apart) for name in sorted(attributes)}
     distinct = _ordered(set(values.values()))
@@ -330,7 +332,7 @@ def _unknown(
 
 
 def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
-    """Return the fold in which an older split tests all recordings of a value, by value."""
+    """Return by value the fold in which an older split tests all of its recordings."""
     folds_of: dict[str, set[int]] = {name: set() for name, _ in keep if name in values}
     for (name, fold), role in keep.items():
         if role == "test" and name in folds_of:
@@ -368,7 +370,7 @@ def _leave_one_out(
 def _older_roles(
     attributes: Mapping[str, Attributes], keep: Mapping[tuple[str, int], str], folds: int, scheme: Scheme
 ) -> Roles:
-    """Return the older roles of recordings that still exist. Raises `TacpipeError` if they do not fit the scheme."""
+    """Return the older roles of recordings that still exist. Raises `TacpipeError` if they do not match the scheme."""
     old = {fold for _, fold in keep}
     grown = scheme.name == "leave-one-out" and len(old) <= folds  # a new value adds a fold
     if keep and old != set(range(folds)) and not grown:
@@ -382,7 +384,7 @@ def _older_roles(
 def _strata(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> dict[tuple[str, ...], list[str]]:
-    """Return the recordings of each value of the attributes ``stratify``, values and names sorted."""
+    """Return the recordings for each combination of values of the attributes ``stratify``, sorted."""
     stratified = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
     strata: dict[tuple[str, ...], list[str]] = {}
     for name in sorted(names):
@@ -402,7 +404,7 @@ def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> s
 
 
 def _ordered(values: set[str]) -> list[str]:
-    """Sort text, whole numbers by value: 4, 10, bottle."""
+    """Sort text, with integers by value: 4, 10, bottle."""
     return sorted(values, key=_place)
 
 

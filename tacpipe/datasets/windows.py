@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
-KEPT_BYTES = 1 << 30  # Decoded recordings in memory, per process
-TACTILE = "tactile"  # quantity of the channels that have a level at rest
+KEPT_BYTES = 1 << 30  # maximum size of decoded recordings in memory, per process
+TACTILE = "tactile"  # quantity of the channels with a level at rest
 
 
 class Window(TypedDict):
-    """One window; a loader stacks the tensors of several along a first axis and lists their names."""
+    """One window. A loader stacks the tensors of several windows along a new first axis and lists their names."""
 
     past: torch.Tensor  # (context, input)
     future: torch.Tensor  # (horizon, target)
@@ -38,20 +38,20 @@ class Window(TypedDict):
 
 
 class Scaling(NamedTuple):
-    """Mean and standard deviation of each channel over the rows that windows may hold; 1 for a constant channel."""
+    """Mean and standard deviation of each channel over all rows of windows; the latter is 1 for a constant channel."""
 
     mean: Floats  # (channel,)
     std: Floats  # (channel,)
 
 
 class _Selection(NamedTuple):
-    """Some channels of rows, and how they are scaled."""
+    """Selected channels and their scaling."""
 
-    positions: list[int] | None  # None: all channels
+    positions: list[int] | None  # None for all channels
     scaling: Scaling | None
 
     def apply(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the channels of ``values`` (time, channel), scaled."""
+        """Return the selected channels of ``values`` (time, channel), scaled."""
         selected = values if self.positions is None else values[:, self.positions]
         if self.scaling is None:
             return selected
@@ -62,31 +62,31 @@ class _Selection(NamedTuple):
 class _RecordingRows(NamedTuple):
     """The rows of one recording."""
 
-    values: torch.Tensor  # (time, channel), above rest where that is subtracted, not scaled
+    values: torch.Tensor  # (time, channel), relative to rest if that is subtracted, not scaled
     t_ns: torch.Tensor  # (time,)
-    starts: Int64s  # (window,), first rows of the windows
+    starts: Int64s  # (window,), first row of each window
 
 
 class Windows(torch.utils.data.Dataset[Window]):
-    """The windows of a dataset's recordings, one after another in the order of names and of time.
+    """The windows of a dataset's recordings, ordered by recording name and time.
 
-    ``len(windows)`` counts them; ``windows[i]`` is a mapping:
+    ``len(windows)`` is their number; ``windows[i]`` is a mapping:
 
     =============  ==========================================================================
-    ``past``       float32 or float64 ``(context, input)``: counts, or what unit the column has
+    ``past``       float32 or float64 ``(context, input)``, in the unit of the columns
     ``future``     the same type, ``(horizon, target)``
     ``t_ns``       int64 ``(context + horizon,)``: times of the rows in nanoseconds
     ``recording``  the name of the recording
     =============  ==========================================================================
 
-    ``inputs`` and ``targets`` name the channels of the past and of the future, ``columns`` both. Without patterns these are
-    all channels that were measured (`tacpipe.datasets.arrays.Arrays`). Rows that follow one another without a gap, by the
-    ``…_gap`` masks and by ``t_ns``, and that hold a finite number in every channel make windows; no window crosses a gap or
-    the end of a recording.
+    ``inputs`` and ``targets`` name the channels of the past and of the future, ``columns`` both. The default is all
+    measured channels (`tacpipe.datasets.arrays.Arrays`). Windows consist of consecutive rows without a gap, according
+    to the ``…_gap`` masks and ``t_ns``, and with finite numbers in every channel. No window crosses a gap or the end of
+    a recording.
 
-    Nothing is read before the first ``len`` or item. That reads and verifies each recording once, to find its windows;
-    decoded recordings of up to 1 GiB stay in memory. It can be pickled, and worker processes of a loader read for
-    themselves.
+    Nothing is read before the first ``len`` or item. Then each recording is read and verified once to find its windows;
+    up to 1 GiB of decoded recordings stays in memory. Windows can be pickled; each worker process of a loader reads for
+    itself.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
     ) -> None:
-        window_starts(np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride)  # refuses lengths below 1
+        window_starts(np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride)  # rejects lengths below 1
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
         if columns is not None and not (inputs is None and targets is None):
@@ -115,7 +115,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         self.stream, self.dtype, self.rest_s, self.scale = stream, dtype, rest_s, scale
         self._patterns = (inputs, targets) if columns is None else (columns, columns)
         self._names = list(dataset.recordings)
-        self._ends: Int64s | None = None  # (recording,), windows up to the end of each
+        self._ends: Int64s | None = None  # (recording,), cumulative number of windows
         self._channels: tuple[tuple[str, ...], tuple[str, ...]] | None = None  # inputs and targets
         self._scaling: Scaling | None = None
         self._cache: OrderedDict[str, _RecordingRows] = OrderedDict()
@@ -124,7 +124,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return int(self._index()[-1]) if self._names else 0
 
     def __getitem__(self, index: int) -> Window:
-        """Return one window. Raises `IndexError` beyond the last."""
+        """Return one window. Raises `IndexError` after the last."""
         count = len(self)
         if not -count <= index < count:
             raise IndexError(f"There are {count} windows, and none has the index {index}.")
@@ -151,7 +151,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of the channels: the inputs, then the targets that are no inputs."""
+        """The names of the channels: the inputs, then the targets that are not inputs."""
         return tuple(dict.fromkeys((*self.inputs, *self.targets)))
 
     @property
@@ -166,7 +166,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     @property
     def scaling(self) -> Scaling | None:
-        """Mean and standard deviation of ``columns`` that windows are scaled by, or None if they are not scaled."""
+        """The scaling of ``columns``, or None if windows are not scaled."""
         if self.scale is False:
             return None
         if self._scaling is None:
@@ -175,7 +175,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return self._scaling
 
     def unscaled(self, future: torch.Tensor) -> torch.Tensor:
-        """Return targets (…, target), such as predictions, in the unit of the windows before they were scaled."""
+        """Return targets (…, target), such as predictions, in their original unit."""
         if self.scaling is None:
             return future
         at = self._positions(self.targets)
@@ -208,7 +208,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             np.add.at(inside, rows.starts, 1)
             np.add.at(inside, rows.starts + self.context + self.horizon, -1)
             values = rows.values.numpy()[np.cumsum(inside)[:-1] > 0].astype(np.float64)
-            if len(values):  # means and squares of two parts are those of the whole
+            if len(values):  # means and squares of two parts add up to those of the whole
                 difference = values.mean(axis=0) - mean
                 total = count + len(values)
                 squares += ((values - values.mean(axis=0)) ** 2).sum(axis=0) + difference**2 * count * len(
@@ -245,7 +245,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     def _rows(self, name: str) -> _RecordingRows:
         rows = self._cache.pop(name, None) or self._decoded(self.dataset[name])
-        self._cache[name] = rows  # moves it to the end, as the last one used
+        self._cache[name] = rows  # moves it to the end as the most recently used
         while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
             self._cache.popitem(last=False)
         return rows
@@ -276,9 +276,9 @@ class Windows(torch.utils.data.Dataset[Window]):
 
 
 def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: str) -> tuple[str, ...]:
-    """Return the columns of these names, and the channels that match these patterns; all channels without any.
+    """Return the columns with these names, and the channels that match these patterns; all channels without patterns.
 
-    Raises `UsageError` for a pattern that nothing matches.
+    Raises `UsageError` for a pattern without a match.
     """
     if patterns is None:
         return read.columns
@@ -310,7 +310,7 @@ def _above_rest(table: pa.Table, matrix: arrays.Arrays, t_ns: Int64s, rest_s: fl
 
 
 def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
-    """Return the channels as (time, channel). Raises `UsageError` if ``dtype`` would round a whole number."""
+    """Return the channels as (time, channel). Raises `UsageError` if ``dtype`` would round an integer."""
     exact = channels.values
     values = exact.astype(dtype)
     if exact.dtype.kind in "iu" and exact.dtype.itemsize > 2 and not np.array_equal(values.astype(exact.dtype), exact):
