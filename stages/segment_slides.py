@@ -14,7 +14,7 @@ Example: tacpipe segment slides data/touched -o data/slides
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -36,8 +36,11 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
 
+BLOCK_ROWS = 1 << 14  # rows that are looked at at once
 USUAL_SPEED = 0.75  # quantile of the speed in contact: that of the slide, which is most of it
 _KEPT_WHOLE = (
     "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
@@ -109,14 +112,14 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     """Return the slide of a recording, with its measures as attributes."""
     from tacpipe.channels import arm
     from tacpipe.channels.streams import finger, without_spikes
-    from tacpipe.datasets.overview import streams_of
+    from tacpipe.datasets.overview import columns_of, streams_of
     from tacpipe.signals import slides as slide_signals
 
+    if params.trigger == "load":
+        return _slide_by_load(params, recording.name, columns_of(recording))
     streams = streams_of(recording)
     table = finger(recording.name, streams)
     t_ns = table.column("t_ns").to_numpy()  # (time,)
-    if params.trigger == "load":
-        return _slide_by_load(params, recording.name, streams, table)
     attributes: dict[str, Attribute]
     table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, params.spike_count)
     pressures = of_quantity(table, "static_pressure")
@@ -151,26 +154,38 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput(tables, attributes)
 
 
-def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], table: pa.Table) -> RecordingOutput:
+def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | Columns]) -> RecordingOutput:
     """Return the slide of a sensor of any unit: the rows in contact, and of these those in which the arm moves."""
     import numpy as np
+    import pyarrow as pa
 
     from tacpipe.channels import arm
-    from tacpipe.channels.streams import without_spikes
+    from tacpipe.channels.streams import finger, without_spikes
+    from tacpipe.io.columns import release
     from tacpipe.signals import slides as slide_signals
     from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load_in_blocks, noise_thresholds
 
-    t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
-    values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
-    axes = axes_of(table, names)
-    level, rows = at_rest(params.rest, lambda: [values], t_ns, params.rest_s)
-    loaded, repeated = load_in_blocks(lambda: [values], level, axes)
+    stream = finger(name, streams)
+    t_ns, names = stream.column("t_ns").to_numpy(), of_quantity(stream, "tactile")
+    measured = np.ones(len(names), bool)  # (channel,): it has a value in each row
+
+    def blocks() -> Iterator[AnyArray]:
+        nonlocal measured
+        for some in _batches(stream, names):
+            values = np.column_stack([column.to_numpy() for column in some.columns])  # (time, channel)
+            measured &= ~np.isnan(values).any(axis=0)
+            yield values
+
+    level, rows = at_rest(params.rest, blocks, t_ns, params.rest_s)
+    loaded, repeated = load_in_blocks(blocks, level, axes_of(stream.schema, names))
     if params.load_trigger is None:
         limits = noise_thresholds(repeated, loaded, t_ns, params.rest_s, rows)
     else:
         limits = Thresholds(params.load_trigger, ENDS * params.load_trigger)
-    unit = unit_of(table, names)
+    unit = unit_of(stream.schema, names)
+    release()  # the memory of the channels
     profile = arm.profile(streams, t_ns, by_place=True)
+    release()
     try:
         touched = slide_signals.touched_rows(loaded, limits.on, limits.off, unit)
         slide = touched
@@ -185,14 +200,35 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
         raise TacpipeError(f"Recording {name}: {error}") from error
     kept_rows = slice(first, stop)
     height = params.spike_count if unit == COUNT else limits.on
-    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, height)
+    begin, end = max(0, first - params.spike_frames), stop + params.spike_frames  # what the medians of kept rows are of
+    pieces, count = [], 0
+    for some in _batches(stream, stream.schema.names):
+        pieces.append(some.slice(max(0, begin - count), max(0, end - max(begin, count))))
+        count += some.num_rows
+        if count >= end:
+            break
+    whole = [channel for channel, is_measured in zip(names, measured, strict=True) if is_measured]
+    table, spikes = without_spikes(
+        pa.concat_tables(pieces), params.spike_frames, params.spike_deviations, height, whole
+    )
     attributes: dict[str, Attribute] = {
         "load_mean": float(f"{loaded[kept_rows].mean():.4g}"),
         "load_trigger": float(f"{limits.on:.4g}"),
         "slide_frames": stop - first,
-        "spikes": int(spikes[kept_rows].sum()),
+        "spikes": int(spikes[first - begin : stop - begin].sum()),
         "outside_protocol": False,
     }
     if profile and np.isfinite(profile["speed_m_s"][kept_rows]).all():
         attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept_rows])), 5)
-    return RecordingOutput({"slide": table.slice(first, stop - first).combine_chunks()}, attributes)
+    return RecordingOutput({"slide": table.slice(first - begin, stop - first).combine_chunks()}, attributes)
+
+
+def _batches(stream: pa.Table | Columns, names: Sequence[str]) -> Iterator[pa.Table]:
+    """Yield columns of a stream some rows at a time."""
+    import pyarrow as pa
+
+    if not isinstance(stream, pa.Table):
+        yield from stream.batches(names)
+        return
+    table = stream.select(list(names))
+    yield from (table.slice(first, BLOCK_ROWS) for first in range(0, table.num_rows, BLOCK_ROWS))

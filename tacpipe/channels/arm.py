@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tacpipe.arrays import AnyArray, Floats, Times
+    from tacpipe.io.columns import Columns
 
 _NAMED = re.compile(r"(.*)([xyzw])((?:[_ .\[(][^xyzw]*)?)", re.IGNORECASE)
 
@@ -167,7 +168,7 @@ def _ordered(fields: list[pa.Field], parts: str, quantity: str, stream: str) -> 
 MEDIAN_ROWS = 3  # a controller that lost cycles takes several for one and gives a single speed that is times too high
 
 
-def profile(streams: Mapping[str, pa.Table], t_ns: Times, *, by_place: bool = False) -> dict[str, Floats]:
+def profile(streams: Mapping[str, pa.Table | Columns], t_ns: Times, *, by_place: bool = False) -> dict[str, Floats]:
     """Return what the arm did at ``t_ns``, each (time,); empty without an arm.
 
     ``speed_raw_m_s`` and ``speed_m_s`` are the speed of the hand as recorded and after a median of three readings,
@@ -200,7 +201,7 @@ def profile_table(t_ns: Times, pressure: AnyArray, moved: Mapping[str, Floats], 
     return schema.stream(t_ns, columns, schema.profile_fields())
 
 
-def path_speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
+def path_speed(streams: Mapping[str, pa.Table | Columns]) -> tuple[Times, Floats] | None:
     """Return stamps and speed in m/s along the path of the first stream with a position, each (time,); None without one.
 
     Raises `TacpipeError` for a position in another unit than metres, cm or mm.
@@ -219,7 +220,7 @@ def path_speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
     return None
 
 
-def speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
+def speed(streams: Mapping[str, pa.Table | Columns]) -> tuple[Times, Floats] | None:
     """Return stamps and speed of the hand in m/s, each (time,); None without an arm.
 
     It follows from the joints where they are recorded and are those of an iiwa 14, else from the velocity that the
@@ -236,9 +237,9 @@ def speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
     if angles is not None and turning is not None:
         at_ns, joint_rad_s = turning
         joint_rad = linear(*angles, at_ns)
-        flange_m = kinematics.joint_frames(kinematics.IIWA14, joint_rad)[:, -1, :3, 3]
-        hand_m = flange_m if place is None else linear(*place, at_ns)
-        if kinematics.carries(kinematics.IIWA14, joint_rad, hand_m):
-            velocity = kinematics.hand_velocity(kinematics.IIWA14, joint_rad, joint_rad_s, hand_m)[:, :3]
+        iiwa = kinematics.IIWA14
+        hand_m = kinematics.last_frames(iiwa, joint_rad)[:, :3, 3] if place is None else linear(*place, at_ns)
+        if kinematics.carries(iiwa, joint_rad, hand_m):
+            velocity = kinematics.hand_velocity(iiwa, joint_rad, joint_rad_s, hand_m)[:, :3]
             return at_ns, np.linalg.norm(velocity, axis=1)
     return None if moving is None else (moving[0], np.linalg.norm(moving[1][:, :3], axis=1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed, plain
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import AnyArray, Bools, Indices, Int64s, Times
     from tacpipe.io.columns import Columns
 
+Table = TypeVar("Table", "pa.Table", "pa.Table | Columns")
 COUNT = "count"  # the unit of readings as a sensor gives them
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin
@@ -115,7 +116,7 @@ def axes_of(source: pa.Table | pa.Schema, names: Sequence[str]) -> int:
     return len({(source.field(name).metadata or {}).get(b"axis") for name in names})
 
 
-def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyArray] | None:
+def signal(streams: Mapping[str, pa.Table | Columns], quantity: str) -> tuple[Int64s, AnyArray] | None:
     """Return stamps (time,) and values (time, channel) of the first stream with ``quantity``; None if there is none."""
     import numpy as np
 
@@ -177,7 +178,7 @@ def absent(
     )
 
 
-def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
+def finger(name: str, streams: Mapping[str, Table]) -> Table:
     """Return the only stream with tactile channels. Raises `TacpipeError`, naming the recording, for none or several."""
     tactile_streams = [stream for stream, table in streams.items() if of_quantity(table, "tactile")]
     if not tactile_streams:
@@ -190,14 +191,21 @@ def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
     return streams[tactile_streams[0]]
 
 
-def without_spikes(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, Int64s]:
-    """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`."""
+def without_spikes(
+    table: pa.Table, rows: int, deviations: float, floor_count: float, names: Sequence[str] | None = None
+) -> tuple[pa.Table, Int64s]:
+    """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`.
+
+    Of the tactile channels only ``names`` are repaired where they are given.
+    """
     import numpy as np
     import pyarrow as pa
 
     from tacpipe.signals.repairs import hampel
 
-    names = of_quantity(table, "tactile")
+    names = of_quantity(table, "tactile") if names is None else list(names)
+    if not names:
+        return table, np.zeros(table.num_rows, np.int64)
     values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
     spikes, repaired = hampel(values, rows, deviations, floor_count)
     for channel in np.flatnonzero(spikes.any(axis=0)):

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.io.columns import Columns
 
 NO_SIGNALS = (EVENTS, "truth")  # streams of events, and of ground truth in a simulation
 
@@ -36,6 +37,13 @@ def streams_of(recording: Recording) -> dict[str, pa.Table]:
     Ground truth and the masks of a synchronized table are omitted.
     """
     return split_tables({name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS})
+
+
+def columns_of(recording: Recording) -> Mapping[str, pa.Table | Columns]:
+    """Return the streams as `streams_of` does; columns of separate streams are decoded when they are asked for."""
+    if set(recording.streams) == {""}:
+        return streams_of(recording)
+    return {name: recording.columns(name) for name in recording.streams if name not in NO_SIGNALS}
 
 
 def split_tables(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:

@@ -181,7 +181,7 @@ def carries(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats) -> b
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
     joint_rad, hand_m = joint_rad[finite], hand_m[finite]
-    last = _last_frames(chain, joint_rad)
+    last = last_frames(chain, joint_rad)
     tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])  # (time, 3), in the last link's frame
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
@@ -192,12 +192,12 @@ def turns(chain: KinematicChain, joint_rad: AnyFloats, quaternions: Floats) -> b
     Rows that are not finite are left out.
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(quaternions).all(axis=1)
-    last = _last_frames(chain, joint_rad[finite])[:, :3, :3]
+    last = last_frames(chain, joint_rad[finite])[:, :3, :3]
     tool = last.transpose(0, 2, 1) @ matrices_of(quaternions[finite])  # (time, 3, 3), in the last link's frame
     return bool(len(tool)) and bool((tool.std(axis=0) < TURN_SPREAD).all())
 
 
-def _last_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
+def last_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
     """Return the pose of the last joint's frame in the base's (time, 4, 4)."""
     lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
     return np.concatenate([np.zeros((0, 4, 4)), *lasts])
@@ -257,7 +257,9 @@ def path_speed(t_ns: Times, position_m: AnyFloats, span_s: float = 0.02) -> Floa
     rows = np.arange(len(t_ns))
     first = np.minimum(np.searchsorted(t_ns, t_ns - half_ns), np.maximum(rows - 1, 0))
     last = np.maximum(np.searchsorted(t_ns, t_ns + half_ns, side="right") - 1, np.minimum(rows + 1, len(rows) - 1))
-    moved = np.linalg.norm(position_m[last] - position_m[first], axis=1)
+    moved = np.empty(len(t_ns))
+    for block in _blocks(len(t_ns)):
+        moved[block] = np.linalg.norm(position_m[last[block]] - position_m[first[block]], axis=1)
     took_s = (t_ns[last] - t_ns[first]) / 1e9
     speed: Floats = np.divide(moved, took_s, out=np.zeros(len(t_ns)), where=took_s > 0)
     return speed

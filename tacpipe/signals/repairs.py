@@ -13,6 +13,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
 
+BLOCK_VALUES = 1 << 19  # values whose windows are in memory at once
 TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in its median absolute deviations
 
 
@@ -35,13 +36,17 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
     wide = np.flatnonzero(values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor)  # others have no spike
     if not len(wide):
         return is_spike, repaired
-    padded = np.pad(values[:, wide].astype(np.float64), ((half, half), (0, 0)), mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)  # (time, channel, row)
-    middle = np.median(windows, axis=-1)  # (time, channel)
-    spread = TO_SIGMA * np.median(np.abs(windows - middle[..., None]), axis=-1)
-    spikes = np.abs(padded[half:-half] - middle) > np.maximum(deviations * spread, floor)
-    is_spike[:, wide] = spikes
-    repaired[:, wide] = np.where(spikes, middle, values[:, wide]).astype(values.dtype)
+    block_rows = max(1, BLOCK_VALUES // len(wide))
+    for first in range(0, len(values), block_rows):
+        stop = min(first + block_rows, len(values))
+        around = np.abs(np.arange(first - half, stop + half))  # mirrored at the first row
+        padded = values[np.minimum(around, 2 * (len(values) - 1) - around)][:, wide].astype(np.float64)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)  # (time, channel, row)
+        middle = np.median(windows, axis=-1)  # (time, channel)
+        spread = TO_SIGMA * np.median(np.abs(windows - middle[..., None]), axis=-1)
+        spikes = np.abs(padded[half:-half] - middle) > np.maximum(deviations * spread, floor)
+        is_spike[first:stop, wide] = spikes
+        repaired[first:stop, wide] = np.where(spikes, middle, values[first:stop, wide]).astype(values.dtype)
     return is_spike, repaired
 
 

@@ -61,3 +61,12 @@ def test_without_neighbours_there_is_nothing_to_compare_with(rows: int, length: 
     flagged, repaired = hampel(values, rows, 5.0, 0.0)
     assert not flagged.any()
     assert np.array_equal(repaired, values)
+
+
+def test_spikes_are_the_same_in_blocks_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(1).integers(0, 2000, (211, 3)).astype(np.int32)
+    whole = hampel(values, 7, 1.0, 50.0)
+    monkeypatch.setattr("tacpipe.signals.repairs.BLOCK_VALUES", 5)
+    for expected, in_blocks in zip(whole, hampel(values, 7, 1.0, 50.0), strict=True):
+        np.testing.assert_array_equal(in_blocks, expected)
+    assert whole[0].any()
