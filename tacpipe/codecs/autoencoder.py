@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
@@ -45,7 +45,7 @@ class Autoencoder:
     decoder: Layers
     frames: int = 1  # rows in a row that it reads
     representation: str = codec.LEVELS
-    measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
+    measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "autoencoder"
 
     @property

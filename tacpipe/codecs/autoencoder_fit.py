@@ -14,7 +14,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -118,10 +117,10 @@ def fit(
         rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
     )
     described = [
-        _record(network, trained) | {"kept": at == best}
+        _record(network, trained, kept=at == best)
         for at, (network, trained) in enumerate(zip(tried, results, strict=True))
     ]
-    measured = {
+    measured: measures.CodecMeasures = {
         "reconstruction": measures.reconstructions(codec, {"train": [train], "val": [val]}),
         "latent_covariance": measures.covariance(codec.project(train)),
         "search": described,
@@ -185,7 +184,7 @@ def _lowest(trained: loop.Trained) -> float:
     return min(float(line["val_loss"]) for line in trained.history)
 
 
-def _record(network: NetworkShape, trained: loop.Trained) -> dict[str, Any]:
+def _record(network: NetworkShape, trained: loop.Trained, *, kept: bool) -> measures.SearchedNetwork:
     """Return the record of a network in the search; no seconds, which are never the same."""
     return {
         "hidden": list(network.hidden),
@@ -194,6 +193,7 @@ def _record(network: NetworkShape, trained: loop.Trained) -> dict[str, Any]:
         "parameters": sum(value.numel() for value in trained.weights.values()),
         "epochs": len(trained.history),
         "val_loss": measures.rounded(_lowest(trained)),
+        "kept": kept,
     }
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Json
 from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, plain
 from tacpipe.signals.runs import breaks as breaks
@@ -189,7 +190,7 @@ def latent_names(count: int) -> tuple[str, ...]:
     return tuple(f"z{index:02d}" for index in range(count))
 
 
-def description(content: Mapping[str, Any]) -> bytes:
+def description(content: Json) -> bytes:
     """Return the bytes of ``codec.json``: keys sorted, so that one codec has one content."""
     return model_files.to_json(content)
 

@@ -14,7 +14,7 @@ Errors are those of the newest frame and, of a codec of increments, those of the
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NotRequired, Protocol, TypedDict
 
 import numpy as np
 
@@ -22,8 +22,48 @@ from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.codecs.codec import LEVELS
 from tacpipe.errors import TacpipeError
 
-NAMES = ("reconstruction", "latent_covariance", "search")
 DIGITS = 6  # stored digits; beyond them the order of additions matters, which the number of threads changes
+
+
+class Reconstruction(TypedDict):
+    """Errors of encoding and decoding rows."""
+
+    rows: int
+    mse_standardised: float
+    mae_counts: float
+
+
+class SearchedNetwork(TypedDict):
+    """A network that was tried for a codec."""
+
+    hidden: list[int]
+    learning_rate: float
+    weight_decay: float
+    parameters: int
+    epochs: int
+    val_loss: float
+    kept: bool
+
+
+class CodecMeasures(TypedDict, total=False):
+    """The measures of a fitted codec."""
+
+    reconstruction: dict[str, Reconstruction]  # of ``train`` and ``val``
+    latent_covariance: list[list[float]]
+    search: list[SearchedNetwork]
+
+
+class StoredCodec(CodecMeasures):
+    """``codec.json`` of tacpipe's own codecs."""
+
+    kind: str
+    of: str  # levels or increments
+    channels: list[str]
+    layout: list[dict[str, str]]
+    latents: int
+    frames: NotRequired[int]
+    explained_ratio: NotRequired[list[float]]
+    layers: NotRequired[dict[str, int]]
 
 
 class RowCodec(Protocol):
@@ -40,14 +80,14 @@ class RowCodec(Protocol):
         """Return the counts that latents decode to."""
 
 
-def reconstructions(codec: RowCodec, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, dict[str, float]]:
+def reconstructions(codec: RowCodec, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, Reconstruction]:
     """Return the errors on each part, of rows (row, frames * channel) in pieces; a part without rows is left out."""
     errors_by_part = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
     return {name: errors for name, errors in errors_by_part.items() if errors}
 
 
-def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> dict[str, float]:
-    """Return the errors of encoding and decoding rows (row, frames * channel), and their number; nothing of no rows."""
+def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> Reconstruction | None:
+    """Return the errors of encoding and decoding rows (row, frames * channel), and their number; None of no rows."""
     rows, squares, deviations, width = 0, 0.0, 0.0, len(codec.scale_count)
     for inputs in pieces:
         newest = inputs[:, -width:]
@@ -56,7 +96,7 @@ def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> dict[str, fl
         squares += float(np.square(error / codec.scale_count).sum())
         deviations += float(np.abs(error).sum())
     if not rows:
-        return {}
+        return None
     return {
         "rows": rows,
         "mse_standardised": rounded(squares / (rows * width)),
@@ -84,9 +124,16 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def stored(content: Mapping[str, Any]) -> dict[str, Any]:
+def stored(content: StoredCodec) -> CodecMeasures:
     """Return what ``codec.json`` holds of measures."""
-    return {name: content[name] for name in NAMES if name in content}
+    measures: CodecMeasures = {}
+    if "reconstruction" in content:
+        measures["reconstruction"] = content["reconstruction"]
+    if "latent_covariance" in content:
+        measures["latent_covariance"] = content["latent_covariance"]
+    if "search" in content:
+        measures["search"] = content["search"]
+    return measures
 
 
 def unmoving_channels(values: AnyFloats, channels: Sequence[str]) -> list[str]:

@@ -11,7 +11,6 @@ import functools
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
@@ -44,7 +43,7 @@ class PCA:
     components: AnyFloats  # (latent, channel)
     explained_ratio: AnyFloats  # (component,), of all components, kept or not
     representation: str = codecs.LEVELS
-    measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
+    measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "pca"
 
     @property
@@ -178,7 +177,7 @@ def fit_and_measure(
         evaluated = fit_rows(train, components=len(codec.components))
     else:
         parts = {"train": rows.names}
-    measured = {
+    measured: measures.CodecMeasures = {
         "reconstruction": measures.reconstructions(
             evaluated, {part: rows.pieces(names) for part, names in parts.items()}
         ),

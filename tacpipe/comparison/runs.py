@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from tacpipe.io import Scalar
 from tacpipe.metrics import pairing
 from tacpipe.plugins import registry
 
@@ -41,12 +42,12 @@ def spread(values: Sequence[float]) -> Spread:
     )
 
 
-Tree = Mapping[str, Any]
+Settings = Mapping[str, Scalar]  # params and whatever else makes a method, by name
 
 
 def distinct_names(
-    methods: Sequence[tuple[str, Tree]], usual: Collection[str | tuple[str, Any]] = ()
-) -> list[tuple[str, dict[str, Any]]]:
+    methods: Sequence[tuple[str, Settings]], usual: Collection[str | tuple[str, Scalar]] = ()
+) -> list[tuple[str, Settings]]:
     """Return a name for each method, given a first name and all its settings, and the settings that are part of it.
 
     Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``:
@@ -55,10 +56,10 @@ def distinct_names(
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
     """
-    alike: dict[str, list[Tree]] = {}
+    alike: dict[str, list[Settings]] = {}
     for name, settings in methods:
         alike.setdefault(name, []).append(settings)
-    distinct = []
+    distinct: list[tuple[str, Settings]] = []
     for first, settings in methods:
         differing = {
             name: value
@@ -69,7 +70,7 @@ def distinct_names(
     return distinct
 
 
-def marks(differing: Tree) -> list[str]:
+def marks(differing: Settings) -> list[str]:
     """Return settings as a name states them, those that are empty left out.
 
     >>> marks({"width": 8, "deep": True, "of": ""})
@@ -82,7 +83,6 @@ def marks(differing: Tree) -> list[str]:
     ]
 
 
-Settings = Mapping[str, Any]
 MODEL = "model"  # the predictor that a run is about
 
 
@@ -182,7 +182,7 @@ class Method:
         return list(dict.fromkeys(name for run in self.of(question) for name in run.questions[question].sums))
 
 
-def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Any]] = ()) -> list[Method]:
+def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Scalar]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
     Runs of one task whose method, settings and units of errors are alike are one method. Names state the settings in which

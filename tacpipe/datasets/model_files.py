@@ -70,7 +70,7 @@ def task(files: Mapping[str, bytes], place: str = "This") -> Task:
     return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
 
 
-def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> dict[str, Any]:
+def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> Any:
     """Return the mapping in a JSON file. ``needed`` gives the type of required values by dotted name.
 
     Raises `TacpipeError` if it is not a mapping, and for missing values, wrong types and absurd sizes.

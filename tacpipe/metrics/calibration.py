@@ -13,7 +13,7 @@ fraction of true values in the band between the lowest and the highest quantile;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -68,10 +68,18 @@ def log_loss(class_probabilities: AnyFloats, labels: Ints) -> float:
     return float(-np.log(likelihoods).mean())
 
 
-def reliability(confidence: AnyFloats, right: Bools) -> list[dict[str, float]]:
+class ConfidenceBin(TypedDict):
+    """The slides of a bin of confidence: how many, their mean confidence and their accuracy."""
+
+    n: int
+    confidence: float
+    accuracy: float
+
+
+def reliability(confidence: AnyFloats, right: Bools) -> list[ConfidenceBin]:
     """Return for each bin of confidence that holds slides how many, their mean confidence and their accuracy."""
     bins = np.minimum((confidence * BINS).astype(int), BINS - 1)
-    rows = []
+    rows: list[ConfidenceBin] = []
     for number in np.unique(bins):
         chosen = bins == number
         rows.append(
@@ -163,7 +171,9 @@ class Sums:
         return Sums(*(getattr(self, name) + getattr(further, name) for name in self.__dataclass_fields__))
 
 
-def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None) -> dict[str, Any]:
+def tree(
+    recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None
+) -> dict[str, dict[str, float]]:
     """Return the measures over recordings by step, ``t1`` …, and over all steps, ``mean``.
 
     ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with the 95 % interval of it over
@@ -174,7 +184,7 @@ def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums]
     total = recordings[0]
     for recording in recordings[1:]:
         total = total + recording
-    measures: dict[str, Any] = {
+    measures = {
         "pinball": _steps(total.pinball.mean(axis=1), total.values),
         "coverage": _steps(total.covered, total.values),
         "width": _steps(total.width, total.values),

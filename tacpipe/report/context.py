@@ -7,26 +7,29 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method, TaskReport
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
 from tacpipe.datasets.selection import PUBLISHED
+from tacpipe.io import Json
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts
 from tacpipe.report.blocks import Block, table
 from tacpipe.report.charts import Curve
+from tacpipe.training.following import Line, read_history
 
 if TYPE_CHECKING:
     from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.report.charts import Spec
+    from tacpipe.tasks.task import ModelConfig
 
 
-Tree = Mapping[str, Any]
+Config = TypeVar("Config", bound="ModelConfig")
 CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `tacpipe calibrate` adds
 SHORTENED = (
     "shortened"  # setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
@@ -34,7 +37,7 @@ SHORTENED = (
 GROWS = "trained_on"  # a part that names the recordings of the calibration too
 
 
-class ReportResult:
+class ReportResult(Generic[Config]):
     """One result: a model trained once and evaluated once."""
 
     STAGE: ClassVar[str] = ""  # stage that trained the model
@@ -44,31 +47,26 @@ class ReportResult:
         self.dataset = dataset
 
     @cached_property
-    def config(self) -> Tree:
+    def config(self) -> Config:
         """The configuration of the model's training and evaluation."""
-        return read_json(self.dataset, "config.json")
+        config: Config = read_json(self.dataset, "config.json")
+        return config
 
     @cached_property
-    def metrics(self) -> Tree:
-        """All errors of the result by name."""
-        return read_json(self.dataset, "metrics.json")
+    def history(self) -> Sequence[Line]:
+        """The lines of ``history.jsonl``, one per epoch; empty where nothing was trained by epochs."""
+        return read_history(self.dataset.files.get("history.jsonl", b""))
 
     @cached_property
-    def history(self) -> Sequence[Tree]:
-        """The lines of ``history.jsonl``, one per epoch, or empty if nothing was trained by epochs."""
-        lines = self.dataset.files.get("history.jsonl", b"").splitlines()
-        return [json.loads(line) for line in lines if line.strip()]
-
-    @cached_property
-    def params(self) -> Tree:
+    def params(self) -> Settings:
         """The params of the training that count for the model's architecture."""
         return params_of.counting(registry.load(self.STAGE), self.given)
 
     @property
-    def given(self) -> Tree:
+    def given(self) -> Settings:
         """The params that are stored with the model."""
-        params: Tree = self.config.get("params", {})
-        return params
+        config: ModelConfig = self.config
+        return config.get("params", {})
 
     @property
     def epochs_of_paper(self) -> str:
@@ -76,7 +74,8 @@ class ReportResult:
         tagged = {"architecture": self.config.get("architecture"), **self.given}
         presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged))
         epochs, printed = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
-        return f"{epochs:,} of {printed:,} epochs" if epochs and printed and epochs < printed else ""
+        fewer = isinstance(epochs, int) and isinstance(printed, int) and 0 < epochs < printed
+        return f"{epochs:,} of {printed:,} epochs" if fewer else ""
 
     @property
     def simulated(self) -> bool:
@@ -89,10 +88,9 @@ class ReportResult:
         return is_published(self.dataset, self.SETS)
 
 
-def read_json(result: Dataset, name: str) -> Tree:
+def read_json(result: Dataset, name: str) -> Any:
     """Return what a JSON file of a result holds, or empty if there is none of the name."""
-    tree: Tree = json.loads(result.files[name]) if name in result.files else {}
-    return tree
+    return json.loads(result.files[name]) if name in result.files else {}
 
 
 def drop_duplicates(results: Sequence[Dataset]) -> list[Dataset]:
@@ -136,12 +134,12 @@ def is_published(result: Dataset, sets: Collection[str]) -> bool:
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
 
 
-def _params_of_step(step: Tree) -> dict[str, Any]:
+def _params_of_step(step: Json) -> Json:
     """Return the params of a step of a chain by today's names."""
     return params_of.with_current_names(str(step.get("stage")), step.get("params") or {})
 
 
-def provenance_blocks(manifest: Tree) -> list[Block]:
+def provenance_blocks(manifest: Json) -> list[Block]:
     """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
     steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
     rows = []

@@ -39,7 +39,7 @@ def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     environment.filters |= {"spec": _spec_markup, "commands": _mark_commands}
-    parts: dict[str, Any] = {
+    parts = {
         "style": Markup(_template("page.css")),
         "script": Markup(_template("page.js")),
         "library": Markup(library),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, TaskReport, grouped
+from tacpipe.io import Json
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, context, screen
@@ -59,7 +60,7 @@ def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
     return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
 
 
-def leaves(tree: Mapping[str, Any]) -> dict[str, str]:
+def leaves(tree: Json) -> dict[str, str]:
     """Return the values of nested names as text, by the names that lead to each.
 
     >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})

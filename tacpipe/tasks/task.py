@@ -12,9 +12,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypedDict, TypeVar
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Scalar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,6 +31,15 @@ if TYPE_CHECKING:
 
 Files = Mapping[str, bytes]  # the files of a model by name
 GraspPredictor = Callable[[Any, "Cloud", "Grasp"], dict[str, float]]
+
+
+class ModelConfig(TypedDict):
+    """The parts of ``config.json`` that models of all tasks have."""
+
+    task: str
+    architecture: str
+    params: dict[str, Scalar]  # as `tacpipe.plugins.params` stores them
+    trained_on: dict[str, str]  # digests of recordings by name
 
 
 class LoadedModel(Protocol):

@@ -24,7 +24,7 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
-    from tacpipe.trackers.tracking import Scalar
+    from tacpipe.io import Scalar
 
 
 MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow refuses its store of files

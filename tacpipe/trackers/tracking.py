@@ -16,7 +16,7 @@ from tacpipe.datasets import manifest
 from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import Json, terminal
+from tacpipe.io import Json, Scalar, terminal
 from tacpipe.io.hashing import digest
 from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
@@ -24,8 +24,6 @@ from tacpipe.store.location import locate
 from tacpipe.store.store import Store
 from tacpipe.training.following import Line, NetworkLabels, TrainedNetwork, read_history
 from tacpipe.training.schedule import learning_rate
-
-Scalar = str | int | float | bool
 
 
 class Tracker(Protocol):

@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -56,6 +56,16 @@ class Anticipation:
     median_lead_rows: float  # rows from alarm to event
     median_lead_frames: float  # new frames from alarm to event, the event's own included
     false_alarms_per_minute: float  # rate for each feature, in rows free of events
+
+
+class AlarmScore(TypedDict):
+    """The fields of `Anticipation` in ``metrics.json``; None where nothing states them."""
+
+    events: int
+    recall: float | None
+    median_lead_rows: float | None
+    median_lead_frames: float | None
+    false_alarms_per_minute: float | None
 
 
 def difference_sd(truth: AnyFloats, groups: AnyArray, *, horizon: int) -> AnyFloats:
@@ -343,7 +353,7 @@ class Loads:
         levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
         return {"sd": sd.tolist(), "theta": levels}
 
-    def scored(self, levels: AlarmLevels) -> dict[str, dict[str, float | int | None]]:
+    def scored(self, levels: AlarmLevels) -> dict[str, AlarmScore]:
         """Return how well each predictor predicted changes with the ``levels`` that `calibrated` gave."""
         if not levels or not self.truth:
             return {}
@@ -363,7 +373,13 @@ class Loads:
                 rate_hz=self.rate_hz,
                 repeated=repairs.held(truth),
             )
-            scores[name] = {key: _number(value) for key, value in asdict(result).items()}
+            scores[name] = AlarmScore(
+                events=result.events,
+                recall=_number(result.recall),
+                median_lead_rows=_number(result.median_lead_rows),
+                median_lead_frames=_number(result.median_lead_frames),
+                false_alarms_per_minute=_number(result.false_alarms_per_minute),
+            )
         return scores
 
     def _with_forecasts(self) -> list[tuple[str, AnyFloats]]:
@@ -376,8 +392,6 @@ class Loads:
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
 
 
-def _number(value: float | int) -> float | int | None:
+def _number(value: float) -> float | None:
     """Return ``value`` to 9 digits, or None if it is not finite."""
-    if isinstance(value, int):
-        return value
     return float(f"{value:.9g}") if math.isfinite(value) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +23,14 @@ from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
-from tacpipe.tasks.forward.headline import BASELINE, MODEL, look_ahead_notes, unit_of_model
+from tacpipe.tasks.forward.headline import (
+    BASELINE,
+    MODEL,
+    QuantileMeasures,
+    QuantileMetrics,
+    look_ahead_notes,
+    unit_of_model,
+)
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, predicted
 from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
@@ -50,7 +57,7 @@ class QuantileSums:
 
     forecaster: Forecaster
     sums: dict[str, dict[str, Sums]] = field(default_factory=dict)  # recording -> predictor -> sums
-    examples: list[dict[str, Any]] = field(default_factory=list)
+    examples: list[dict[str, str | int | list[float]]] = field(default_factory=list)  # see `_Drawn.example`
 
     def add(self, track: Track, trial: Trial) -> None:
         """Count the windows of a recording."""
@@ -75,11 +82,11 @@ class QuantileSums:
             if drawn is not None:
                 self.examples.append(drawn.example(uncertainty.percents))
 
-    def summary(self, trials: Sequence[Trial]) -> dict[str, Any]:
-        """Return what ``metrics.json`` holds under ``quantiles``: measures by predictor, of unseen recordings at the top."""
+    def summary(self, trials: Sequence[Trial]) -> QuantileMetrics | None:
+        """Return the measures of the quantiles of each predictor, or None if the model has none."""
         uncertainty = self.forecaster.quantiles
         if uncertainty is None:
-            return {}
+            return None
         fresh = [trial for trial in trials if not trial.seen and trial.name in self.sums]
         parts = {
             "known": [trial for trial in fresh if trial.known],
@@ -88,11 +95,11 @@ class QuantileSums:
         if not all(parts.values()):
             parts = {}
         parts["seen"] = [trial for trial in trials if trial.seen and trial.name in self.sums]
-        described = {"levels": list(uncertainty.percents), **self.forecaster.config.get("quantiles", {})}
-        trees = {name: self._tree(part, uncertainty.percents) for name, part in parts.items() if part}
-        return {**described, **(self._tree(fresh, uncertainty.percents) if fresh else {}), **trees}
+        described = self.forecaster.config["quantiles"]
+        measures = {name: self._measures(part, uncertainty.percents) for name, part in parts.items() if part}
+        return QuantileMetrics(described, self._measures(fresh, uncertainty.percents) if fresh else {}, measures)
 
-    def _tree(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, Any]:
+    def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
         sums_by_unit: dict[
             str, dict[str, Sums]
         ] = {}  # unit of the interval (recording, or unseen object) to sums by predictor
@@ -113,7 +120,7 @@ class QuantileSums:
         """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw."""
         if self.forecaster.quantiles is None:
             return {}
-        rows: list[dict[str, Any]] = []
+        rows = []
         for trial in trials:
             about = {name: getattr(trial, name) for name in ("object", "known", "seen")}
             for predictor, sums in self.sums.get(trial.name, {}).items():
@@ -173,7 +180,7 @@ class _Drawn:
         at = (slice(None), self._step - 1, self._channel)
         self._rows += zip(self._t_ns[now + self._step] / 1e9, truth[at], *predicted[at].T, strict=True)
 
-    def example(self, percents: Sequence[int]) -> dict[str, Any]:
+    def example(self, percents: Sequence[int]) -> dict[str, str | int | list[float]]:
         """Return the curves: time in s, what was measured, and each quantile."""
         columns = np.array(self._rows[:MAX_ROWS]).T
         names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
@@ -220,22 +227,20 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             del track
             advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
-    tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
-    if warned := loads.scored(forecaster.config.get("anticipation", {})):
-        tree["anticipation"] = warned
-    if led := slipping.scored():
-        tree["slips"] = led
-    if situations_tree := by_situation.summary():
-        tree["situations"] = situations_tree
-    if quantiles := bands.summary(trials):
-        tree["quantiles"] = quantiles
+    measured = replace(
+        metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale),
+        anticipation=loads.scored(forecaster.config.get("anticipation", {})),
+        slips=slipping.scored(),
+        situations=by_situation.summary(),
+        quantiles=bands.summary(trials),
+    )
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
             metrics.headline(method, trials, forecaster.horizon, unit_of_model(forecaster.config))
         ),
-        "metrics.json": model_files.to_json(tree),
-        "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
+        "metrics.json": model_files.to_json(measured.to_json()),
+        "horizons.csv": metrics.horizons_csv(measured.fresh.predictors, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
         **bands.files(trials),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Self, cast
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -181,7 +181,7 @@ class Forecaster:
         task = model_files.tree(files, CONFIG, {"task": str})["task"]
         if task != TASK:
             raise TacpipeError(f"This model was trained for {plain(task)}, not for {TASK}.")
-        config = cast("ForwardConfig", model_files.tree(files, CONFIG, NEEDED))
+        config: ForwardConfig = model_files.tree(files, CONFIG, NEEDED)
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NotRequired, Self, TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.io import Json
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from tacpipe.tasks.forward.alarms import AlarmScore
+    from tacpipe.tasks.forward.params import ForwardConfig, QuantileDescription
+    from tacpipe.tasks.forward.situations import SituationMeasures
+    from tacpipe.tasks.forward.slips import LeadSums, SlipScore
 
 COUNT, COUNTS = "count", "counts"  # the unit in columns and in texts
 MIXED = "own units"  # unit of channels, or of models, that differ
@@ -26,7 +32,7 @@ def unit_of_channels(schema: pa.Schema, channels: Sequence[str]) -> str:
     return units.pop() if len(units) == 1 else MIXED
 
 
-def unit_of_model(config: Mapping[str, Any]) -> str:
+def unit_of_model(config: ForwardConfig) -> str:
     """Return the unit in a model's configuration, as texts have it; one without is in counts.
 
     >>> unit_of_model({"inputs": {}}), unit_of_model({"inputs": {"unit": "kPa"}})
@@ -35,7 +41,7 @@ def unit_of_model(config: Mapping[str, Any]) -> str:
     return str(config.get("inputs", {}).get("unit", COUNTS))
 
 
-def common_unit(configs: Iterable[Mapping[str, Any]]) -> str:
+def common_unit(configs: Iterable[ForwardConfig]) -> str:
     """Return the unit that models have in common, `MIXED` where they differ."""
     units = {unit_of_model(config) for config in configs} or {COUNTS}
     return units.pop() if len(units) == 1 else MIXED
@@ -67,16 +73,155 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
     return tuple(step for step in STEPS if step in steps) or (max(steps),)
 
 
-def look_ahead_notes(config: Mapping[str, Any]) -> list[str]:
+def look_ahead_notes(config: ForwardConfig) -> list[str]:
     """Return how far the rows that a model was trained on look ahead, or nothing if they do not."""
-    ahead = config.get("look_ahead") or {"max_ms": 0.0}
-    if not ahead["max_ms"]:
+    ahead = config.get("look_ahead")
+    if not ahead or not ahead["max_ms"]:
         return []
     return [
         f"The rows of the training recordings look ahead by {ahead['mean_ms']:g} ms on average and at most "
         f"{ahead['max_ms']:g} ms, so errors are smaller than a live session's. Synchronize without --values interpolate for "
         f"models to act on."
     ]
+
+
+IntervalsByStep = dict[str, dict[str, float]]  # mean, low and high of a value by step
+QuantileMeasures = dict[str, dict[str, float]]  # by measure and step
+
+
+class WindowCounts(TypedDict):
+    """Windows and recordings that errors are about."""
+
+    windows: int
+    recordings: int
+    recordings_without_window: int
+    effective_windows: int  # number that fits without overlap of their horizons
+
+
+class PredictorScores(TypedDict):
+    """Mean errors of a predictor by step, ``t1`` …, and over all steps, ``mean``."""
+
+    mse_counts: dict[str, dict[str, float]]  # by group of channels
+    mae_counts: dict[str, dict[str, float]]
+    mse_standard: dict[str, float]  # in units of each channel's spread in training
+    mse_latent: NotRequired[dict[str, float]]
+    mse_feature: NotRequired[dict[str, float]]  # latents scaled to ±1
+
+
+class LiveRows(TypedDict):
+    """Published forecasts of live sessions next to those that ``predict --causal`` gives."""
+
+    published: int
+    recomputed: int
+    compared: int
+    equal: int
+    differ_after_late_samples: int
+    largest_difference: float
+    late_samples: int
+    skipped: int
+    of_errors: int
+
+
+class LiveMeasures(TypedDict):
+    """Measures of recorded live sessions."""
+
+    rows: LiveRows
+    mae: dict[str, dict[str, float]]  # by predictor and step
+    latency: dict[str, float]
+    alarms: dict[str, dict[str, LeadSums]]  # by alarm and event, and predictor
+
+
+class LiveMetrics(LiveMeasures):
+    """Measures of all recorded live sessions and of each."""
+
+    recordings: dict[str, LiveMeasures]
+
+
+@dataclass(frozen=True)
+class ForwardScores:
+    """Errors and skill on some recordings."""
+
+    counts: WindowCounts
+    predictors: dict[str, PredictorScores]  # empty if no recording has a window
+    skill: dict[str, IntervalsByStep]  # of the model over persistence, by measure
+
+    @classmethod
+    def from_json(cls, stored: Json) -> Self:
+        """Return the scores in ``metrics.json`` or in one of its parts."""
+        scored = {name: value for name, value in stored.items() if name != "skill" and "mse_counts" in value}
+        return cls(stored["counts"], scored, stored.get("skill", {}))
+
+    def to_json(self) -> Json:
+        """Return what `from_json` reads."""
+        return {"counts": self.counts, **self.predictors, **({"skill": self.skill} if self.skill else {})}
+
+
+@dataclass(frozen=True)
+class QuantileMetrics:
+    """Measures of a calibrated model's quantiles."""
+
+    description: QuantileDescription
+    fresh: dict[str, QuantileMeasures]  # of recordings that the model has not seen, by predictor
+    parts: dict[str, dict[str, QuantileMeasures]]
+
+    @classmethod
+    def from_json(cls, stored: Json) -> Self:
+        """Return what `to_json` wrote."""
+        parts = {name: stored[name] for name in METRIC_PARTS if name in stored}
+        described = ("levels", "method", "recordings", "most_promised")
+        fresh = {name: value for name, value in stored.items() if name not in (*parts, *described)}
+        description: QuantileDescription = {
+            "levels": stored["levels"],
+            "method": stored["method"],
+            "recordings": stored["recordings"],
+            "most_promised": stored["most_promised"],
+        }
+        return cls(description, fresh, parts)
+
+    def to_json(self) -> Json:
+        """Return the part ``quantiles`` of ``metrics.json``."""
+        return {**self.description, **self.fresh, **self.parts}
+
+
+METRIC_PARTS = ("known", "unseen", "seen")  # of known and of unseen objects, and recordings that the model has seen
+
+
+@dataclass(frozen=True)
+class ForwardMetrics:
+    """``metrics.json`` of a result on forecasts."""
+
+    fresh: ForwardScores  # of recordings that the model has not seen
+    parts: dict[str, ForwardScores]  # those of `METRIC_PARTS` that hold recordings
+    anticipation: dict[str, AlarmScore] = field(default_factory=dict)  # by predictor
+    slips: dict[str, SlipScore] = field(default_factory=dict)  # by predictor
+    situations: dict[str, SituationMeasures] = field(default_factory=dict)
+    quantiles: QuantileMetrics | None = None
+    live: LiveMetrics | None = None
+
+    @classmethod
+    def from_json(cls, stored: Json) -> Self:
+        """Return the metrics that `to_json` wrote."""
+        return cls(
+            ForwardScores.from_json(stored),
+            {name: ForwardScores.from_json(stored[name]) for name in METRIC_PARTS if name in stored},
+            stored.get("anticipation", {}),
+            stored.get("slips", {}),
+            stored.get("situations", {}),
+            QuantileMetrics.from_json(stored["quantiles"]) if "quantiles" in stored else None,
+            stored.get("live"),
+        )
+
+    def to_json(self) -> Json:
+        """Return the content of ``metrics.json``; what was not measured is left out."""
+        optional = {
+            "anticipation": self.anticipation,
+            "slips": self.slips,
+            "situations": self.situations,
+            "quantiles": self.quantiles and self.quantiles.to_json(),
+            "live": self.live,
+        }
+        parts = {name: scores.to_json() for name, scores in self.parts.items()}
+        return {**self.fresh.to_json(), **parts, **{name: value for name, value in optional.items() if value}}
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,19 @@ from tacpipe.metrics import intervals, regression
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.intervals import Interval
 from tacpipe.tasks.forward import headline as headlines
-from tacpipe.tasks.forward.headline import BASELINE, COUNTS, MODEL
+from tacpipe.tasks.forward.headline import (
+    BASELINE,
+    COUNTS,
+    MODEL,
+    ForwardMetrics,
+    ForwardScores,
+    IntervalsByStep,
+    PredictorScores,
+    WindowCounts,
+)
 from tacpipe.tasks.forward.predictors import Prediction
 
 Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
-Tree = dict[str, Any]  # names down to numbers
-IntervalsByStep = dict[str, dict[str, float]]  # mean, low and high of a value by step
 
 _COLUMNS = pa.schema(
     {
@@ -109,10 +116,10 @@ def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     return groups
 
 
-def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> Tree:
-    """Return the metrics of ``metrics.json``; ``channel_scale`` (channel,) is each channel's spread in training.
+def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardMetrics:
+    """Return the errors of all predictors; ``channel_scale`` (channel,) is each channel's spread in training.
 
-    Recordings that the model has not seen are at the top, and under ``known`` and ``unseen`` once more those of objects
+    Recordings that the model has not seen are ``fresh``, and under ``known`` and ``unseen`` once more those of objects
     that it was trained on and of others, where there are both; those that it has seen are under ``seen``.
     """
     fresh = [trial for trial in trials if not trial.seen]
@@ -123,8 +130,10 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     if not all(parts.values()):
         parts = {}
     parts["seen"] = [trial for trial in trials if trial.seen]
-    tree = _summary(fresh, groups, horizon, channel_scale)
-    return tree | {name: _summary(part, groups, horizon, channel_scale) for name, part in parts.items() if part}
+    return ForwardMetrics(
+        _scores(fresh, groups, horizon, channel_scale),
+        {name: _scores(part, groups, horizon, channel_scale) for name, part in parts.items() if part},
+    )
 
 
 def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
@@ -159,18 +168,18 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
     return headlines_found
 
 
-def horizons_csv(tree: Tree, rate_hz: float) -> bytes:
-    """Return the errors by predictor and step of ``summary``'s recordings that the model has not seen."""
+def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: float) -> bytes:
+    """Return the errors by predictor and step."""
     rows = [
         (
             name,
             step,
             round(1000 * step / rate_hz, 3) if rate_hz else "",
-            *(scores[measure]["both"][f"t{step}"] for measure in ("mse_counts", "mae_counts")),
+            scores["mse_counts"]["both"][f"t{step}"],
+            scores["mae_counts"]["both"][f"t{step}"],
             scores["mse_standard"][f"t{step}"],
         )
-        for name, scores in tree.items()
-        if "mse_standard" in scores and name != "skill"
+        for name, scores in scores_by_predictor.items()
         for step in range(1, len(scores["mse_standard"]))
     ]
     return _csv(("predictor", "step", "horizon_ms", "mse_counts", "mae_counts", "mse_standard"), rows)
@@ -239,38 +248,44 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
     )
 
 
-def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> Tree:
+def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardScores:
     """Return errors of each predictor, skill and counts over the recordings that hold windows."""
     evaluated = [item for item in trials if item.windows]
     windows = np.array([item.windows for item in evaluated], dtype=np.int64)
-    counts = {
+    counts: WindowCounts = {
         "windows": int(windows.sum()),
         "recordings": len(evaluated),
         "recordings_without_window": len(trials) - len(evaluated),
-        "effective_windows": int(windows.sum()) // horizon,  # number that fits without overlap of their horizons
+        "effective_windows": int(windows.sum()) // horizon,
     }
-    tree: Tree = {"counts": counts}
-    for name in evaluated[0].errors if evaluated else ():
+    if not evaluated:
+        return ForwardScores(counts, {}, {})
+    predictors: dict[str, PredictorScores] = {}
+    for name in evaluated[0].errors:
         errors = [item.errors[name] for item in evaluated]
         squared = np.stack([item.count_squared for item in errors])  # (recording, step, channel)
-        tree[name] = {
+        predictors[name] = {
             "mse_counts": _grouped(squared, windows, groups),
             "mae_counts": _grouped(np.stack([item.count_absolute for item in errors]), windows, groups),
             "mse_standard": _steps(squared / channel_scale**2, windows),
         }
-        for name_of, attribute in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
-            if getattr(errors[0], attribute) is not None:
-                tree[name][name_of] = _steps(np.stack([getattr(item, attribute) for item in errors]), windows)
-    if evaluated:
-        units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
-        kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
-        tree["skill"] = {
-            name_of: _intervals(_by_step(evaluated, MODEL, attribute), _by_step(evaluated, BASELINE, attribute), units)
-            for name_of, attribute in kinds.items()
-        }
-        model, persistence = (_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
-        tree["skill"][headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
-    return tree
+        latent, feature = (
+            [sums for item in errors if (sums := getattr(item, attribute)) is not None]
+            for attribute in ("latent_squared", "feature_squared")
+        )
+        if latent:
+            predictors[name]["mse_latent"] = _steps(np.stack(latent), windows)
+        if feature:
+            predictors[name]["mse_feature"] = _steps(np.stack(feature), windows)
+    units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
+    kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
+    skill = {
+        name_of: _intervals(_by_step(evaluated, MODEL, attribute), _by_step(evaluated, BASELINE, attribute), units)
+        for name_of, attribute in kinds.items()
+    }
+    model, persistence = (_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
+    skill[headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
+    return ForwardScores(counts, predictors, skill)
 
 
 def _steps(sums: AnyFloats, windows: Int64s) -> dict[str, float]:

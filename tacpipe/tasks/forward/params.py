@@ -9,12 +9,14 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict, cast
 
 from tacpipe.channels import arm
+from tacpipe.io import Scalar
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Channels, Label, Requirements
+from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from tacpipe.models.windows import ForecastShape
 
-Presets = Mapping[str, Mapping[str, object]]
+Presets = Mapping[str, Mapping[str, Scalar]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
 
@@ -233,12 +235,9 @@ class QuantileDescription(TypedDict):
     most_promised: float
 
 
-class ForwardConfig(TypedDict):
+class ForwardConfig(ModelConfig):
     """``config.json`` of a model of the task ``forward``."""
 
-    task: str
-    architecture: str
-    params: Any  # as `tacpipe.plugins.params` stores them
     codec: CodecDescription
     context: int
     horizon: int
@@ -250,7 +249,6 @@ class ForwardConfig(TypedDict):
     scaling: ForwardScaling
     largest_level: float
     validation: dict[str, float]  # loss and epoch of the stored weights
-    trained_on: dict[str, str]  # digests of recordings by name
     objects: list[str]
     counts: dict[str, dict[str, int]]
     baselines: NotRequired[dict[str, float]]

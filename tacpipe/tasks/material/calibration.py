@@ -27,7 +27,16 @@ from tacpipe.tasks.material.sensor_calibration import (
 from tacpipe.tasks.material.slides import Slides
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.tasks.material.headline import (
+        MaterialMetrics,
+        ProbabilityMeasures,
+        StatedProbabilities,
+        UnknownMeasures,
+    )
+    from tacpipe.tasks.material.params import UnknownDescription
     from tacpipe.tasks.material.slides import BySensor, Slides
     from tacpipe.tasks.task import CalibrationRequest
 
@@ -43,7 +52,7 @@ def calibrate(
     training_by_sensor, validation_by_sensor = (classifier.read(part, labelled=True) for part in (training, validation))
     _check(classifier, training_by_sensor, validation_by_sensor)
     calibrations: dict[str, SensorCalibration] = {}
-    about: dict[str, Any] = {}
+    about: dict[str, UnknownDescription] = {}
     for sensor in classifier.layouts:
         held_out = set(classifier.config.get("held_out", {}).get(sensor, []))
         training_slides, validation_slides = (
@@ -66,7 +75,8 @@ def calibrate(
             "auroc_left_out": areas,
             "calibration_error": _errors(scores, labels, calibrations[sensor].temperature),
         }
-    config = {**classifier.config, "known": about}
+    config = classifier.config.copy()
+    config["known"] = about
     return {**model, CONFIG: model_files.to_json(config), CALIBRATION_FILE: pack_calibrations(calibrations)}
 
 
@@ -104,7 +114,6 @@ def _check(classifier: Classifier, training: BySensor, validation: BySensor) -> 
 
 
 ANSWERS = "answers.csv"
-Tree = dict[str, Any]
 
 
 @dataclass
@@ -113,8 +122,8 @@ class Answers:
 
     classifier: Classifier
     labels: Mapping[str, str] = field(default_factory=dict)  # recording to its label as text
-    calibration: Tree = field(default_factory=dict)
-    unknown: Tree = field(default_factory=dict)
+    calibration: dict[str, ProbabilityMeasures] = field(default_factory=dict)
+    unknown: dict[str, UnknownMeasures] = field(default_factory=dict)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
     def add(self, slides: Slides, in_training: Bools) -> Bools:
@@ -140,30 +149,30 @@ class Answers:
         score = scores_by_rule[sensor_calibration.rule]
         if learned.any():
             labels = np.searchsorted(self.classifier.classes, slides.materials[learned])
-            self.calibration[sensor] = {"n": int(learned.sum()), "temperature": sensor_calibration.temperature}
-            for name, divisor in (("before", 1.0), ("after", sensor_calibration.temperature)):
-                probabilities = calibration.probabilities(scores[learned], divisor)
-                confidence, correct = probabilities.max(axis=1), right[learned]
-                self.calibration[sensor][name] = {
-                    "calibration_error": calibration.calibration_error(confidence, correct),
-                    "log_loss": calibration.log_loss(probabilities, labels),
-                    "confidence": float(confidence.mean()),
-                    "reliability": calibration.reliability(confidence, correct),
-                }
+            before, after = (
+                _stated(scores[learned], labels, right[learned], divisor)
+                for divisor in (1.0, sensor_calibration.temperature)
+            )
+            self.calibration[sensor] = {
+                "n": int(learned.sum()),
+                "temperature": sensor_calibration.temperature,
+                "before": before,
+                "after": after,
+            }
         if learned.any() or unknown.any():
             refused = score < sensor_calibration.threshold
-            tree: Tree = {"rule": sensor_calibration.rule, "threshold": sensor_calibration.threshold}
-            labels = np.array([self.labels.get(name, "") for name in slides.names])
-            tree |= _rate("false_unknown", refused[learned])
-            tree |= _rate("false_known", ~refused[unknown], labels[unknown])
+            measures: UnknownMeasures = {"rule": sensor_calibration.rule, "threshold": sensor_calibration.threshold}
+            _add_false_unknown(measures, refused[learned])
+            materials = [self.labels.get(name, "") for name in slides.select(unknown).names]
+            _add_false_known(measures, ~refused[unknown], materials)
             if learned.any() and unknown.any():
-                tree["auroc"] = {
+                measures["auroc"] = {
                     rule: calibration.auroc(rule_scores[learned], rule_scores[unknown])
                     for rule, rule_scores in scores_by_rule.items()
                 }
             if (learned & ~refused).any():
-                tree["accuracy_of_answers"] = float(right[learned & ~refused].mean())
-            self.unknown[sensor] = tree
+                measures["accuracy_of_answers"] = float(right[learned & ~refused].mean())
+            self.unknown[sensor] = measures
         names = self.classifier.naming.names_for(self.classifier.best_classes(scores))
         best = sensor_calibration.probabilities(scores).max(axis=1)
         for at, name in enumerate(slides.names):
@@ -182,10 +191,14 @@ class Answers:
                 )
             )
 
-    def trees(self) -> Tree:
-        """Return the parts ``calibration`` and ``unknown`` of ``metrics.json``, by sensor."""
-        parts = {"calibration": self.calibration, "unknown": self.unknown}
-        return {name: by_sensor for name, by_sensor in parts.items() if by_sensor}
+    def metrics(self) -> MaterialMetrics:
+        """Return what ``metrics.json`` states of the answers."""
+        metrics: MaterialMetrics = {}
+        if self.calibration:
+            metrics["calibration"] = self.calibration
+        if self.unknown:
+            metrics["unknown"] = self.unknown
+        return metrics
 
     def files(self) -> dict[str, bytes]:
         """Return ``answers.csv``: a row a slide: class named, its probability, score of known, answer, label."""
@@ -198,20 +211,37 @@ class Answers:
         return {ANSWERS: text.getvalue().encode()}
 
 
-def _rate(name: str, flags: Bools, materials: AnyArray | None = None) -> Tree:
-    """Return the fraction of slides that are so, of how many, and its 95 % interval; nothing without slides.
+def _stated(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) -> StatedProbabilities:
+    """Return how the probabilities of scores (slide, class), divided by a temperature, fit the slides' labels (slide,)."""
+    probabilities = calibration.probabilities(scores, divisor)
+    confidence = probabilities.max(axis=1)
+    return {
+        "calibration_error": calibration.calibration_error(confidence, right),
+        "log_loss": calibration.log_loss(probabilities, labels),
+        "confidence": float(confidence.mean()),
+        "reliability": calibration.reliability(confidence, right),
+    }
 
-    With ``materials`` (slide,) the interval is over materials, because the rate is about materials that nobody has seen,
-    and slides of one are alike: it is left out where these are fewer than `MIN_CLUSTERS`. Else it is Wilson's over slides.
+
+def _add_false_unknown(measures: UnknownMeasures, refused: Bools) -> None:
+    """Add the fraction of slides of learned classes that are refused (slide,), with Wilson's interval over slides."""
+    if len(refused):
+        low, high = wilson(int(refused.sum()), len(refused))
+        measures["false_unknown"], measures["false_unknown_n"] = float(refused.mean()), len(refused)
+        measures["false_unknown_low"], measures["false_unknown_high"] = low, high
+
+
+def _add_false_known(measures: UnknownMeasures, answered: Bools, materials: Sequence[str]) -> None:
+    """Add the fraction of slides of other classes that are answered with a class (slide,).
+
+    Its interval is over materials, because the rate is about materials that nobody has seen, and slides of one are alike.
+    It is left out if these are fewer than `MIN_CLUSTERS`.
     """
-    if not len(flags):
-        return {}
-    tree: Tree = {name: float(flags.mean()), f"{name}_n": len(flags)}
-    if materials is None:
-        low, high = wilson(int(flags.sum()), len(flags))
-        return {**tree, f"{name}_low": low, f"{name}_high": high}
-    tree[f"{name}_materials"] = len(np.unique(materials))
-    if tree[f"{name}_materials"] < MIN_CLUSTERS:
-        return tree
-    interval = share_interval(flags[:, None].astype(np.float64), np.ones((len(flags), 1)), materials).first
-    return {**tree, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    if not len(answered):
+        return
+    measures["false_known"], measures["false_known_n"] = float(answered.mean()), len(answered)
+    measures["false_known_materials"] = len(set(materials))
+    if len(set(materials)) >= MIN_CLUSTERS:
+        counted = np.ones((len(answered), 1))
+        interval = share_interval(answered[:, None].astype(np.float64), counted, np.array(materials)).first
+        measures["false_known_low"], measures["false_known_high"] = interval.low, interval.high

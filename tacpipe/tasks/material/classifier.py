@@ -29,7 +29,7 @@ from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
-from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, Params
+from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, MaterialConfig, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import SlideLayout, Slides, difference
 from tacpipe.tasks.recordings import OpenedChain
@@ -47,7 +47,6 @@ CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.saf
 ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
 UNKNOWN_ANSWER = "unknown"
 
-Config = dict[str, Any]
 ReadoutModel = MinirocketClassifier | StatisticsClassifier
 Baseline = Level | ReadoutModel | FittedEstimator
 
@@ -174,8 +173,8 @@ class Classifier:
 
     def __init__(self, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> None:
         self.chain = chain  # the stages that it was trained behind; None: unknown
-        config = model_files.tree(files, CONFIG, NEEDED)
-        self.config: Config = config  # config.json
+        config: MaterialConfig = model_files.tree(files, CONFIG, NEEDED)
+        self.config = config
         self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
@@ -358,7 +357,7 @@ class StoredClassifier:
     """The files of a classifier, and the ways to read them that the task offers to architectures."""
 
     files: Mapping[str, bytes]
-    config: Config
+    config: MaterialConfig
     layouts: Mapping[str, SlideLayout]
     classes: tuple[int, ...]
     weights: str = WEIGHTS  # name of the file that `networks` and readouts are read from

@@ -17,11 +17,12 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.metrics.intervals import mcnemar, wilson
-from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Result
 from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, Classifier, ReaderOutput
+from tacpipe.tasks.material.headline import ChanceAccuracy, MaterialScores, SensorAccuracy, ZeroShotAccuracy
 from tacpipe.tasks.material.network_training import HISTORY
 from tacpipe.tasks.material.params import MEAN_LEVEL
 from tacpipe.tasks.material.slides import Slides
@@ -30,10 +31,9 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
-Tree = dict[str, Any]
 
 
-def accuracy(correct: Mapping[str, Bools]) -> Tree:
+def accuracy(correct: Mapping[str, Bools]) -> SensorAccuracy:
     """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
 
     Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
@@ -43,43 +43,38 @@ def accuracy(correct: Mapping[str, Bools]) -> Tree:
     >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
     {'biotac': 0.5}
     """
-    tree: Tree = {"accuracy": {}, "correct": {}, "n": {}, "low": {}, "high": {}}
-    for sensor, right in correct.items():
-        if not len(right):
-            continue
-        count = int(right.sum())
-        low, high = wilson(count, len(right))
-        tree["accuracy"][sensor] = count / len(right)
-        tree["correct"][sensor], tree["n"][sensor] = count, len(right)
-        tree["low"][sensor], tree["high"][sensor] = low, high
-    return tree
+    evaluated = {sensor: right for sensor, right in correct.items() if len(right)}
+    counts = {sensor: int(right.sum()) for sensor, right in evaluated.items()}
+    ends = {sensor: wilson(counts[sensor], len(right)) for sensor, right in evaluated.items()}
+    return {
+        "accuracy": {sensor: counts[sensor] / len(right) for sensor, right in evaluated.items()},
+        "correct": counts,
+        "n": {sensor: len(right) for sensor, right in evaluated.items()},
+        "low": {sensor: low for sensor, (low, _) in ends.items()},
+        "high": {sensor: high for sensor, (_, high) in ends.items()},
+    }
 
 
-def chance(counts: Mapping[str, int], classes: int) -> Tree:
+def chance(counts: Mapping[str, int], classes: int) -> ChanceAccuracy:
     """Return what guessing one of ``classes`` gets, by sensor."""
     shares = {sensor: 1 / classes for sensor, count in counts.items() if count}
     return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
 
 
-def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> Tree:
-    """Return the metrics of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,).
-
-    ``skill`` is the fraction of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
-    of so unequal disagreements if both were as good.
-    """
-    tree: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> MaterialScores:
+    """Return the scores of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,)."""
     counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
-    tree["chance"] = chance(counts, classes)
-    tree["counts"] = {"slides": counts}
+    skill = disagreements = None
     if MEAN_LEVEL in right:
-        tree["skill"], tree["mcnemar"] = {}, {"model_vs_mean_level": {}}
-        for sensor, model in right[MODEL].items():
-            level = right[MEAN_LEVEL][sensor]
-            if len(model) and not level.all():
-                tree["skill"][sensor] = float(1 - (~model).mean() / (~level).mean())
-            if len(model):
-                tree["mcnemar"]["model_vs_mean_level"][sensor] = mcnemar(model, level)
-    return tree
+        pairs = {sensor: (model, right[MEAN_LEVEL][sensor]) for sensor, model in right[MODEL].items() if len(model)}
+        skill = {
+            sensor: float(1 - (~model).mean() / (~level).mean())
+            for sensor, (model, level) in pairs.items()
+            if not level.all()
+        }
+        disagreements = {sensor: mcnemar(*pair) for sensor, pair in pairs.items()}
+    predictors = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+    return MaterialScores(predictors, chance(counts, classes), counts, skill, disagreements)
 
 
 def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:
@@ -143,13 +138,15 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         raise TacpipeError(
             "There is no slide to evaluate the model on. Give a dataset that `tacpipe segment slides` made."
         )
-    tree = {**_summary(evaluated, classifier, seen=False), **answers.trees()}
+    metrics = answers.metrics()
+    if zero_shot := _zero_shot(evaluated, classifier):
+        metrics["zero_shot"] = zero_shot
     seen = _summary(evaluated, classifier, seen=True)
-    if any(seen["counts"]["slides"].values()):
-        tree["seen"] = seen
-    zero = _zero_shot(evaluated, classifier)
-    if zero:
-        tree["zero_shot"] = zero
+    tree = {
+        **_summary(evaluated, classifier, seen=False).to_json(),
+        **metrics,
+        **({"seen": seen.to_json()} if any(seen.slides.values()) else {}),
+    }
     rows = [
         (sensor, result, int(at))
         for sensor, result in evaluated.items()
@@ -255,7 +252,7 @@ def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out
     return classifier.best_classes(scores), classifier.best_classes(np.where(is_held_out, scores, -np.inf))
 
 
-def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> Tree:
+def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> MaterialScores:
     """Return the metrics on the slides that the model has seen, or on those it has not."""
     chosen = {
         sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
@@ -290,7 +287,7 @@ def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> li
     return sensor_headlines
 
 
-def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Tree:
+def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> ZeroShotAccuracy | None:
     """Return how well another sensor's classifier names materials whose labels a sensor did not learn."""
     correct, correct_among_held_out, chances = {}, {}, {}
     for sensor, result in evaluated.items():
@@ -301,15 +298,16 @@ def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Tr
         correct_among_held_out[sensor] = (result.zero_shot[1] == result.slides.materials)[chosen]
         chances[sensor] = 1 / len(classifier.config["held_out"][sensor])
     if not correct:
-        return {}
-    tree = accuracy(correct)
-    tree["chance"] = {sensor: 1 / len(classifier.classes) for sensor in correct}
-    tree["among_held_out"] = {**accuracy(correct_among_held_out), "chance": chances}
-    return tree
+        return None
+    return {
+        **accuracy(correct),
+        "chance": {sensor: 1 / len(classifier.classes) for sensor in correct},
+        "among_held_out": {**accuracy(correct_among_held_out), "chance": chances},
+    }
 
 
 def predictions_table(
-    evaluated: Mapping[str, Evaluated], classifier: Classifier, sessions: Mapping[str, Any] | None = None
+    evaluated: Mapping[str, Evaluated], classifier: Classifier, sessions: Mapping[str, Attribute] | None = None
 ) -> pa.Table:
     """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
 

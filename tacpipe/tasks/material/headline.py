@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Json
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
@@ -20,6 +21,9 @@ from tacpipe.tasks.material.params import KEY
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from tacpipe.metrics.calibration import ConfidenceBin
+    from tacpipe.tasks.material.params import StoredNaming
 
 TASK = "material"
 CHANCE = "chance"
@@ -73,6 +77,104 @@ MEASURE = Measure(
     weight=lambda draws: draws[:, 1],
 )
 
+
+class SensorAccuracy(TypedDict):
+    """How often a predictor names slides rightly, by sensor, with the 95 % Wilson interval."""
+
+    accuracy: dict[str, float]
+    correct: dict[str, int]
+    n: dict[str, int]
+    low: dict[str, float]
+    high: dict[str, float]
+
+
+class ChanceAccuracy(TypedDict):
+    """The accuracy of guesses by sensor."""
+
+    accuracy: dict[str, float]
+    n: dict[str, int]
+
+
+class HeldOutAccuracy(SensorAccuracy):
+    """Accuracy on materials whose labels a sensor did not learn, and that of guesses."""
+
+    chance: dict[str, float]
+
+
+class ZeroShotAccuracy(HeldOutAccuracy):
+    """Accuracy out of all materials, and out of those held out alone."""
+
+    among_held_out: NotRequired[HeldOutAccuracy]
+
+
+class StatedProbabilities(TypedDict):
+    """How the stated probabilities of learned classes fit the slides."""
+
+    calibration_error: float
+    log_loss: float
+    confidence: float
+    reliability: list[ConfidenceBin]
+
+
+class ProbabilityMeasures(TypedDict):
+    """The probabilities of a sensor's classes before calibration and after."""
+
+    n: int
+    temperature: float
+    before: StatedProbabilities
+    after: StatedProbabilities
+
+
+class UnknownMeasures(TypedDict):
+    """The answers of a calibrated classifier for slides of learned classes and of others, of one sensor.
+
+    Rates have their number of slides and the ends of their 95 % interval.
+    """
+
+    rule: str
+    threshold: float
+    false_unknown: NotRequired[float]
+    false_unknown_n: NotRequired[int]
+    false_unknown_low: NotRequired[float]
+    false_unknown_high: NotRequired[float]
+    false_known: NotRequired[float]
+    false_known_n: NotRequired[int]
+    false_known_materials: NotRequired[int]
+    false_known_low: NotRequired[float]
+    false_known_high: NotRequired[float]
+    auroc: NotRequired[dict[Literal["probability", "distance"], float]]
+    accuracy_of_answers: NotRequired[float]
+
+
+@dataclass(frozen=True)
+class MaterialScores:
+    """Accuracy of all predictors on some slides, by sensor."""
+
+    predictors: dict[str, SensorAccuracy]
+    chance: ChanceAccuracy
+    slides: dict[str, int]
+    skill: dict[str, float] | None  # fraction of the mean level's wrong names that the model gets right
+    mcnemar: dict[str, float] | None  # exact probability of disagreements so unequal if both were as good
+
+    def to_json(self) -> Json:
+        """Return the scores as ``metrics.json`` has them."""
+        compared = {"skill": self.skill, "mcnemar": {"model_vs_mean_level": self.mcnemar}}
+        return {
+            **self.predictors,
+            "chance": self.chance,
+            "counts": {"slides": self.slides},
+            **({} if self.skill is None else compared),
+        }
+
+
+class MaterialMetrics(TypedDict, total=False):
+    """The parts of ``metrics.json`` next to `MaterialScores`; those without slides are left out."""
+
+    calibration: dict[str, ProbabilityMeasures]  # by sensor
+    unknown: dict[str, UnknownMeasures]  # by sensor
+    zero_shot: ZeroShotAccuracy
+
+
 UNKNOWN = -1  # stands where a slide has no label
 
 
@@ -125,12 +227,15 @@ class Naming:
             return numbers
         return np.array([self.names[number] if number >= 0 else "" for number in numbers.tolist()], dtype=np.str_)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return what a model's configuration holds of it: nothing of whole numbers under the usual key."""
-        return ({} if self.key == KEY else {"label": self.key}) | ({"names": list(self.names)} if self.names else {})
+    def write(self, config: StoredNaming) -> None:
+        """Add the naming to a model's configuration: nothing of whole numbers under the usual key."""
+        if self.key != KEY:
+            config["label"] = self.key
+        if self.names:
+            config["names"] = list(self.names)
 
     @classmethod
-    def from_json(cls, config: Any) -> Naming:
+    def from_json(cls, config: StoredNaming) -> Naming:
         """Return the naming in a model's configuration."""
         return cls(str(config.get("label", KEY)), tuple(map(str, config.get("names", ()))))
 

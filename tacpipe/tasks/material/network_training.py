@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -31,7 +30,6 @@ from tacpipe.tasks.material.classifier import (
     TASK,
     WEIGHTS,
     Classifier,
-    Config,
     NetworkReader,
 )
 from tacpipe.tasks.material.headline import Naming
@@ -39,11 +37,14 @@ from tacpipe.tasks.material.losses import NONE, BatchPairs, JointWork, ScaledSli
 from tacpipe.tasks.material.params import (
     MEAN_LEVEL,
     PERMUTED_LABELS,
+    BestEpochs,
     Estimator,
+    MaterialConfig,
     Minirocket,
     Params,
     Spectra,
     Statistics,
+    StoredShape,
     aligning_architectures,
 )
 from tacpipe.tasks.material.params import NetworkParams as NetworkParams
@@ -60,7 +61,7 @@ HISTORY = "history.jsonl"
 
 def train_network(
     params: NetworkParams,
-    config: Config,
+    config: MaterialConfig,
     training_slides: BySensor,
     validation_slides: BySensor,
     workspace: Path,
@@ -109,7 +110,8 @@ def train_network(
         for part in (training_slides, validation_slides)
     )
     partners = _partners(params, len(config["classes"]))
-    config |= _described(config["classes"], shapes, scalings, held_out_materials, partners, joint=joint)
+    _describe(config, shapes, scalings, held_out_materials, partners)
+    config["joint"] = joint
     pairs = _pairs(params, training, partners)
     work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
 
@@ -134,33 +136,38 @@ def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
     return None
 
 
-def _described(
-    classes: Sequence[int],
+def _stored(shape: AutoencoderShape) -> StoredShape:
+    return {
+        "channels": shape.channels,
+        "classes": shape.classes,
+        "header": shape.header,
+        "decoder": shape.decoder,
+        "hidden": shape.hidden,
+        "latents": shape.latents,
+        "unpool": shape.unpool,
+        "dropout": shape.dropout,
+    }
+
+
+def _describe(
+    config: MaterialConfig,
     shapes: Mapping[str, AutoencoderShape],
     scalings: Mapping[str, Affine],
     held_out_materials: Mapping[str, set[int]],
     partners: Mapping[int, int] | None,
-    *,
-    joint: bool,
-) -> dict[str, Any]:
-    """Return the part of a model's configuration that describes its networks."""
-    description: dict[str, Any] = {
-        "shapes": {name: dataclasses.asdict(shape) for name, shape in shapes.items()},
-        "scaling": {
-            name: {key: value.tolist() for key, value in scaling.to_tensors().items()}
-            for name, scaling in scalings.items()
-        },
-        "joint": joint,
-        "held_out": {name: sorted(materials) for name, materials in held_out_materials.items()},
+) -> None:
+    """Add the networks to a model's configuration."""
+    config["shapes"] = {name: _stored(shape) for name, shape in shapes.items()}
+    config["scaling"] = {
+        name: {key: value.tolist() for key, value in scaling.to_tensors().items()} for name, scaling in scalings.items()
     }
+    config["held_out"] = {name: sorted(materials) for name, materials in held_out_materials.items()}
     if partners is not None:
-        description["partners"] = {
-            str(classes[number]): classes[partner] for number, partner in sorted(partners.items())
-        }
-    return description
+        classes = config["classes"]
+        config["partners"] = {str(classes[number]): classes[partner] for number, partner in sorted(partners.items())}
 
 
-def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict[str, bytes]:
+def _files(trained: loop.Trained, config: MaterialConfig, params: NetworkParams) -> dict[str, bytes]:
     """Return the files of trained networks: the weights that were selected, and the last ones next to them."""
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
     files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: history_bytes(trained.history)}
@@ -185,7 +192,7 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
 
 def _scaled(
     params: NetworkParams,
-    config: Config,
+    config: MaterialConfig,
     slides: Slides,
     scaled: Affine,
     held_out_materials: Mapping[str, set[int]],
@@ -221,7 +228,7 @@ def _same_materials(training_slides: BySensor, naming: Naming) -> None:
             )
 
 
-def _same_space(start: Classifier, frozen_sensor: str, config: Config, slides: BySensor) -> None:
+def _same_space(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> None:
     """Refuse a model of --init that does not know the sensor or the same materials."""
     if frozen_sensor not in slides:
         raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
@@ -264,7 +271,7 @@ def _built(
     return built
 
 
-def _validation(history: Sequence[Line], joint: bool) -> dict[str, Any]:
+def _validation(history: Sequence[Line], joint: bool) -> BestEpochs:
     """Return the epoch that each sensor's weights come from, and the accuracy at that epoch."""
 
     def chosen(sensor: str) -> Line:
@@ -294,7 +301,7 @@ def _network_baselines(trained: Classifier, training_slides: BySensor, params: P
 class TrainingSlides:
     """The slides and settings that an architecture's ``fit`` learns from, and the ways to train that the task offers."""
 
-    config: Config  # the model's configuration as far as the data determine it
+    config: MaterialConfig  # the model's configuration as far as the data determine it
     training: BySensor
     validation: BySensor
     naming: Naming
@@ -352,7 +359,7 @@ def train(
             f"All training slides are of {naming.key} {naming.name(classes[0])}; there is nothing to classify."
         )
     absent = slides_of.absent_quantities(training, kinds)
-    config: Config = {
+    config: MaterialConfig = {
         "task": TASK,
         "architecture": params.architecture,
         "params": params_of.to_json(params),
@@ -360,8 +367,6 @@ def train(
         "quantities": kinds,
         "sensors": {name: slides.layout.to_json() for name, slides in training_slides.items()},
         "classes": classes,
-        **naming.to_json(),
-        **({"absent": absent} if absent else {}),
         "counts": {
             role: {name: len(slides) for name, slides in part.items()}
             for role, part in (("train", training_slides), ("val", validation_slides))
@@ -374,6 +379,9 @@ def train(
             )
         ),
     }
+    naming.write(config)
+    if absent:
+        config["absent"] = absent
     return params.fit(TrainingSlides(config, training_slides, validation_slides, naming, workspace, init))
 
 

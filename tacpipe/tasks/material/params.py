@@ -9,9 +9,10 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict
 
 from tacpipe.errors import UsageError
+from tacpipe.io import Scalar
 from tacpipe.plugins import architectures, fields
 from tacpipe.plugins.constraints import (
     Assignments,
@@ -26,6 +27,7 @@ from tacpipe.plugins.constraints import (
     StoredAs,
 )
 from tacpipe.plugins.params import added
+from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
 if TYPE_CHECKING:
@@ -41,11 +43,11 @@ if TYPE_CHECKING:
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of every architecture
 LEVEL_VIEWS: Mapping[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # baselines of statistics
 KEY = "material"  # the label that names classes, unless params name another
-Presets = Mapping[str, Mapping[str, object]]
+Presets = Mapping[str, Mapping[str, Scalar]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
 # the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
-_PAPER_TEXT: Mapping[str, object] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
+_PAPER_TEXT: Mapping[str, Scalar] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
 _ALIGNED_RECONSTRUCTION = 0.05  # weight in networks that are aligned to a frozen one: that of the published script
 HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(min_items=1)], between=";")]
 
@@ -443,6 +445,81 @@ class XLSTM(NetworkParams):
 
 
 Params = MaterialModelParams  # params of any architecture
+
+
+class StoredNaming(TypedDict):
+    """The naming of classes in a model's configuration; nothing of whole numbers under the usual key."""
+
+    label: NotRequired[str]
+    names: NotRequired[list[str]]
+
+
+class StoredLayout(TypedDict):
+    """The layout of a sensor's slides, in a model's configuration."""
+
+    channels: list[str]
+    frames: int
+    rate_hz: float
+    layout: str
+
+
+class StoredShape(TypedDict):
+    """The fields of `AutoencoderShape`, in a model's configuration."""
+
+    channels: int
+    classes: int
+    header: str
+    decoder: str
+    hidden: int
+    latents: int
+    unpool: str
+    dropout: float
+
+
+class BestEpochs(TypedDict):
+    """The epoch that each sensor's weights come from, and the validation accuracy at that epoch."""
+
+    epoch: dict[str, int]
+    accuracy: dict[str, float]
+
+
+class SpectraDescription(TypedDict):
+    """The bands of spectra over spatial frequency, and the speed of each sensor's slides."""
+
+    way_m: float
+    edges_per_m: list[float]
+    speed_m_s: dict[str, float]
+
+
+class UnknownDescription(TypedDict):
+    """The calibration of a sensor's probabilities and of its threshold of unknown."""
+
+    slides: int
+    temperature: float
+    rule: str
+    threshold: float
+    false_unknown: float
+    auroc_left_out: dict[Literal["probability", "distance"], float]
+    calibration_error: dict[str, float]  # before and after
+
+
+class MaterialConfig(ModelConfig, StoredNaming):
+    """``config.json`` of a model of the task ``material``."""
+
+    split: str  # in words; of older models a mapping
+    quantities: Sequence[str]
+    sensors: dict[str, StoredLayout]
+    classes: list[int]
+    absent: NotRequired[list[str]]  # quantities that no sensor has
+    counts: dict[str, dict[str, int]]  # slides by role and sensor
+    shapes: NotRequired[dict[str, StoredShape]]  # networks only
+    scaling: NotRequired[dict[str, dict[str, list[float]]]]
+    joint: NotRequired[bool]
+    held_out: NotRequired[dict[str, list[int]]]  # sensor to classes whose labels it does not learn
+    partners: NotRequired[dict[str, int]]  # class to the one that it is paired with across sensors
+    validation: NotRequired[BestEpochs]
+    spectra: NotRequired[SpectraDescription]
+    known: NotRequired[dict[str, UnknownDescription]]  # by sensor, of calibrated models
 
 
 def aligning_architectures() -> list[str]:

@@ -20,7 +20,6 @@ from tacpipe.tasks.material.classifier import (
     ESTIMATORS,
     SHUFFLED_ESTIMATORS,
     WEIGHTS,
-    Config,
     ReadoutModel,
 )
 from tacpipe.tasks.material.estimators import FittedEstimator
@@ -31,6 +30,7 @@ from tacpipe.tasks.material.params import (
     MEAN_LEVEL,
     PERMUTED_LABELS,
     Estimator,
+    MaterialConfig,
     Minirocket,
     Params,
     Spectra,
@@ -42,7 +42,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def rockets(
-    params: Minirocket, config: Config, training_slides: BySensor, validation_slides: BySensor
+    params: Minirocket, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of a model of patterns and a readout, of each sensor alone."""
     tensors: Arrays = {}
@@ -59,7 +59,7 @@ def rockets(
 
 
 def estimators(
-    params: Estimator, config: Config, training_slides: BySensor, validation_slides: BySensor
+    params: Estimator, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of estimators of scikit-learn, of each sensor alone."""
     fitted: dict[str, FittedEstimator] = {}
@@ -79,7 +79,7 @@ def estimators(
 
 
 def statistics(
-    params: Statistics, config: Config, training_slides: BySensor, validation_slides: BySensor
+    params: Statistics, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of a model of statistics and a readout, of each sensor alone.
 
@@ -102,7 +102,7 @@ def statistics(
 
 def spectra(
     params: Spectra,
-    config: Config,
+    config: MaterialConfig,
     training_slides: BySensor,
     validation_slides: BySensor,
     held_out: Mapping[str, Iterable[int]],
@@ -134,15 +134,13 @@ def spectra(
         raise UsageError(
             f"hold_out leaves no sensor that learns {Naming.from_json(config).name(missing[0])}; leave at least one."
         )
-    config = config | {
-        "spectra": {
-            "way_m": bands.way_m,
-            "edges_per_m": bands.edges_per_m.tolist(),
-            "speed_m_s": {name: sampling.speed_m_s for name, sampling in sampled.items()},
-        },
-        "held_out": {
-            name: sorted(set(config["classes"]) - learned_materials) for name, learned_materials in learned.items()
-        },
+    config["spectra"] = {
+        "way_m": bands.way_m,
+        "edges_per_m": bands.edges_per_m.tolist(),
+        "speed_m_s": {name: sampling.speed_m_s for name, sampling in sampled.items()},
+    }
+    config["held_out"] = {
+        name: sorted(set(config["classes"]) - learned_materials) for name, learned_materials in learned.items()
     }
     tensors = {
         f"{name}.{key}": value
@@ -208,6 +206,6 @@ def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def _files(config: Config, tensors: Arrays, baselines: Arrays) -> dict[str, bytes]:
+def _files(config: MaterialConfig, tensors: Arrays, baselines: Arrays) -> dict[str, bytes]:
     files = {CONFIG: model_files.to_json(config), WEIGHTS: packed(tensors)}
     return {**files, BASELINES: packed(baselines)} if baselines else files

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.tasks.material.params import StoredLayout
 
 STREAM = "slide"
 TACTILE = "tactile"
@@ -42,13 +43,17 @@ class SlideLayout:
         near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= NEAR * max(self.rate_hz, other.rate_hz)
         return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> StoredLayout:
         """Return what `from_json` reads."""
-        layout = {"frames": self.frames, "rate_hz": self.rate_hz, "layout": self.layout}
-        return {"channels": list(self.channels), **layout}
+        return {
+            "channels": list(self.channels),
+            "frames": self.frames,
+            "rate_hz": self.rate_hz,
+            "layout": self.layout,
+        }
 
     @classmethod
-    def from_json(cls, sensor: str, stored: dict[str, Any]) -> SlideLayout:
+    def from_json(cls, sensor: str, stored: StoredLayout) -> SlideLayout:
         """Return the layout that `to_json` wrote."""
         return cls(sensor, tuple(stored["channels"]), int(stored["frames"]), float(stored["rate_hz"]), stored["layout"])
 

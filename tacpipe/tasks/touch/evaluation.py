@@ -6,7 +6,8 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +16,7 @@ from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import selection
 from tacpipe.errors import TacpipeError
-from tacpipe.io import terminal
+from tacpipe.io import Json, terminal
 from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
@@ -38,18 +39,67 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
-Tree = dict[str, Any]
+Scores = dict[str, float | None]  # values by name; None where a measure is not defined
 
 
-def reading_measures(readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]) -> Tree:
+class ReadingMeasures(TypedDict):
+    """The measures of a predictor's readings, by target."""
+
+    rmse: Scores
+    rmse_counts: Scores
+    rmse_batch_mean: Scores
+    mae: Scores
+    r2: Scores
+    skill: Scores
+    skill_low: Scores
+    skill_high: Scores
+    n: int  # grasps
+
+
+class PredictorMeasures(ReadingMeasures):
+    """The measures of a predictor, over all grasps and by object."""
+
+    by_object: dict[str, ReadingMeasures]
+
+
+class ModelMeasures(PredictorMeasures):
+    """The measures of the model itself."""
+
+    by_electrode: dict[str, dict[str, Scores]]  # by target, electrode and measure
+
+
+@dataclass(frozen=True)
+class TouchScores:
+    """The measures of all predictors on some grasps."""
+
+    counts: dict[str, int]
+    predictors: dict[str, PredictorMeasures] = field(default_factory=dict)
+
+    def to_json(self) -> Json:
+        """Return the scores as ``metrics.json`` has them."""
+        return {"counts": self.counts, **self.predictors}
+
+
+def reading_measures(
+    readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]
+) -> ReadingMeasures:
     """Return the measures of one predictor's readings, by measure and target.
 
     ``rmse`` and ``mae`` are in fractions of each target's range (`biotac_sp.RANGES`), over grasps and electrodes at once;
     ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
     ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over ``clusters``.
     """
-    names = ("rmse", "rmse_counts", "rmse_batch_mean", "mae", "r2", "skill", "skill_low", "skill_high")
-    measures: Tree = {name: {} for name in names}
+    measures: ReadingMeasures = {
+        "rmse": {},
+        "rmse_counts": {},
+        "rmse_batch_mean": {},
+        "mae": {},
+        "r2": {},
+        "skill": {},
+        "skill_low": {},
+        "skill_high": {},
+        "n": len(clusters),
+    }
     for target, values in predicted.items():
         true, share, mean = (biotac_sp.normalised(target, counts[target]) for counts in (readings, predicted, constant))
         measures["rmse"][target] = regression.rmse(true, share)
@@ -58,16 +108,14 @@ def reading_measures(readings: Readings, predicted: Readings, constant: Readings
         measures["mae"][target] = regression.mae(true, share)
         measures["r2"][target] = _finite(regression.r2(true, share))
         model, baseline = (regression.squared_sums(true, share_of_range) for share_of_range in (share, mean))
-        skill = regression.skill_interval(model, baseline, np.asarray(clusters))
-        for name, value in zip(("skill", "skill_low", "skill_high"), skill, strict=True):
-            measures[name][target] = _finite(value)
-    measures["n"] = len(clusters)
+        skill, low, high = map(_finite, regression.skill_interval(model, baseline, np.asarray(clusters)))
+        measures["skill"][target], measures["skill_low"][target], measures["skill_high"][target] = skill, low, high
     return measures
 
 
-def by_electrode(readings: Readings, predicted: Readings) -> Tree:
+def by_electrode(readings: Readings, predicted: Readings) -> dict[str, dict[str, Scores]]:
     """Return RMSE (fraction of the range) and R2 of each electrode, by target."""
-    by_target: Tree = {}
+    by_target = {}
     for target, values in predicted.items():
         if biotac_sp.width(target) > 1:
             true, share = (biotac_sp.normalised(target, counts) for counts in (readings[target], values))
@@ -127,16 +175,18 @@ def _evaluated(
         grasps
     )
     is_known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
-    tree = _measures(grasps, predicted, ~in_training, is_known)
-    for name, mask in (("known", is_known & ~in_training), ("novel", ~is_known & ~in_training), ("seen", in_training)):
-        if mask.any():
-            tree[name] = _measures(grasps, predicted, mask, is_known)
-    if quantile_tree := _quantiles(predictor, grasps, predicted, in_training, is_known):
-        tree["quantiles"] = quantile_tree
+    fresh = _scores(grasps, predicted, ~in_training, is_known)
+    masks = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training, "seen": in_training}
+    quantile_measures = _quantiles(predictor, grasps, predicted, in_training, is_known)
+    tree = {
+        **fresh.to_json(),
+        **{name: _scores(grasps, predicted, mask, is_known).to_json() for name, mask in masks.items() if mask.any()},
+        **({"quantiles": quantile_measures} if quantile_measures else {}),
+    }
     files = {
         headline.FILE: headline.write(_headlines(predictor, grasps, predicted, in_training, is_known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
-        "by_object.csv": _by_object_csv(tree),
+        "by_object.csv": _by_object_csv(fresh),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     if predictor.quantiles is not None:
@@ -148,17 +198,21 @@ def _evaluated(
 
 def _quantiles(
     predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
-) -> Tree:
+) -> Json:
     """Return the measures of a calibrated model's quantiles, of known objects and of novel ones; empty for others."""
     if predictor.quantiles is None:
         return {}
     parts = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training}
     clusters = {"known": grasps.names, "novel": grasps.objects}
-    trees = {
-        name: quantiles.tree(predictor.quantiles, grasps, predicted, mask, clusters[name])
+    measures = {
+        name: {
+            "n": int(mask.sum()),
+            **quantiles.measures_by_predictor(predictor.quantiles, grasps, predicted, mask, clusters[name]),
+        }
         for name, mask in parts.items()
+        if mask.any()
     }
-    return {**predictor.config["quantiles"], **{name: measures for name, measures in trees.items() if measures}}
+    return {**predictor.config["quantiles"], **measures}
 
 
 def _headlines(
@@ -184,43 +238,50 @@ def _headlines(
     return target_headlines
 
 
-def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> Tree:
+def _scores(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> TouchScores:
     """Return the measures of every predictor on some grasps, over all of them and by object.
 
     Intervals are over objects where one of them is not known, else over grasps (``is_known`` (grasp,)).
     """
     if not mask.any():
-        return {"counts": {"grasps": 0}}
+        return TouchScores({"grasps": 0})
     names, objects = np.array(grasps.names), np.array(grasps.objects)
     clusters = objects if (mask & ~is_known).any() else names
-    tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
-    for name, readings in predicted.items():
-        tree[name] = _tree(grasps, readings, predicted[CONSTANT], mask, clusters)
-        tree[name]["by_object"] = {
-            object_name or "unnamed": _tree(
-                grasps, readings, predicted[CONSTANT], mask & (objects == object_name), names
-            )
-            for object_name in sorted(set(objects[mask]))
+    constant = predicted[CONSTANT]
+    predictors: dict[str, PredictorMeasures] = {
+        name: {
+            **_measures(grasps, readings, constant, mask, clusters),
+            "by_object": {
+                object_name or "unnamed": _measures(grasps, readings, constant, mask & (objects == object_name), names)
+                for object_name in sorted(set(objects[mask]))
+            },
         }
-    readings, model = (select_rows(one, mask) for one in (grasps.readings, predicted[MODEL]))
-    tree[MODEL]["by_electrode"] = by_electrode(readings, model)
-    return tree
+        for name, readings in predicted.items()
+    }
+    readings, model = (select_rows(values, mask) for values in (grasps.readings, predicted[MODEL]))
+    own_measures: ModelMeasures = {**predictors[MODEL], "by_electrode": by_electrode(readings, model)}
+    predictors[MODEL] = own_measures
+    return TouchScores({"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}, predictors)
 
 
-def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray) -> Tree:
+def _measures(
+    grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray
+) -> ReadingMeasures:
     readings, model, mean = (select_rows(values, mask) for values in (grasps.readings, predicted, constant))
     return reading_measures(readings, model, mean, clusters[mask].tolist())
 
 
-def _by_object_csv(tree: Tree) -> bytes:
+def _by_object_csv(scores: TouchScores) -> bytes:
     """Return a row an object, predictor and target: how many grasps, RMSE in shares and counts, R2, skill."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
-        for name, measures in tree.get(predictor, {}).get("by_object", {}).items():
+        by_object = scores.predictors[predictor]["by_object"] if predictor in scores.predictors else {}
+        for name, measures in by_object.items():
             for target in measures["rmse"]:
-                values = [measures[measure][target] for measure in ("rmse", "rmse_counts", "r2", "skill")]
+                scored = (measures["rmse"], measures["rmse_counts"], measures["r2"], measures["skill"])
+                values = [by_target[target] for by_target in scored]
                 rounded = ["" if value is None else f"{value:.6g}" for value in values]
                 writer.writerow([name, predictor, target, measures["n"], *rounded])
     return text.getvalue().encode()

@@ -18,13 +18,13 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from tacpipe.arrays import Floats, Indices, Int64s
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Json
 from tacpipe.metrics import regression
 from tacpipe.metrics.intervals import Estimate
 from tacpipe.models.forest import Forest
@@ -139,7 +139,6 @@ OTHER = {
     "pdc_mf": ("pdc_th", "e_th"),
     "e_mf": ("pdc_th", "e_th"),
 }
-Tree = dict[str, Any]
 Skills = dict[str, Estimate]  # target to skill
 
 
@@ -163,7 +162,7 @@ class Limits:
     draws: int
     trees: int
 
-    def to_json(self) -> Tree:
+    def to_json(self) -> Json:
         """Return all of it for JSON; NaN is null, and so is the upper bound of the last class of distance."""
         return {
             "grasps": dict(self.counts),
@@ -295,9 +294,9 @@ def drawn(candidates: Indices, objects: Sequence[str], size: int, rng: np.random
     return np.concatenate([rng.permutation(candidates[names == name])[:size] for name in sorted(set(names))])
 
 
-def _by_target(skills: Skills) -> Tree:
+def _by_target(skills: Skills) -> dict[str, dict[str, float | None]]:
     return {name: _numbers(estimate) for name, estimate in skills.items()}
 
 
-def _numbers(estimate: Estimate) -> Tree:
+def _numbers(estimate: Estimate) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else value for name, value in estimate._asdict().items()}

@@ -128,14 +128,11 @@ def calibrate(
         levels, training_grasps, validation_grasps, predicted, promised=request.promise
     )
     calibrated_on = recordings.merge_trained_on(zip(validation_grasps.names, validation_grasps.digests, strict=True))
-    description = {
+    config = predictor.config.copy()
+    config["quantiles"] = {
         "levels": list(request.quantiles),
         "method": "promised" if request.promise else "pooled",
         "grasps": len(validation_grasps),
     }
-    config = {
-        **predictor.config,
-        "quantiles": description,
-        "trained_on": recordings.add_calibration(predictor.config["trained_on"], calibrated_on),
-    }
+    config["trained_on"] = recordings.add_calibration(config["trained_on"], calibrated_on)
     return {**model, CONFIG: model_files.to_json(config), FILE: reading_quantiles.to_bytes()}

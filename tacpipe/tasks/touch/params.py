@@ -8,8 +8,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict
 
+from tacpipe.io import Scalar
 from tacpipe.plugins.constraints import (
     CommaList,
     NonNegativeFloat,
@@ -22,6 +23,7 @@ from tacpipe.plugins.constraints import (
     Unit,
 )
 from tacpipe.plugins.params import added
+from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.touch.inputs import CloudInputs, PatchOptions
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
-Presets = Mapping[str, Mapping[str, object]]
+Presets = Mapping[str, Mapping[str, Scalar]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
 Draws = Annotated[int, Range(1, 100_000)]
@@ -264,3 +266,37 @@ class Pointnet(PointNetwork):
 Params = TouchModelParams  # params of any architecture
 DEFAULT = TouchModelParams.architecture  # the architecture that is trained if none is named
 PAPER = Pointnet.architecture  # the architecture of the paper
+
+
+class MemberDescription(TypedDict):
+    """A member of a model, which predicts some of its targets."""
+
+    kind: str  # forest or network; a forest has all that follows
+    targets: list[str]
+    groups: NotRequired[list[list[str]]]  # targets of each forest
+    features: NotRequired[list[str]]
+    coloured: NotRequired[bool]
+    placed: NotRequired[bool]
+    leaves: NotRequired[list[int]]
+
+
+class GraspQuantiles(TypedDict):
+    """The calibration of a model's quantiles."""
+
+    levels: list[int]  # percent
+    method: str
+    grasps: int
+
+
+class TouchConfig(ModelConfig):
+    """``config.json`` of a model of the task ``touch``."""
+
+    split: str
+    targets: list[str]
+    objects: list[str]
+    counts: dict[str, int]  # grasps by role
+    members: list[MemberDescription]
+    parameters: int | None  # numbers that are learned; None: forests
+    learned_objects: NotRequired[list[str]]  # of each training grasp, for the baselines
+    kept_of_novel: NotRequired[dict[str, float]]  # shrinkage by target
+    quantiles: NotRequired[GraspQuantiles]

@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
@@ -30,7 +31,7 @@ from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
-from tacpipe.tasks.touch.params import Params, PointNetwork
+from tacpipe.tasks.touch.params import MemberDescription, Params, PointNetwork, TouchConfig
 from tacpipe.tasks.touch.quantiles import FILE as QUANTILES
 from tacpipe.tasks.touch.quantiles import ReadingQuantiles
 from tacpipe.training import devices
@@ -169,8 +170,6 @@ def fit_shrinkage(
     return Shrinkage(factor, {name: values.mean(axis=0) for name, values in readings.items()})
 
 
-Config = dict[str, Any]
-
 TASK = "touch"
 CONFIG, WEIGHTS, HISTORY, BASELINES = "config.json", "model.safetensors", "history.jsonl", "baselines.safetensors"
 FOREST, NETWORK = "forest", "network"
@@ -201,7 +200,7 @@ class Predictor:
     """A loaded model of touch; `model` adds what reads recordings."""
 
     params: Params
-    config: Config  # config.json
+    config: TouchConfig
     members: Sequence[members.Member]
     baselines: Baselines | None
     chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
@@ -215,7 +214,7 @@ class Predictor:
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
         that recordings went through the same.
         """
-        config = model_files.tree(files, CONFIG, NEEDED)
+        config: TouchConfig = model_files.tree(files, CONFIG, NEEDED)
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = devices.kind()
@@ -288,7 +287,7 @@ class Predictor:
         ]
 
 
-def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], device: str) -> members.Member:
+def _member(params: Params, about: MemberDescription, tensors: dict[str, Tensor], device: str) -> members.Member:
     targets = tuple(about["targets"])
     width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:

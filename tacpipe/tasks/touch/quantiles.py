@@ -92,17 +92,15 @@ class ReadingQuantiles:
         return cls(tensors[LEVELS], offsets)
 
 
-def tree(
+def measures_by_predictor(
     fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, clusters: Sequence[str]
-) -> dict[str, Any]:
+) -> dict[str, dict[str, dict[str, float]]]:
     """Return measures of the quantiles of grasps that a mask (grasp,) chooses, by predictor, measure and target.
 
     ``pinball`` and ``width`` are in device counts; the interval of ``coverage`` is over ``clusters`` (grasp,), and
-    ``pinball_skill`` is over the constant with its empirical quantiles. Empty without grasps.
+    ``pinball_skill`` is over the constant with its empirical quantiles.
     """
-    if not mask.any():
-        return {}
-    measures: dict[str, Any] = {}
+    measures: dict[str, dict[str, dict[str, float]]] = {}
     names = np.asarray(clusters)[mask]
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
         for target in predicted[MODEL]:
@@ -112,7 +110,7 @@ def tree(
             for measure, values in calibration.tree(sums, fitted.percents, constant_sums).items():
                 if MEAN in values:
                     measures.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
-    return {"n": int(mask.sum()), **measures}
+    return measures
 
 
 def coverage(

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from tacpipe.tasks.touch import members, predictor
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import require_colours
 from tacpipe.tasks.touch.members import Drawn, ScaledGrasps, TouchWork
-from tacpipe.tasks.touch.params import Params, PointNetwork, Trees
+from tacpipe.tasks.touch.params import MemberDescription, Params, PointNetwork, TouchConfig, Trees
 from tacpipe.tasks.touch.predictor import (
     BASELINES,
     CONFIG,
@@ -47,7 +47,6 @@ from tacpipe.training.scaling import Affine
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-Config = dict[str, Any]
 
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried
 
@@ -74,11 +73,11 @@ class TrainingGrasps:
 class FittedModel:
     """The stored parts of a model, to which an architecture's ``fit`` adds."""
 
-    config: Config  # holds ``members``, one description for each member
+    config: TouchConfig  # holds ``members``, one description for each member
     tensors: dict[str, Tensor] = field(default_factory=dict)
     history: list[Line] = field(default_factory=list)
 
-    def add_member(self, described: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    def add_member(self, described: MemberDescription, tensors: Mapping[str, Tensor]) -> None:
         """Add a member of the model: its description, and its tensors by name."""
         number = len(self.config["members"])
         self.config["members"].append(described)
@@ -116,7 +115,7 @@ def train(
     return {CONFIG: model_files.to_json(config), **files}
 
 
-def _config(params: Params, targets: Sequence[str], training: Grasps, validation: Grasps | None) -> Config:
+def _config(params: Params, targets: Sequence[str], training: Grasps, validation: Grasps | None) -> TouchConfig:
     """Return the model's configuration before anything is learned."""
     stored = params_of.to_json(params)
     return {
@@ -149,8 +148,15 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
     if params.adds_joint_forest and len(targets) > 1:
         groups.append(tuple(targets))
     forests, leaves = _forests(params, rows, readings, groups)
-    description: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": [*map(list, groups)]}
-    description |= {"features": list(names), "coloured": params.coloured, "placed": params.place, "leaves": leaves}
+    description: MemberDescription = {
+        "kind": FOREST,
+        "targets": list(targets),
+        "groups": [*map(list, groups)],
+        "features": list(names),
+        "coloured": params.coloured,
+        "placed": params.place,
+        "leaves": leaves,
+    }
     forest_tensors: dict[str, Tensor] = {}
     for number, (_, forest) in enumerate(forests):
         forest_tensors |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
@@ -229,7 +235,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
             )
             kept = trained.weights if params.select == "best" else trained.last
             parameters += _weights_learned(params, group)
-            about = {"kind": NETWORK, "targets": list(group)}
+            about: MemberDescription = {"kind": NETWORK, "targets": list(group)}
             named = {f"network.{name}": value for name, value in kept.items()}
             named |= {
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()

@@ -12,6 +12,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.headline import UNKNOWN, Naming
 from tacpipe.tasks.material.model import MaterialModel
+from tacpipe.tasks.material.params import StoredNaming
 from tacpipe.tasks.material.report import figures, predictions
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts
@@ -44,7 +45,9 @@ def test_any_label_is_a_class_and_none_is_unknown(label: Any, number: int) -> No
 
 def test_whole_numbers_stay_their_own_names_and_are_written_as_before() -> None:
     naming = Naming.from_labels("material", [20, 3])
-    assert (naming.number(20), naming.name(20), naming.to_json()) == (20, "20", {})
+    stored: StoredNaming = {}
+    naming.write(stored)
+    assert (naming.number(20), naming.name(20), stored) == (20, "20", {})
     assert Naming.from_labels("material", [0.5, -1, 3]).names == ("-1", "0.5", "3")
 
 

@@ -27,6 +27,7 @@ from tacpipe.tasks.forward import evaluation
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.alarms import loads
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.headline import ForwardMetrics, LiveMetrics
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
@@ -58,7 +59,7 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     check(model.digest, recordings)
     forecaster = Forecaster.load(model.files)
     steps = headlines.shown(range(1, forecaster.horizon + 1))
-    offline: dict[str, Any] = {}
+    offline = {}
     sessions: dict[str, Session] = {}
     for name, recording in sorted(recordings.recordings.items()):
         try:
@@ -68,21 +69,21 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
             raise type(error)(f"{name}: {error}") from error
     unstored: Any = RecordingsInMemory(offline, model.files)
     result = evaluation.evaluate(model.files, unstored)
-    tree = json.loads(result.files["metrics.json"])
     channels = len(forecaster.codec.channels)
-    tree["live"] = {
+    live: LiveMetrics = {
         **summed(list(sessions.values()), steps, channels),
         "recordings": {name: summed([session], steps, channels) for name, session in sessions.items()},
     }
+    offline_metrics = ForwardMetrics.from_json(json.loads(result.files["metrics.json"]))
     headlines_offline = headline.read(result.files[headline.FILE])
     added = _headline(forecaster, sessions, steps, channels)
     files = {
         **result.files,
-        "metrics.json": model_files.to_json(tree),
-        "live.csv": measures.table(tree["live"], steps),
+        "metrics.json": model_files.to_json(dataclasses.replace(offline_metrics, live=live).to_json()),
+        "live.csv": measures.table(live, steps),
         headline.FILE: headline.write([*headlines_offline, *added]),
     }
-    return dataclasses.replace(result, files=files, notes=[*result.notes, *measures.sentences(tree["live"])])
+    return dataclasses.replace(result, files=files, notes=[*result.notes, *measures.sentences(live)])
 
 
 def check(digest: str, recordings: Dataset) -> None:

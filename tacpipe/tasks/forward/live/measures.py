@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Int64s, Times
 from tacpipe.tasks.forward import slips
-from tacpipe.tasks.forward.slips import Leads
+from tacpipe.tasks.forward.headline import LiveMeasures
+from tacpipe.tasks.forward.slips import Leads, LeadSums
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class Session(NamedTuple):
     late: int
 
 
-def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> dict[str, Any]:
+def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> LiveMeasures:
     """Return the metrics of some sessions together; mean absolute errors are in the unit of the channels."""
     rows = sum(session.rows for session in sessions)
     mae = {
@@ -157,9 +158,9 @@ def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> 
     }
 
 
-def _pooled(sessions: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, Any]:
+def _pooled(sessions: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, dict[str, LeadSums]]:
     """Return what alarms were worth over sessions."""
-    pooled: dict[str, Any] = {}
+    pooled: dict[str, dict[str, LeadSums]] = {}
     for kind in dict.fromkeys(kind for session in sessions for kind in session):
         for source in dict.fromkeys(source for session in sessions for source in session.get(kind, {})):
             parts = [session[kind][source] for session in sessions if source in session.get(kind, {})]
@@ -167,7 +168,7 @@ def _pooled(sessions: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, 
     return pooled
 
 
-def sentences(live: Mapping[str, Any]) -> list[str]:
+def sentences(live: LiveMeasures) -> list[str]:
     """Return what is to be known of live sessions in words: equality, rows left out, latency."""
     rows, latency = live["rows"], live["latency"]
     counted = f"{rows['equal']} of {rows['compared']} published forecasts"
@@ -187,7 +188,7 @@ def sentences(live: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def table(live: Mapping[str, Any], steps: Sequence[int]) -> bytes:
+def table(live: LiveMeasures, steps: Sequence[int]) -> bytes:
     """Return the errors of live and offline forecasts and of persistence as CSV."""
     lines = ["predictor," + ",".join(f"mae_t{step}" for step in steps)]
     for name in PREDICTORS:

@@ -121,12 +121,11 @@ class ForwardReport(TaskReport):
         settings = "; ".join(
             f"{name} {', '.join(map(str, sorted(setting_values, key=str)))}" for name, setting_values in values.items()
         )
-        counts = [run.metrics.get("counts", {}) for run in runs[:1]]
+        counts = [run.metrics.fresh.counts for run in runs[:1]]
         mixed = "Objects of some recordings are known to one run and unseen to another."
         effective = [
             f"{setting_values['windows']:,} windows overlap and are worth about {setting_values['effective_windows']:,}"
             for setting_values in counts
-            if "windows" in setting_values
         ]
         return [
             f"Settings: {settings}." if settings else "",

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.report.blocks import NONE, Cell, Fold, Table, fixed, fold, notes, number, table
 from tacpipe.report.context import Context
+from tacpipe.tasks.forward.headline import LiveMetrics
 from tacpipe.tasks.forward.report.figures import predictor_title
 
 Figures = Mapping[str, float]
 
 
 def rows_by_predictor(
-    methods: Sequence[Method], key: str, scores_of: Callable[[Method, str], Figures | None]
+    methods: Sequence[Method],
+    key: Literal["anticipation", "slips"],
+    scores_of: Callable[[Method, str], Figures | None],
 ) -> list[tuple[str, Figures]]:
     """Return names and what ``of`` a method and a predictor gives, for all that state it.
 
     A baseline is the same for all methods, so it is taken from the method whose most runs state it under ``key``.
     """
     rows = [(method.name, scores_of(method, MODEL)) for method in methods]
-    names = {name for method in methods for run in method.runs for name in run.details.metrics.get(key, {})} - {MODEL}
+    names = {name for method in methods for run in method.runs for name in getattr(run.details.metrics, key)} - {MODEL}
     for name in sorted(names):
-        source = max(methods, key=lambda method: sum(name in run.details.metrics.get(key, {}) for run in method.runs))
+        source = max(methods, key=lambda method: sum(name in getattr(run.details.metrics, key) for run in method.runs))
         rows.append((predictor_title(name), scores_of(source, name)))
     return [(name, figures) for name, figures in rows if figures]
 
@@ -46,7 +49,7 @@ def anticipation_folds(context: Context) -> list[Fold]:
 
 def anticipation_scores(method: Method, predictor: str) -> dict[str, float] | None:
     """Return recall, leads and false alarms of a predictor, averaged over runs by their numbers of events."""
-    described = [run.details.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
+    described = [run.details.metrics.anticipation.get(predictor) for run in method.runs]
     trees = [tree for tree in described if tree and tree.get("events")]
     if not trees:
         return None
@@ -90,7 +93,7 @@ def slip_scores(method: Method, predictor: str) -> dict[str, float] | None:
 
     Counts and minutes are sums. The median lead is the mean of the runs' medians, weighted by the slips that were led.
     """
-    described = [run.details.metrics.get("slips", {}).get(predictor) for run in method.runs]
+    described = [run.details.metrics.slips.get(predictor) for run in method.runs]
     trees = [tree for tree in described if tree and tree["events"]]
     if not trees:
         return None
@@ -130,13 +133,13 @@ def live_folds(context: Context) -> list[Fold]:
     """Return a part for each result that has recordings of live sessions."""
     live_parts = []
     for run in context.runs:
-        live = run.details.metrics.get("live")
+        live = run.details.metrics.live
         if live:
             live_parts += fold("Live sessions", *_live_tables(run, live))
     return live_parts
 
 
-def _live_tables(run: ComparedRun, live: Mapping[str, Any]) -> list[Table]:
+def _live_tables(run: ComparedRun, live: LiveMetrics) -> list[Table]:
     steps = sorted(next(iter(live["mae"].values()), {}), key=lambda step: int(step.removeprefix("t")))
     errors: list[Cells] = [
         [LIVE_NAMES.get(name, name), *(number(by_step[step]) for step in steps)]

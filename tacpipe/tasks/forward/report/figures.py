@@ -14,9 +14,11 @@ from tacpipe.comparison.runs import MODEL, ComparedRun, Method
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Cell, Chart, Charts, Fold, SmallPrint, Table, counted, fold, number, table
 from tacpipe.report.charts import Curve
-from tacpipe.report.context import Context, Tree, loss_chart, median_run
+from tacpipe.report.context import Context, loss_chart, median_run
 from tacpipe.tasks.forward import headline
+from tacpipe.tasks.forward.headline import ForwardMetrics, ForwardScores, IntervalsByStep
 from tacpipe.tasks.forward.report import methods
+from tacpipe.tasks.forward.report.methods import ForwardResult
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -41,8 +43,9 @@ EXPLAINED = {
 
 def run_folds(method: str, run: ComparedRun) -> list[Fold]:
     """Return the errors of a run of a method, or nothing if the result holds no errors by step."""
-    metrics, unit = run.details.metrics, headline.unit_of_model(run.details.config)
-    names = _ordered_predictors(metrics)
+    result: ForwardResult = run.details
+    metrics, unit = result.metrics, headline.unit_of_model(result.config)
+    names = _ordered_predictors(metrics.fresh)
     if not names:
         return []
     notes = [SmallPrint(text) for text in (_describe_floor(metrics, unit), _describe_seen(metrics)) if text]
@@ -61,14 +64,14 @@ def predictor_title(predictor: str) -> str:
 
 
 def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Chart]:
-    metrics, rate_hz = run.details.metrics, float(run.details.config.get("rate_hz") or 0)
-    steps = sorted(int(name[1:]) for name in _both_groups(metrics[names[0]]["mse_counts"]) if name != "mean")
+    predictors, rate_hz = run.details.metrics.fresh.predictors, run.details.rate_hz
+    steps = sorted(int(name[1:]) for name in _both_groups(predictors[names[0]]["mse_counts"]) if name != "mean")
     x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
     lines = [
         Curve(
             predictor_title(name),
             x,
-            [float(np.sqrt(_both_groups(metrics[name]["mse_counts"])[f"t{step}"])) for step in steps],
+            [float(np.sqrt(_both_groups(predictors[name]["mse_counts"])[f"t{step}"])) for step in steps],
             dashed=name != MODEL,
         )
         for name in names
@@ -84,31 +87,34 @@ def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Char
     ]
 
 
-def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]:
-    groups = metrics[names[0]]["mae_counts"]
+def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> list[Table]:
+    predictors = metrics.fresh.predictors
+    groups = predictors[names[0]]["mae_counts"]
     steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in _both_groups(groups)] + ["mean"]
     heads = ["", *(name.replace("t", "t+") if name != "mean" else name for name in steps)]
 
-    def cells(errors: Tree) -> list[Cell]:
+    def cells(errors: Mapping[str, float]) -> list[Cell]:
         return [number(errors[step]) for step in steps]
 
-    errors = {"mae_counts": f"Mean absolute error ({unit})", "mse_counts": f"Mean squared error ({unit}²)"}
+    absolute = {name: _both_groups(scores["mae_counts"]) for name, scores in predictors.items()}
+    squared = {name: _both_groups(scores["mse_counts"]) for name, scores in predictors.items()}
     tables = [
-        table(title, heads, [[predictor_title(name), *cells(_both_groups(metrics[name][measure]))] for name in names])
-        for measure, title in errors.items()
+        table(title, heads, [[predictor_title(name), *cells(errors[name])] for name in names])
+        for title, errors in ((f"Mean absolute error ({unit})", absolute), (f"Mean squared error ({unit}²)", squared))
     ]
     rows: list[Sequence[str | Cell]] = [
-        [predictor_title(name), *cells(metrics[name]["mse_feature"])]
+        [predictor_title(name), *cells(predictors[name]["mse_feature"])]
         for name in names
-        if "mse_feature" in metrics[name]
+        if "mse_feature" in predictors[name]
     ]
     tables += [table("Mean squared error (latents scaled to ±1)", heads, rows)] if rows else []
     rows = [
-        [measure, *(_error_cell(skill.get(step, {})) for step in steps)] for measure, skill in metrics["skill"].items()
+        [measure, *(_error_cell(skill.get(step, {})) for step in steps)]
+        for measure, skill in metrics.fresh.skill.items()
     ]
     tables.append(table("Skill over persistence, with 95 % interval", heads, rows))
     rows = [
-        [f"{predictor_title(name)}, {group}", *cells(metrics[name]["mae_counts"][group])]
+        [f"{predictor_title(name)}, {group}", *cells(predictors[name]["mae_counts"][group])]
         for group in groups
         if group not in ("both", "all")
         for name in names[:2]
@@ -116,13 +122,13 @@ def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]
     tables.append(table(f"Mean absolute error by sensor and axis ({unit})", heads, rows))
     rows = []
     for name in ("known", "unseen"):
-        part = metrics.get(name, {})
-        if "skill" in part:
-            objects = f"{name} objects ({counted(part['counts']['recordings'], 'recordings')})"
+        part = metrics.parts.get(name)
+        if part and part.skill:
+            objects = f"{name} objects ({counted(part.counts['recordings'], 'recordings')})"
             rows += [
                 [
                     f"{objects}, {predictor_title(predictor)} ({unit})",
-                    *cells(_both_groups(part[predictor]["mae_counts"])),
+                    *cells(_both_groups(part.predictors[predictor]["mae_counts"])),
                 ]
                 for predictor in _ordered_predictors(part)[:2]
             ]
@@ -134,11 +140,12 @@ def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]
     )
 
 
-def _describe_floor(metrics: Tree, unit: str) -> str:
+def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
     """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
-    if "codec" not in metrics:
+    predictors = metrics.fresh.predictors
+    if "codec" not in predictors:
         return ""
-    floor, baseline = (_both_groups(metrics[name]["mse_counts"]) for name in ("codec", "persistence"))
+    floor, baseline = (_both_groups(predictors[name]["mse_counts"]) for name in ("codec", "persistence"))
     steps = sorted(int(name[1:]) for name in floor if name != "mean")
     lost = [step for step in steps if floor[f"t{step}"] >= baseline[f"t{step}"]]
     if not lost:
@@ -150,24 +157,23 @@ def _describe_floor(metrics: Tree, unit: str) -> str:
     )
 
 
-def _describe_seen(metrics: Tree) -> str:
+def _describe_seen(metrics: ForwardMetrics) -> str:
     """Return the errors on recordings that the model was trained on, which prove nothing."""
-    described = _without_summary(metrics.get("seen", {})).get("mean", {})
-    if "mean" not in described:
+    seen = metrics.parts.get("seen")
+    described = _without_summary(seen).get("mean", {}) if seen else {}
+    if not seen or "mean" not in described:
         return ""
-    count = counted(metrics["seen"]["counts"]["recordings"], "recordings")
+    count = counted(seen.counts["recordings"], "recordings")
     mean = blocks.signed(described["mean"])
     return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
 
 
-def _without_summary(part: Tree) -> Tree:
+def _without_summary(part: ForwardScores) -> IntervalsByStep:
     """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
-    skills: Tree = part.get("skill", {})
-    scores: Tree = skills.get(headline.GEOMETRIC, skills.get("mse_counts", {}))
-    return scores
+    return part.skill.get(headline.GEOMETRIC, part.skill.get("mse_counts", {}))
 
 
-def _error_cell(interval_tree: Tree) -> Cell:
+def _error_cell(interval_tree: Mapping[str, float]) -> Cell:
     return (
         blocks.interval(interval_tree["mean"], interval_tree.get("low", np.nan), interval_tree.get("high", np.nan))
         if "mean" in interval_tree
@@ -175,21 +181,15 @@ def _error_cell(interval_tree: Tree) -> Cell:
     )
 
 
-def _both_groups(scores: Tree) -> Tree:
+def _both_groups(scores: Mapping[str, dict[str, float]]) -> dict[str, float]:
     """Return the errors over all channels; results of before this was called ``both`` call it ``all``."""
-    group: Tree = scores["both"] if "both" in scores else scores["all"]
-    return group
+    return scores["both"] if "both" in scores else scores["all"]
 
 
-def _ordered_predictors(metrics: Tree) -> list[str]:
+def _ordered_predictors(scores: ForwardScores) -> list[str]:
     """Return the names of model and baselines, model first, then persistence."""
-    predictors = [
-        name
-        for name, scores in metrics.items()
-        if name != "skill" and isinstance(scores, Mapping) and "mse_counts" in scores
-    ]
     order = list(EXPLAINED)
-    return sorted(predictors, key=lambda name: (order.index(name) if name in order else len(order), name))
+    return sorted(scores.predictors, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
 SHOWN_S = 12.0  # seconds of a recording that are drawn

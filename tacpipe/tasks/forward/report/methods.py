@@ -6,18 +6,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.comparison.runs import ComparedRun, Kind, PredictorErrors, Question
+from tacpipe.comparison.runs import ComparedRun, Kind, PredictorErrors, Question, Settings
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
-from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.report.context import drop_duplicates
 from tacpipe.tasks.forward import headline
-from tacpipe.tasks.forward.headline import BASELINE
-from tacpipe.tasks.forward.params import PAPER
+from tacpipe.tasks.forward.headline import BASELINE, ForwardMetrics
+from tacpipe.tasks.forward.params import PAPER, CodecDescription, ForwardConfig
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -135,11 +135,16 @@ _NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are f
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 
-class ForwardResult(context.ReportResult):
+class ForwardResult(context.ReportResult[ForwardConfig]):
     """One result of forecasts."""
 
     STAGE = "train.forward"
     SETS = ("xela-flat",)
+
+    @cached_property
+    def metrics(self) -> ForwardMetrics:
+        """The errors of the result."""
+        return ForwardMetrics.from_json(context.read_json(self.dataset, "metrics.json"))
 
     @cached_property
     def errors(self) -> ErrorSums:
@@ -162,7 +167,7 @@ class ForwardResult(context.ReportResult):
         return float(self.config.get("rate_hz") or 0)
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """All that makes its method, without seed and split."""
         params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
         codec = self.config["codec"]["name"]
@@ -202,13 +207,13 @@ def paper_method(methods: Sequence[Method]) -> Method | None:
     return min(candidates, key=_distance, default=None)
 
 
-def codec_of(method: Method) -> Tree:
+def codec_of(method: Method) -> CodecDescription:
     """Return kind, width and name of a method's representation."""
-    codec: Tree = method.details[0].config["codec"]
-    return codec
+    result: ForwardResult = method.details[0]
+    return result.config["codec"]
 
 
-def paper_row(codec: Tree) -> str | None:
+def paper_row(codec: CodecDescription) -> str | None:
     """Return what Table 1 of the paper calls a representation, or None if it has none such.
 
     >>> paper_row({"kind": "autoencoder", "of": "levels", "frames": 2, "latents": 8})

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.codecs.measures import Reconstruction, StoredCodec
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Spread, spread
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, Table, fold, number, table
 from tacpipe.report.charts import Curve
-from tacpipe.report.context import Context, Tree, is_published
+from tacpipe.report.context import Context, is_published
 from tacpipe.tasks.forward.report import methods
 
 if TYPE_CHECKING:
@@ -36,13 +37,13 @@ class CodecLoss:
     mae_counts: float
 
 
-def read_codecs(datasets: Sequence[Dataset]) -> list[Tree]:
+def read_codecs(datasets: Sequence[Dataset]) -> list[StoredCodec]:
     """Return the descriptions of the codecs among the files of ``datasets``, each one once."""
     texts = dict.fromkeys(bytes(dataset.files[CODEC_FILE]) for dataset in datasets if CODEC_FILE in dataset.files)
     return [json.loads(content) for content in texts]
 
 
-def codec_series(codec: Tree) -> str:
+def codec_series(codec: StoredCodec) -> str:
     """Return what codecs that differ in width alone are called together.
 
     >>> codec_series({"kind": "autoencoder", "frames": 2, "of": "increments"})
@@ -52,28 +53,28 @@ def codec_series(codec: Tree) -> str:
     return name if codec.get("of", "levels") == "levels" else f"{name} {codec['of']}"
 
 
-def codec_losses(codecs: Sequence[Tree]) -> list[CodecLoss]:
+def codec_losses(codecs: Sequence[StoredCodec]) -> list[CodecLoss]:
     """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
     part = (
         "val"
         if all("val" in loss_tree["reconstruction"] for loss_tree in codecs if loss_tree.get("reconstruction"))
         else "train"
     )
-    by_series: dict[tuple[str, int], list[Tree]] = {}
+    by_series: dict[tuple[str, int], list[dict[str, Reconstruction]]] = {}
     for codec in codecs:
         if codec.get("reconstruction"):
             by_series.setdefault((codec_series(codec), int(codec["latents"])), []).append(codec["reconstruction"])
     mean_losses = []
     for (name, latents), described in sorted(by_series.items()):
         errors = {
-            measure: float(np.mean([loss_tree[part][measure] for loss_tree in described]))
-            for measure in ("mse_standardised", "mae_counts")
+            "mse_standardised": float(np.mean([losses[part]["mse_standardised"] for losses in described])),
+            "mae_counts": float(np.mean([losses[part]["mae_counts"] for losses in described])),
         }
         mean_losses.append(CodecLoss(name, latents, len(described), part, **errors))
     return mean_losses
 
 
-def paper_codec(codecs: Sequence[Tree], series: str, latents: int) -> Tree | None:
+def paper_codec(codecs: Sequence[StoredCodec], series: str, latents: int) -> StoredCodec | None:
     """Return the first codec of a series that has a covariance, the one whose width is nearest to ``latents``."""
     candidates = [
         candidate for candidate in codecs if codec_series(candidate) == series and candidate.get("latent_covariance")
@@ -204,7 +205,7 @@ def _representation_table(context: Context) -> Table | None:
     return table(f"{title}, mean ± sd over runs", heads, rows)
 
 
-def _codec_charts(codecs: Sequence[Tree], published: bool) -> list[Charts | Table]:
+def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts | Table]:
     if not codecs:
         return []
     drawn = []

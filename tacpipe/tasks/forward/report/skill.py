@@ -120,7 +120,7 @@ def skill_in_situation(method: Method, situation: str) -> dict[str, float] | Non
 
     Skill is weighted by windows; of one run it has its interval.
     """
-    trees = [run.details.metrics.get("situations", {}) for run in method.runs]
+    trees = [run.details.metrics.situations for run in method.runs]
     selected = [part[situation] for part in trees if situation in part and "mean" in part[situation]["skill"]]
     if not selected:
         return None
@@ -163,7 +163,7 @@ def band_folds(context: Context) -> list[Fold]:
     runs = [run for run in context.runs if COVERAGE in run.details.dataset.files]
     if not runs:
         return []
-    levels = sorted({tuple(run.details.metrics["quantiles"]["levels"]) for run in runs})[0]
+    levels = sorted({tuple(run.details.metrics.quantiles.description["levels"]) for run in runs})[0]
     level = (levels[-1] - levels[0]) / 100
     methods = sorted({run.method for run in runs})
     drawn: list[Chart] = []

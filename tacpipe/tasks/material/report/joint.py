@@ -12,7 +12,8 @@ from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.metrics.intervals import wilson
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint, Table, number, p_value, signed
-from tacpipe.report.context import SHORTENED, Tree
+from tacpipe.report.context import SHORTENED
+from tacpipe.tasks.material.headline import HeldOutAccuracy, ZeroShotAccuracy
 from tacpipe.tasks.material.report import figures, scores
 from tacpipe.tasks.material.report.methods import (
     has_usual_settings,
@@ -305,7 +306,6 @@ def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
     return bool(described) and SAME_COUNT < max(described) / slides < 1 / SAME_COUNT
 
 
-AMONG_ALL, AMONG_HELD_OUT = "zero_shot", "among_held_out"
 ZERO_SHOT_NOTE = (
     "The sensor's own labels and pairs of these materials were kept from training; the other sensor's classifier names them "
     "from its latents, out of all materials or out of the held-out ones alone. Above chance here, and here alone, is "
@@ -322,7 +322,7 @@ class HeldOut:
     kind: str
     main: bool  # True: nothing else sets them apart
     sensor: str
-    trees: tuple[Tree, ...]  # metrics on the held-out materials, one per run
+    results: tuple[ZeroShotAccuracy, ...]  # accuracy on the held-out materials, one per run
     materials: int  # number of materials that any run held out
 
 
@@ -334,10 +334,10 @@ def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
             [
                 f"{scored.name}, out of all",
                 sensor_title(scored.sensor),
-                *_zero_shot_cells(scored.trees, scored.sensor, scored.materials),
+                *_zero_shot_cells(scored.results, scored.sensor, scored.materials),
             ]
         )
-        among_held_out = [tree[AMONG_HELD_OUT] for tree in scored.trees if AMONG_HELD_OUT in tree]
+        among_held_out = [result["among_held_out"] for result in scored.results if "among_held_out" in result]
         if among_held_out:
             cells = _zero_shot_cells(among_held_out, scored.sensor, scored.materials)
             rows.append([f"{scored.name}, out of those held out", sensor_title(scored.sensor), *cells])
@@ -357,10 +357,10 @@ def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
     """Return whether one sensor's classifier names what the other never learned, a sentence a method and sensor."""
     described = []
     for scored in held_out_methods(methods):
-        correct, evaluated, low, high = _zero_shot_counts(scored.trees, scored.sensor, scored.materials)
+        correct, evaluated, low, high = _zero_shot_counts(scored.results, scored.sensor, scored.materials)
         if not evaluated or not scored.main:
             continue
-        chance = _accuracy_at(scored.trees[0], "chance", scored.sensor)
+        chance = scored.results[0]["chance"][scored.sensor]
         unsure = "which cannot be distinguished from chance"
         word = "above chance" if low > chance else "below chance" if high < chance else unsure
         described.append(
@@ -376,15 +376,15 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
     """Return the runs that held materials out, those together that differ in which, by sensor."""
     alike: dict[str, list[Method]] = {}
     for method in methods:
-        if any(AMONG_ALL in result.metrics for result in method.details):
+        if any("zero_shot" in result.metrics for result in method.details):
             alike.setdefault(method.key_without("hold_out"), []).append(method)
     scored_methods = []
     for same in alike.values():
-        runs = [
-            (result.metrics[AMONG_ALL], method)
+        runs: list[tuple[ZeroShotAccuracy, Method]] = [
+            (result.metrics["zero_shot"], method)
             for method in same
             for result in method.details
-            if AMONG_ALL in result.metrics
+            if "zero_shot" in result.metrics
         ]
         for sensor in dict.fromkeys(name for tree, _ in runs for name in tree["accuracy"]):
             evaluated = [(tree, method) for tree, method in runs if sensor in tree["accuracy"]]
@@ -397,13 +397,14 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
     return scored_methods
 
 
-def _zero_shot_counts(trees: Sequence[Tree], sensor: str, materials: int) -> tuple[int, int, float, float]:
+def _zero_shot_counts(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> tuple[int, int, float, float]:
     """Return how many slides were named right, of how many, and the interval of that share.
 
     Slides of one material are right or wrong together, also by chance and in several runs. So there are as many trials as
     held-out ``materials``.
     """
-    correct, evaluated = (sum(int(_accuracy_at(tree, name, sensor)) for tree in trees) for name in ("correct", "n"))
+    correct = sum(result["correct"].get(sensor, 0) for result in results)
+    evaluated = sum(result["n"].get(sensor, 0) for result in results)
     if not evaluated:
         return 0, 0, float("nan"), float("nan")
     return correct, evaluated, *wilson(round(correct / evaluated * materials), materials)
@@ -416,22 +417,14 @@ def _count_held_out(sets: Collection[str], sensor: str) -> int:
     return max(len(held_out - {""}), 1)
 
 
-def _zero_shot_cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str | Cell]:
+def _zero_shot_cells(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> list[str | Cell]:
     """Return what runs state of the held-out materials of one sensor."""
-    correct, evaluated, low, high = _zero_shot_counts(trees, sensor, materials)
+    correct, evaluated, low, high = _zero_shot_counts(results, sensor, materials)
     if not evaluated:
-        return [NONE, NONE, str(len(trees))]
+        return [NONE, NONE, str(len(results))]
     spread = (
-        float(np.std([_accuracy_at(tree, "accuracy", sensor) for tree in trees], ddof=1))
-        if len(trees) > 1
-        else float("nan")
+        float(np.std([result["accuracy"][sensor] for result in results], ddof=1)) if len(results) > 1 else float("nan")
     )
-    chance = float(np.mean([_accuracy_at(tree, "chance", sensor) for tree in trees]))
+    chance = float(np.mean([result["chance"][sensor] for result in results]))
     described = scores.count_cell(correct, evaluated, low, high, spread)
-    return [described, scores.format_percent(chance), str(len(trees))]
-
-
-def _accuracy_at(tree: Tree, name: str, sensor: str) -> float:
-    """Return a number of a result, stated for all sensors or by sensor."""
-    value = tree.get(name, float("nan"))
-    return float(value[sensor] if isinstance(value, Mapping) else value)
+    return [described, scores.format_percent(chance), str(len(results))]

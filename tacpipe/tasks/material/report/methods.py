@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, Kind, Method, PredictorErrors, Question, marks
+from tacpipe.comparison.runs import ComparedRun, Kind, Method, PredictorErrors, Question, Settings, marks
 from tacpipe.plugins import architectures
 from tacpipe.report import context
-from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
+from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
-from tacpipe.tasks.material.params import MaterialModelParams
+from tacpipe.tasks.material.headline import MaterialMetrics
+from tacpipe.tasks.material.params import MaterialConfig, MaterialModelParams
 from tacpipe.tasks.material.report import predictions
 from tacpipe.tasks.material.report.predictions import (
     LAST,
@@ -48,11 +49,17 @@ _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without 
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
-class MaterialResult(context.ReportResult):
+class MaterialResult(context.ReportResult[MaterialConfig]):
     """One result on materials."""
 
     STAGE = "train.material"
     SETS = ("biotac-slide", "roboskin")
+
+    @cached_property
+    def metrics(self) -> MaterialMetrics:
+        """The parts of the metrics that are reported as they are."""
+        metrics: MaterialMetrics = context.read_json(self.dataset, "metrics.json")
+        return metrics
 
     @cached_property
     def predictions(self) -> SlidePredictions:
@@ -67,8 +74,7 @@ class MaterialResult(context.ReportResult):
     @property
     def trained(self) -> Mapping[str, int]:
         """The number of slides with the role train, by sensor."""
-        counts: Mapping[str, int] = self.config.get("counts", {}).get("train", {})
-        return counts
+        return self.config.get("counts", {}).get("train", {})
 
     @property
     def learned(self) -> Mapping[str, int]:
@@ -98,7 +104,7 @@ class MaterialResult(context.ReportResult):
         return described, "authors" if "authors" in layouts else "time"
 
 
-def settings(results: Sequence[MaterialResult]) -> list[dict[str, Any]]:
+def settings(results: Sequence[MaterialResult]) -> list[Settings]:
     """Return all that makes a method of each result.
 
     That is architecture, joint or not, number of training slides, layout and split of the slides, and all params but the
@@ -118,7 +124,7 @@ def settings(results: Sequence[MaterialResult]) -> list[dict[str, Any]]:
     ]
 
 
-def has_usual_settings(settings: Tree, *but: str) -> bool:
+def has_usual_settings(settings: Settings, *but: str) -> bool:
     """Return whether a method of these settings was trained on all materials and slides, with true labels and pairs.
 
     This is what tables compare; the settings in ``but`` may be others.
@@ -183,7 +189,7 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
     return batch * sum(number % 10 != 0 if ratio == 90 else number % steps[ratio] == 0 for number in batches)
 
 
-def base_name(settings: Tree, variants: bool = True) -> str:
+def base_name(settings: Settings, variants: bool = True) -> str:
     """Return the name that a method has before it is derived from others like it."""
     architecture = str(settings["architecture"])
     name = architectures.title(MaterialModelParams, architecture)
@@ -201,7 +207,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
         "with vibration" if settings["vibration"] else "",
         "permuted pairs" if settings["pairing"] == "permuted" else "",
         "permuted labels" if settings["labels"] == "permuted" else "",
-        f"{sensor_title(settings['subsample_sensor'])} {settings['subsample_percent']} %"
+        f"{sensor_title(str(settings['subsample_sensor']))} {settings['subsample_percent']} %"
         if settings["subsample_sensor"]
         else "",
         *(f"{sensor_title(sensor)} without {materials.replace(',', ', ')}" for sensor, _, materials in held_out),
@@ -210,7 +216,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
     return " · ".join(filter(None, parts))
 
 
-def _settings(run: MaterialResult) -> dict[str, Any]:
+def _settings(run: MaterialResult) -> Settings:
     """Return all that makes a method but the number of its slides; what is of no effect is left out."""
     config, params, architecture = run.config, run.params, run.architecture
     frozen = str(params.get("frozen_sensor", ""))
@@ -306,7 +312,7 @@ def named_right(result: MaterialResult, sensor: str, predictor: str) -> dict[str
     return {str(name): np.array([answer == truth, 1.0]) for name, answer, truth in triples if answer != NOTHING}
 
 
-def _run(result: MaterialResult, settings: dict[str, Any]) -> ComparedRun:
+def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
     place = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
     classes = len(result.config.get("classes", ()))
     questions = {}

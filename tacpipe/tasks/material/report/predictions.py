@@ -17,6 +17,8 @@ from tacpipe.tasks.material.headline import NUMBERS, Naming
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.tasks.material.params import MaterialConfig
+
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
@@ -65,7 +67,7 @@ class SlidePredictions:
         return all(len(names) == 1 for names in sessions.values())
 
 
-def read_predictions(table: pa.Table, config: Mapping[str, Any]) -> SlidePredictions:
+def read_predictions(table: pa.Table, config: MaterialConfig) -> SlidePredictions:
     """Return what the table ``predictions`` of a result states of slides that its model has not seen.
 
     As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
@@ -96,7 +98,7 @@ def _numbers(table: pa.Table, name: str, naming: Naming) -> Int64s:
     return np.array([numbers.get(label, NOTHING) for label in table[name].to_pylist()], np.int64)
 
 
-def _counted_slides(table: pa.Table, config: Mapping[str, Any], naming: Naming) -> Bools:
+def _counted_slides(table: pa.Table, config: MaterialConfig, naming: Naming) -> Bools:
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)

@@ -305,7 +305,7 @@ def losses_by_epoch(result: TouchResult, target: str, name: str) -> list[float]:
     networks: dict[object, list[float]] = {}
     for line in result.history:
         if line.get("target", ALL) == target:
-            described = line.get(name)
+            described = line.get("val_loss") if name == "val_loss" else line.get("train_loss")
             networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
     length = min(map(len, networks.values()), default=0)
     mean = [

@@ -7,20 +7,21 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, distinct_names, marks
+from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, Settings, distinct_names, marks
+from tacpipe.io import Scalar
 from tacpipe.metrics import regression
 from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
 from tacpipe.report import blocks, context
-from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
+from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
-from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchModelParams
+from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, TouchModelParams
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
@@ -33,7 +34,7 @@ USUAL = ("split", "simulated")  # settings that no name states: parts of questio
 _NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
 
-class TouchResult(context.ReportResult):
+class TouchResult(context.ReportResult[TouchConfig]):
     """One result on touch."""
 
     STAGE = "train.touch"
@@ -58,11 +59,10 @@ class TouchResult(context.ReportResult):
     @property
     def trained(self) -> int | None:
         """How many grasps the weights were fitted to."""
-        count: int | None = self.config.get("counts", {}).get("train")
-        return count
+        return self.config.get("counts", {}).get("train")
 
     @cached_property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """All that makes its method: params but the seed, the split of its grasps, and whether these were simulated."""
         params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
         if self.architecture != PAPER:  # the others take nothing more from it
@@ -147,7 +147,7 @@ def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
 
     chosen: dict[str, Method] = {}
     for candidate in sorted(methods, key=place):
-        chosen.setdefault(candidate.settings["architecture"], candidate)
+        chosen.setdefault(str(candidate.settings["architecture"]), candidate)
     return sorted(chosen.values(), key=lambda candidate: candidate.name)
 
 
@@ -157,7 +157,7 @@ def predicted_targets(*methods: Method) -> tuple[str, ...]:
     return tuple(target for target in biotac_sp.TARGETS if target in available)
 
 
-def _first_names(settings: Tree) -> list[str]:
+def _first_names(settings: Settings) -> list[str]:
     """Return what a kind of model is called by what it reads; marks that distinguish methods of a kind come behind."""
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
@@ -169,7 +169,7 @@ def _first_names(settings: Tree) -> list[str]:
     ]
 
 
-def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
+def _usual_settings(alike: Sequence[tuple[Settings, int]]) -> list[tuple[str, Scalar]]:
     """Return the setting that most methods have, or of several such that of most runs, by name, given methods and runs.
 
     All splits are usual, and so are simulated grasps: these have headings of their own. What is called by its colour has no

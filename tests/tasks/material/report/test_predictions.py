@@ -13,7 +13,7 @@ BOTH = {"biotac": 1, "roboskin": 2}
 
 
 def read(fake_result: Any, **config: Any) -> SlidePredictions:
-    content = {**json.loads(fake_result.files["config.json"]), **config}
+    content: Any = {**json.loads(fake_result.files["config.json"]), **config}
     return predictions.read_predictions(fake_result.recordings["predictions"].table(), content)
 
 
