@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+
+from tacpipe.report.charts import Spec
 
 TINY = 1e-12  # a smaller number is a rounded 0
 NONE = "–"  # stands where there is no number
-Spec = Mapping[str, Any]  # specification of a chart, in Vega-Lite's grammar (`tacpipe.report.charts`)
 
 
 @dataclass(frozen=True)

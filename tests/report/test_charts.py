@@ -12,7 +12,7 @@ from tacpipe.report.charts import Curve, Dot
 
 
 def ranking(*dots: Dot) -> tuple[list[dict[str, Any]], list[float]]:
-    spec = charts.ranking(dots, "skill")
+    spec: Any = charts.ranking(dots, "skill")
     return spec["data"]["values"], spec["layer"][2]["encoding"]["x"]["scale"]["domain"]
 
 
@@ -37,7 +37,7 @@ def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
 def test_names_keep_their_colour_from_chart_to_chart() -> None:
     scales = []
     for names in ("a", "b", "ab"):
-        spec = charts.lines([Curve(name, [1, 2], [0.1, 0.2]) for name in names], "x", "y", order=["a", "b"])
+        spec: Any = charts.lines([Curve(name, [1, 2], [0.1, 0.2]) for name in names], "x", "y", order=["a", "b"])
         scale = spec["layer"][-1]["encoding"]["color"]["scale"]
         scales.append(dict(zip(scale["domain"], scale["range"], strict=True)))
     assert {**scales[0], **scales[1]} == scales[2]
@@ -54,7 +54,7 @@ def test_one_method_that_is_far_off_does_not_press_the_others_together() -> None
 
 
 def test_a_chart_of_skill_ends_at_its_floor() -> None:
-    spec = charts.lines(
+    spec: Any = charts.lines(
         [Curve("far", [1, 2], [-1000.0, -500.0]), Curve("near", [1, 2], [0.1, 0.2])], "x", "y", floor=-1.0
     )
     assert spec["layer"][-1]["encoding"]["y"]["scale"]["domain"] == [-1.0, 0.2]

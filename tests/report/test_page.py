@@ -15,6 +15,7 @@ from tacpipe.comparison import engine
 from tacpipe.errors import TacpipeError
 from tacpipe.report import page
 from tacpipe.report.blocks import Chart, Fold, Section, SmallPrint, table
+from tacpipe.report.charts import Spec
 from tests.conftest import forget
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
 from tests.stages.learning_fakes import motion
@@ -195,7 +196,7 @@ def test_a_dataset_that_no_task_on_the_page_can_use_is_refused() -> None:
 
 def test_text_that_looks_like_markup_stays_text() -> None:
     name = "</script><b>& `rm x`"
-    spec = {"data": {"values": [{"name": name, "x": 1.5}]}, "mark": "point"}
+    spec: Spec = {"data": {"values": [{"name": name, "x": 1.5}]}, "mark": {"type": "point"}}
     section = Section(
         "t",
         name,

@@ -5,18 +5,159 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
 
-Spec = dict[str, Any]
+DataRow = dict[str, str | float | None]  # a row of the data of a chart, by field
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
 DIGITS = 5  # digits of a number: more cannot be seen
 FEW_STEPS = 12  # whole numbers on an axis, up to which each has a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that none is cut
+
+
+class ChartScale(TypedDict, total=False):
+    """How values of a field become places or colours."""
+
+    type: str
+    zero: bool
+    nice: bool
+    padding: float
+    domain: Sequence[str | float | None]
+    range: Sequence[str] | Sequence[Sequence[int]]
+
+
+class ChartAxis(TypedDict, total=False):
+    """The ticks and labels of an axis, or the labels of panels."""
+
+    tickMinStep: float
+    values: Sequence[float]
+    format: str
+    ticks: bool
+    domain: bool
+    labelExpr: str
+    labelOverlap: bool
+    labelAngle: float
+    labelLimit: float
+    labelPadding: float
+    labelFontSize: float
+    labelFontWeight: int
+    labelOrient: str
+    labelAnchor: str
+
+
+class ChartLegend(TypedDict, total=False):
+    """The place and the symbols of a legend."""
+
+    title: str | None
+    orient: str
+    direction: str
+    columns: int
+    labelLimit: float
+    symbolStrokeWidth: float
+    symbolOpacity: float
+
+
+class Condition(TypedDict):
+    """The value of what a reader has chosen."""
+
+    param: str
+    value: float
+    empty: bool  # true: all is chosen as long as nothing is
+
+
+class SortField(TypedDict):
+    """The field that another one is sorted by."""
+
+    field: str
+
+
+class ChartChannel(TypedDict, total=False):
+    """A field, or a value, as a place, a colour or another property of a mark."""
+
+    field: str
+    type: str
+    title: str | None
+    sort: SortField | Sequence[str] | None
+    scale: ChartScale | None
+    axis: ChartAxis | None
+    header: ChartAxis
+    legend: ChartLegend | None
+    condition: Condition
+    value: float
+
+
+class ChartEncoding(TypedDict, total=False):
+    """The channels of a layer."""
+
+    x: ChartChannel
+    x2: ChartChannel
+    y: ChartChannel
+    y2: ChartChannel
+    color: ChartChannel
+    opacity: ChartChannel
+    shape: ChartChannel
+    strokeDash: ChartChannel
+    detail: ChartChannel
+    text: ChartChannel
+    row: ChartChannel
+    tooltip: Sequence[ChartChannel]
+
+
+class ChartMark(TypedDict, total=False):
+    """The geometry that stands for a row of data, and how it looks."""
+
+    type: str
+    clip: bool
+    filled: bool
+    size: float
+    shape: str | dict[str, str]
+    opacity: float
+    fill: str
+    stroke: str | None
+    strokeWidth: float
+    strokeDash: Sequence[int]
+    fontSize: float
+    fontWeight: int
+    tooltip: str | None
+
+
+class ChartSelection(TypedDict, total=False):
+    """What a reader chooses with the pointer."""
+
+    type: str
+    fields: Sequence[str]
+    zoom: str
+
+
+class ChartParam(TypedDict, total=False):
+    """A name for what a reader chooses."""
+
+    name: str
+    select: ChartSelection
+    bind: str
+
+
+class Spec(TypedDict, total=False):
+    """The specification of a chart, or of a layer of one, in Vega-Lite's grammar: the parts that are used here."""
+
+    data: dict[str, list[DataRow]]
+    transform: Sequence[dict[str, str]]
+    params: Sequence[ChartParam]
+    mark: ChartMark
+    encoding: ChartEncoding
+    layer: list[Spec]
+    height: int | dict[str, int]
+    view: dict[str, str | None]
+    facet: ChartChannel | ChartEncoding
+    columns: int
+    spec: Spec
+    resolve: dict[str, dict[str, str]]
+    spacing: int
+    usermeta: dict[str, float | None]  # hints for the page's script
 
 
 def colour_of(number: int, count: int) -> str:
@@ -26,7 +167,7 @@ def colour_of(number: int, count: int) -> str:
     return f"hsl({360 * number // count} 70% {(42, 62)[number % 2]}%)"
 
 
-def legend_of(count: int) -> Spec | None:
+def legend_of(count: int) -> ChartLegend | None:
     """Return the legend of so many names, or None if there is one."""
     if count < 2:
         return None
@@ -34,36 +175,34 @@ def legend_of(count: int) -> Spec | None:
             "columns": 1 if count < 7 else 2, "symbolStrokeWidth": 3, "symbolOpacity": 1}  # fmt: skip
 
 
-def zoom() -> Spec:
+def zoom() -> ChartParam:
     """Return what zooms with Shift and the wheel and moves by dragging."""
     return {"name": "zoom", "select": {"type": "interval", "zoom": "wheel![event.shiftKey]"}, "bind": "scales"}
 
 
-def whole_steps(values: Iterable[object]) -> Spec:
-    """Return the options of an axis: ticks at whole numbers where all values are whole, such as epochs and counts."""
+def whole_steps(values: Iterable[object]) -> ChartAxis:
+    """Return an axis: ticks at whole numbers where all values are whole, such as epochs and counts."""
     numbers = sorted({value for value in values if isinstance(value, int | float)})
     if not all(float(value).is_integer() for value in numbers):
         return {}
-    return {"axis": {"tickMinStep": 1} if len(numbers) > FEW_STEPS else {"values": numbers, "format": ","}}
+    return {"tickMinStep": 1} if len(numbers) > FEW_STEPS else {"values": numbers, "format": ","}
 
 
-def tip_of(name: str, title: str) -> Spec:
+def tip_of(name: str, title: str) -> ChartChannel:
     """Return a field that is stated under the cursor."""
     return {"field": name, "title": title or " "}
 
 
-def y_of(name: str) -> Spec:
+def y_of(name: str) -> ChartChannel:
     """Return the place of a field up and down."""
     return {"field": name, "type": "quantitative"}
 
 
 def diagonal_of(ends: Sequence[float]) -> Spec:
     """Return a thin line on which x and y are the same, between its ends."""
-    values = [{"x": short(end), "y": short(end)} for end in ends]
-    mark = {"type": "line", "stroke": INK, "strokeWidth": 0.8}
     return {
-        "data": {"values": values},
-        "mark": mark,
+        "data": {"values": [{"x": short(end), "y": short(end)} for end in ends]},
+        "mark": {"type": "line", "stroke": INK, "strokeWidth": 0.8},
         "encoding": {"x": {"field": "x", "type": "quantitative"}, "y": y_of("y")},
     }
 
@@ -81,10 +220,10 @@ def short(value: float) -> float | None:
 
 def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
     """Return bars in the order given, the first ``marked`` in another colour."""
-    rows = [
+    rows: list[DataRow] = [
         {"x": name, "y": short(value), "kept": place < marked} for place, (name, value) in enumerate(values.items())
     ]
-    colour = {
+    colour: ChartChannel = {
         "field": "kept",
         "type": "nominal",
         "legend": None,
@@ -150,19 +289,15 @@ def lines(
     across, up = _scales(values, log=log, floor=floor, diagonal=diagonal)
     if points:
         across["padding"] = up["padding"] = MARGIN
-    base: Spec = {
-        "x": {
-            "field": "x",
-            "type": "quantitative",
-            "title": x,
-            "scale": across,
-            **whole_steps(row["x"] for row in values),
-        },
+    base: ChartEncoding = {
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": across},
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": up},
         "color": _colour(names, {curve.name for curve in curves}),
         "detail": {"field": "run", "type": "nominal"},
         "opacity": _opacity(1, 0.07),
     }
+    if axis := whole_steps(row["x"] for row in values):
+        base["x"]["axis"] = axis
     layers = [
         *([_span(shade)] if shade else []),
         *([diagonal_of(diagonal)] if diagonal else []),
@@ -180,21 +315,27 @@ def lines(
     return {"data": {"values": values}, "height": height, "layer": layers}
 
 
-def _scales(values: Sequence[Spec], *, log: bool, floor: float | None, diagonal: Sequence[float]) -> tuple[Spec, Spec]:
+def _scales(
+    values: Sequence[DataRow], *, log: bool, floor: float | None, diagonal: Sequence[float]
+) -> tuple[ChartScale, ChartScale]:
     """Return the scales of x and y."""
-    across: Spec = {"zero": False, "nice": False}
-    up: Spec = {"zero": False, **({"type": "log"} if log else {})}
+    across: ChartScale = {"zero": False, "nice": False}
+    up: ChartScale = {"zero": False}
+    if log:
+        up["type"] = "log"
     if floor is not None:
-        described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
+        described = [
+            value for row in values for key in ("y", "low", "high") if isinstance(value := row.get(key), float)
+        ]
         up["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
     if diagonal:  # points on its ends are drawn whole
         room = ROOM * (diagonal[1] - diagonal[0])
-        up |= {"nice": False, "domain": [short(diagonal[0] - room), short(diagonal[1] + room)]}
-        across["domain"] = up["domain"]
+        up["nice"] = False
+        up["domain"] = across["domain"] = [short(diagonal[0] - room), short(diagonal[1] + room)]
     return across, up
 
 
-def _colour(names: Sequence[str], drawn: Container[str]) -> Spec:
+def _colour(names: Sequence[str], drawn: Container[str]) -> ChartChannel:
     """Return the colours of the names that are drawn, each by its place among all."""
     drawn_names = [name for name in names if name in drawn]
     colours = [COLOURS[names.index(name) % len(COLOURS)] for name in drawn_names]
@@ -206,7 +347,7 @@ def _colour(names: Sequence[str], drawn: Container[str]) -> Spec:
     }
 
 
-def _opacity(opacity: float, hidden: float) -> Spec:
+def _opacity(opacity: float, hidden: float) -> ChartChannel:
     """Return the opacity of what is chosen in the legend, all where nothing is, and of the rest."""
     return {"condition": {"param": "shown", "value": opacity, "empty": True}, "value": hidden}
 
@@ -220,14 +361,16 @@ def _span(shade: tuple[float, float]) -> Spec:
 
 
 def _rule(name: str, at: float) -> Spec:
-    mark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": name}
+    mark: ChartMark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": name}
     return {"data": {"values": [{"y": at}]}, "mark": mark, "encoding": {"y": y_of("y")}}
 
 
-def _bands(base: Spec) -> Spec:
+def _bands(base: ChartEncoding) -> Spec:
     """Return the layer of bands, of what has bounds."""
-    encoding = {name: value for name, value in base.items() if name != "detail"}
-    encoding |= {"y": {**base["y"], "field": "low"}, "y2": {"field": "high"}, "opacity": _opacity(0.16, 0.02)}
+    encoding = _of_points(base)
+    encoding["y"] = {**base["y"], "field": "low"}
+    encoding["y2"] = {"field": "high"}
+    encoding["opacity"] = _opacity(0.16, 0.02)
     return {
         "transform": [{"filter": "isValid(datum.low)"}],
         "mark": {"type": "area", "clip": True},
@@ -235,10 +378,11 @@ def _bands(base: Spec) -> Spec:
     }
 
 
-def _strokes(base: Spec, *, thin: bool) -> Spec:
+def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
     """Return the layer of lines: of single runs where ``thin``, else of all others."""
-    dashes = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
-    encoding = {**base, "strokeDash": {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}}
+    dashes: ChartScale = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
+    encoding = base.copy()
+    encoding["strokeDash"] = {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}
     if thin:
         encoding["opacity"] = _opacity(0.4, 0.03)
     return {
@@ -248,13 +392,20 @@ def _strokes(base: Spec, *, thin: bool) -> Spec:
     }
 
 
-def _dots(base: Spec) -> Spec:
+def _dots(base: ChartEncoding) -> Spec:
     """Return the layer of points, which a pointer finds."""
     return {
         "transform": [{"filter": "datum.thin === false"}],
         "mark": {"type": "circle", "size": 28, "clip": True},
-        "encoding": {name: value for name, value in base.items() if name != "detail"},
+        "encoding": _of_points(base),
     }
+
+
+def _of_points(base: ChartEncoding) -> ChartEncoding:
+    """Return the channels of lines without the one that keeps runs apart."""
+    encoding = base.copy()
+    del encoding["detail"]
+    return encoding
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
@@ -279,14 +430,14 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
     return x[at], y[at]
 
 
-def _rows(curve: Curve, number: int) -> list[Spec]:
+def _rows(curve: Curve, number: int) -> list[DataRow]:
     x, y = (np.asarray(part, np.float64) for part in (curve.x, curve.y))
     bounds = [None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high)]
     if bounds[0] is None:
         x, y = decimated(x, y)
-    rows = []
+    rows: list[DataRow] = []
     for place, (at, value) in enumerate(zip(x, y, strict=True)):
-        row: Spec = {
+        row: DataRow = {
             "name": curve.name,
             "run": number,
             "x": short(at),

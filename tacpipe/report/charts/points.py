@@ -6,7 +6,6 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,14 @@ from tacpipe.report.charts.curves import (
     MARGIN,
     QUIET,
     WORSE,
+    ChartAxis,
+    ChartChannel,
+    ChartEncoding,
+    ChartLegend,
+    ChartMark,
+    ChartParam,
+    ChartScale,
+    DataRow,
     Spec,
     colour_of,
     diagonal_of,
@@ -31,7 +38,7 @@ from tacpipe.report.charts.curves import (
 
 
 def scatter(
-    rows: Iterable[Mapping[str, Any]],
+    rows: Iterable[DataRow],
     x: str,
     y: str,
     *,
@@ -46,11 +53,10 @@ def scatter(
 
     With ``diagonal``, a line lies where both are the same.
     """
-    values = [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
+    values = _shortened(rows)
     names = list(order) or sorted({str(row["name"]) for row in values})
-    encoding: Spec = {
-        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "padding": MARGIN},
-              **whole_steps(row["x"] for row in values)},
+    encoding: ChartEncoding = {
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "padding": MARGIN}},
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": {"zero": False, "padding": MARGIN}},
         "color": {"field": "name", "type": "nominal", "legend": legend_of(len(names)) if legend else None,
                   "scale": {"domain": names, "range": [colour_of(names.index(name), len(names)) for name in names]}},
@@ -58,80 +64,82 @@ def scatter(
         "tooltip": [tip_of("name", ""), *([tip_of("tip", "")] if any("tip" in row for row in values) else []),
                     tip_of("x", x or "x"), tip_of("y", y or "y")],
     }  # fmt: skip
+    if axis := whole_steps(row["x"] for row in values):
+        encoding["x"]["axis"] = axis
     if shapes:
         marks = ["circle", "triangle-up", "square", "diamond"][: len(shapes)]
-        legend_of_shapes = {"title": None, "orient": "bottom", "direction": "horizontal"}
+        legend_of_shapes: ChartLegend = {"title": None, "orient": "bottom", "direction": "horizontal"}
         encoding["shape"] = {"field": "shape", "type": "nominal", "legend": legend_of_shapes,
                              "scale": {"domain": list(shapes), "range": marks}}  # fmt: skip
-    params = [
-        {"name": "shown", "select": {"type": "point", "fields": ["name"]}, **({"bind": "legend"} if legend else {})},
-        zoom(),
-    ]
+    shown: ChartParam = {"name": "shown", "select": {"type": "point", "fields": ["name"]}}
+    if legend:
+        shown["bind"] = "legend"
     points: Spec = {
-        "params": params,
+        "params": [shown, zoom()],
         "mark": {"type": "point", "filled": True, "size": 34, "clip": True},
         "encoding": encoding,
     }
-    layers = []
+    layers: list[Spec] = []
     if diagonal and values:
         coordinates = [float(row[key] or 0.0) for row in values for key in ("x", "y")]
         layers.append(diagonal_of([min(coordinates), max(coordinates)]))
     if level and not math.isnan(level[1]):
-        rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
+        rule: ChartMark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
         layers.append({"data": {"values": [{"y": short(level[1])}]}, "mark": rule, "encoding": {"y": y_of("y")}})
     return {"data": {"values": values}, "height": height, "layer": [*layers, points]}
 
 
 def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
     """Return a layer of diamonds at points (name, x, y), which state their numbers under the cursor."""
-    values = [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]
-    places: Spec = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
-    mark = {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1}
     return {
-        "data": {"values": values},
-        "mark": mark,
-        "encoding": {**places, "tooltip": [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]},
+        "data": {"values": [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]},
+        "mark": {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1},
+        "encoding": {
+            "x": {"field": "x", "type": "quantitative"},
+            "y": y_of("y"),
+            "tooltip": [tip_of("name", ""), tip_of("x", x), tip_of("y", y)],
+        },
     }
 
 
 def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
     """Return a layer of lines between two points (x, y), each with its name at the first."""
-    values = [
+    values: list[DataRow] = [
         {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
         for name, start, end in pairs
     ]
-    places: Spec = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
-    rule = {
+    x: ChartChannel = {"field": "x", "type": "quantitative"}
+    rule: Spec = {
         "mark": {"type": "rule", "stroke": INK, "strokeWidth": 0.8},
-        "encoding": {**places, "x2": {"field": "x2"}, "y2": {"field": "y2"}},
+        "encoding": {"x": x, "y": y_of("y"), "x2": {"field": "x2"}, "y2": {"field": "y2"}},
     }
-    text = {"type": "text", "fontSize": 9, "fontWeight": 700, "fill": INK}
-    return {
-        "data": {"values": values},
-        "layer": [rule, {"mark": text, "encoding": {**places, "text": {"field": "text"}}}],
+    text: Spec = {
+        "mark": {"type": "text", "fontSize": 9, "fontWeight": 700, "fill": INK},
+        "encoding": {"x": x, "y": y_of("y"), "text": {"field": "text"}},
     }
+    return {"data": {"values": values}, "layer": [rule, text]}
 
 
-def plane(rows: Sequence[Mapping[str, Any]], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
+def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
     """Return points in the plane, as many units across as down, a panel a name: rows have x, y, panel, strength and text.
 
     A strength from -1 to 1 is a colour; what has no ``text`` has none.
     """
-    values = [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
-    xs, ys = ([float(row[key]) for row in rows] for key in ("x", "y"))
+    values = _shortened(rows)
+    xs, ys = ([float(row[key] or 0.0) for row in rows] for key in ("x", "y"))
     room = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
     ends = {
         key: [round(min(coordinates) - room, 3), round(max(coordinates) + room, 3)]
         for key, coordinates in (("x", xs), ("y", ys))
     }
     tall = (ends["y"][1] - ends["y"][0]) / ((ends["x"][1] - ends["x"][0]) or 1.0)
-    places: Spec = {
-        key: {"field": key, "type": "quantitative", "axis": None, "scale": {"domain": ends[key], "nice": False}}
+    x, y = (
+        ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": ends[key], "nice": False})
         for key in ("x", "y")
-    }
+    )
     has_texts = any("text" in row for row in values)
-    opacity = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
-    colour = {"field": "side", "type": "nominal", "legend": None,
+    opacity: ChartChannel = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
+    colour: ChartChannel = {"field": "side", "type": "nominal", "legend": None,
               "scale": {"domain": ["a", "b", "c"], "range": [BETTER, WORSE, QUIET]}}  # fmt: skip
     tips = [tip_of(name, name) for name in dict.fromkeys(key for row in values for key in row) if name[0].isupper()]
     for row in values:
@@ -140,11 +148,11 @@ def plane(rows: Sequence[Mapping[str, Any]], panels: Sequence[str], *, size: int
         row["opacity"] = short(min(1.0, 0.12 + 0.78 * abs(strength))) if strength else 0.35
     layer: list[Spec] = [
         {"mark": {"type": "circle", "size": size, "stroke": QUIET if has_texts else None, "strokeWidth": 0.5},
-         "encoding": {**places, "color": colour, "opacity": opacity, "tooltip": tips}}
+         "encoding": {"x": x, "y": y, "color": colour, "opacity": opacity, "tooltip": tips}}
     ]  # fmt: skip
     if has_texts:
         layer.append({"mark": {"type": "text", "fontSize": 8.5, "fill": INK, "tooltip": None},
-                      "encoding": {**places, "text": {"field": "text"}}})  # fmt: skip
+                      "encoding": {"x": x, "y": y, "text": {"field": "text"}}})  # fmt: skip
     return {
         "data": {"values": values},
         "columns": columns,
@@ -154,6 +162,11 @@ def plane(rows: Sequence[Mapping[str, Any]], panels: Sequence[str], *, size: int
         "spacing": 12,
         "usermeta": {"tall": short(tall), "columns": columns},
     }  # fmt: skip
+
+
+def _shortened(rows: Iterable[DataRow]) -> list[DataRow]:
+    """Return rows whose numbers have as many digits as can be seen."""
+    return [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
 
 
 LABEL_CHARACTERS = 24  # a line of a predictor's name; longer names take several lines
@@ -182,7 +195,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
     panels = list(dict.fromkeys(estimate.panel for estimate in dots))
     lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
     row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
-    values = []
+    values: list[DataRow] = []
     for place, estimate in enumerate(dots):
         off = estimate.mean < low or estimate.mean > high
         values.append(
@@ -196,7 +209,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
                 "level": short((level or {}).get(estimate.panel, math.nan)),
             }
         )  # fmt: skip
-    y: Spec = {
+    y: ChartChannel = {
         "field": "name",
         "type": "nominal",
         "sort": {"field": "place"},
@@ -209,14 +222,14 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
             "labelPadding": 6,
         },
     }
-    colour = {
+    colour: ChartChannel = {
         "field": "kind",
         "type": "nominal",
         "legend": None,
         "scale": {"domain": list(KINDS), "range": list(KINDS.values())},
     }
-    scale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
-    across = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
+    scale: ChartScale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
+    across: ChartChannel = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
     tip = [tip_of("name", ""), tip_of("mean", x), tip_of("interval", "95 % interval"), tip_of("kind", "kind")]
     layer: list[Spec] = [
         {"mark": {"type": "rule", "stroke": QUIET, "strokeDash": [3, 3]},
@@ -261,7 +274,7 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
 def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
     """Return how often each name (row) was taken for each (column), each with its number; mistakes in another colour."""
     totals = np.maximum(counts.sum(axis=1), 1)
-    values = [
+    values: list[DataRow] = [
         {
             "row": names[row], "column": names[column], "count": int(count), "right": bool(row == column),
             # the square root shows a single mistake next to many right ones
@@ -271,8 +284,8 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         for (row, column), count in np.ndenumerate(counts)
         if count
     ]  # fmt: skip
-    axis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
-    places: Spec = {
+    axis: ChartAxis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
+    places: ChartEncoding = {
         "y": {"field": "row", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": down,
               "axis": axis},
         "x": {"field": "column", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": across,
@@ -280,18 +293,18 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         "tooltip": [tip_of("row", down), tip_of("column", across), tip_of("count", "slides"),
                     tip_of("fraction", "fraction")],
     }  # fmt: skip
-    colour = {
+    colour: ChartChannel = {
         "field": "right",
         "type": "nominal",
         "legend": None,
         "scale": {"domain": [True, False], "range": [BETTER, WORSE]},
     }
-    square = {"color": colour, "opacity": {"field": "strength", "type": "quantitative", "scale": None, "legend": None}}
+    opacity: ChartChannel = {"field": "strength", "type": "quantitative", "scale": None, "legend": None}
     return {
         "data": {"values": values},
         "height": {"step": 20},
         "layer": [
-            {"mark": {"type": "rect"}, "encoding": {**places, **square}},
+            {"mark": {"type": "rect"}, "encoding": {**places, "color": colour, "opacity": opacity}},
             {"mark": {"type": "text", "fontSize": 9, "fill": INK}, "encoding": {**places, "text": {"field": "count"}}},
         ],
     }
@@ -300,7 +313,7 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
 def grid(matrix: AnyFloats, title: str) -> Spec:
     """Return a square matrix in squares: the stronger the colour, the farther from 0; blue above it, orange below."""
     largest = float(np.abs(matrix).max()) or 1.0
-    values = [
+    values: list[DataRow] = [
         {
             "row": row + 1,
             "column": column + 1,
@@ -312,7 +325,7 @@ def grid(matrix: AnyFloats, title: str) -> Spec:
         # the square root shows what is small next to the largest
         if (strength := round(math.sqrt(abs(float(value)) / largest), 2)) >= 0.01
     ]
-    axis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
+    axis: ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
     return {
         "data": {"values": values},
         "height": {"step": 13},

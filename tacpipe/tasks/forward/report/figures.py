@@ -332,7 +332,8 @@ def training_folds(context: Context) -> list[Fold]:
             continue
         best = min(history, key=lambda line: line["val_loss"])
         curves = {name: [[epoch[key] for epoch in history]] for name, key in LOSS_NAMES.items()}
-        spec = {**loss_chart(curves, "loss (scaled latents)", log=True), "height": 190}
+        spec = loss_chart(curves, "loss (scaled latents)", log=True)
+        spec["height"] = 190
         selected = (
             f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
         )

@@ -221,7 +221,8 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
         )
     for name, codec in (("PCA", pca), ("AE-C1", autoencoder)):
         if codec:
-            spec = {**charts.grid(np.array(codec["latent_covariance"]), "latent"), "usermeta": {"most": 360}}
+            spec = charts.grid(np.array(codec["latent_covariance"]), "latent")
+            spec["usermeta"] = {"most": 360}
             caption = "Training rows; blue above 0, orange below; strength is the square root of the size."
             drawn.append(Chart(f"Covariance between the {codec['latents']} latents of {name}", spec, caption))
     losses = codec_losses(codecs)

@@ -87,7 +87,8 @@ def _confusion_chart(method: Method, sensor: str) -> Chart:
     runs = len(runs_on(method, sensor))
     label = runs_on(method, sensor)[0].details.predictions.naming.key
     names = [str(material) for material in materials]
-    spec = {**charts.matrix(counts, names, label, "named"), "usermeta": {"most": 150 + 30 * len(names)}}
+    spec = charts.matrix(counts, names, label, "named")
+    spec["usermeta"] = {"most": 150 + 30 * len(names)}
     pooled = f", {runs} runs pooled" if runs > 1 else ""
     caption = f"{counts.trace()} of {counts.sum()} right{pooled}. {describe_worst(counts, materials)}"
     return Chart(f"{sensor_title(sensor)}: {method.name}", spec, caption)
@@ -259,7 +260,7 @@ def _latent_chart(method: Method) -> Chart | None:
         int(material): int(partner) for material, partner in method.details[0].config.get("partners", {}).items()
     }
     same, count = count_nearest_partners(parts[0], parts[1], partners)
-    dots = [
+    dots: list[charts.DataRow] = [
         {"name": str(name), "x": float(x), "y": float(y), "shape": sensor_title(sensor), "tip": str(recording)}
         for sensor, part, at in zip(sensors, parts, points, strict=True)
         for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, at, strict=True)

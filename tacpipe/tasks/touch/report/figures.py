@@ -50,7 +50,7 @@ def _pressure_chart(method: Method, target: str) -> Chart:
     total = len(rows.recordings)
     rows = rows.rows(np.unique(np.linspace(0, total - 1, MAX_GRASPS).astype(int)))
     values = rows.true[target][:, 0], rows.predicted[MODEL][target][:, 0]
-    dots = [
+    dots: list[charts.DataRow] = [
         {
             "name": f"{name}{'' if is_known else ' (novel)'}",
             "tip": str(recording),
@@ -134,7 +134,7 @@ def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
 
 def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
     """Return the R² of each electrode on known or on novel objects, or None if there are none."""
-    rows: list[dict[str, object]] = []
+    rows: list[charts.DataRow] = []
     for target in fingers:
         scores_by_electrode = predictions.r2_by_electrode(paper.predictions_of_runs(method), target, known_objects)
         if scores_by_electrode is not None:
@@ -149,7 +149,7 @@ def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Ch
 
 def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequence[str]) -> Chart:
     """Return true next to predicted electrodes of one grasp."""
-    tips: list[dict[str, object]] = []
+    tips: list[charts.DataRow] = []
     errors = []
     for target in fingers:
         finger = methods.FINGER_NAMES[target]
@@ -169,7 +169,7 @@ def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequ
     )
 
 
-def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[dict[str, object]]:
+def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[charts.DataRow]:
     """Return the electrodes of one fingertip, its skin rolled out flat, the tip up, coloured from -1 to 1."""
     places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
     return [
@@ -179,7 +179,7 @@ def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: s
     ]  # fmt: skip
 
 
-def draw_fingertips(rows: Sequence[dict[str, object]]) -> charts.Spec:
+def draw_fingertips(rows: Sequence[charts.DataRow]) -> charts.Spec:
     """Return fingertips next to each other, of rows that `tip` gave."""
     spec = charts.plane(rows, list(dict.fromkeys(str(row["panel"]) for row in rows)), size=520, columns=4)
     spec["usermeta"] |= {"panel": 200, "least": 170}
@@ -229,7 +229,7 @@ def _cloud_chart(shard: Recording, words: str) -> Chart:
     contacts = 1000 * (contacts_m - middle)
     distance = np.linalg.norm(points[:, None] - contacts[None], axis=2)  # (point, finger)
     near = np.where(distance.min(axis=1) <= NEAR_MM, np.array([1, -1])[distance.argmin(axis=1)], 0)
-    rows = [
+    rows: list[charts.DataRow] = [
         {
             "panel": view,
             "x": float(round(point[across], 1)),

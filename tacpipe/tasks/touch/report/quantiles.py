@@ -146,7 +146,7 @@ def _with_interval(values: Sequence[float], digits: int) -> Cell:
 
 def _electrode_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart | None:
     """Return the coverage of each electrode on the fingertips; None without electrodes."""
-    tips: list[dict[str, object]] = []
+    tips: list[charts.DataRow] = []
     for target in (finger for finger in figures.FINGERS if (rows.target == finger).any()):
         coverage = coverage_by_electrode(rows, target)
         strength = np.clip((coverage - nominal) / STRONGEST, -1, 1)
