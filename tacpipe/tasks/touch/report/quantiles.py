@@ -44,7 +44,7 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
         read = _read_coverage(method)
         if read is None:
             continue
-        levels = method.details[0].metrics["quantiles"]["levels"]
+        levels = method.details[0].config["quantiles"]["levels"]
         level = (levels[-1] - levels[0]) / 100
         parts = [(known_objects, read[read.known == known_objects]) for known_objects in (True, False)]
         evaluated = [(known_objects, rows) for known_objects, rows in parts if len(rows)]

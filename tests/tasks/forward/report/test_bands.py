@@ -16,6 +16,13 @@ from tests.tasks.forward.report.result_fakes import STEPS, WINDOWS, result
 
 PREDICTORS = {"model": (8.0, 4.0), "persistence": (6.0, 5.0)}  # sums over ten values: covered, and pinball loss
 
+QUANTILES = {
+    "levels": [10, 50, 90],
+    "method": "pooled",
+    "recordings": {"fitted": 3, "corrected": 3},
+    "most_promised": 75.0,
+}
+
 
 def calibrated(**options: Any) -> Any:
     """A result with quantiles of recordings whose objects are known and unseen, and one of a recording that was seen."""
@@ -31,7 +38,7 @@ def calibrated(**options: Any) -> Any:
         for step in STEPS
     ]
     curves = {"t_s": [1.0, 1.1], "measured": [3.0, 4.0], "q10": [1.0, 2.0], "q50": [3.0, 3.5], "q90": [4.0, 6.0]}
-    tree = {**json.loads(plain.files["metrics.json"]), "quantiles": {"levels": [10, 50, 90]}}
+    tree = {**json.loads(plain.files["metrics.json"]), "quantiles": QUANTILES}
     more_files = {
         "coverage.parquet": to_parquet(pa.Table.from_pylist(rows)),
         "bands.json": json.dumps([{"recording": "r1", "channel": "xela1_taxel01_z", "step": 3, **curves}]).encode(),

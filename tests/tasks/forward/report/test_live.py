@@ -26,12 +26,12 @@ LIVE = {
 }
 
 
-def context(metrics: dict[str, Any]) -> Any:
-    return SimpleNamespace(runs=[SimpleNamespace(details=SimpleNamespace(metrics=metrics))])
+def context(live: dict[str, Any] | None) -> Any:
+    return SimpleNamespace(runs=[SimpleNamespace(details=SimpleNamespace(metrics=SimpleNamespace(live=live)))])
 
 
 def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
-    (fold,) = events.live_folds(context({"live": LIVE}))
+    (fold,) = events.live_folds(context(LIVE))
     text = str(fold)
     for words in ("published live", "t+10", "1,419 of 1,489", "slip alarm, slips", "8.5", "41.5"):
         assert words in text
@@ -39,15 +39,15 @@ def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
 
 def test_steps_stand_in_their_order() -> None:
     errors = {"live": {"t1": 1.0, "t10": 3.0, "t5": 2.0}}  # in the order of JSON keys
-    (fold,) = events.live_folds(context({"live": {**LIVE, "mae": errors}}))
+    (fold,) = events.live_folds(context({**LIVE, "mae": errors}))
     text = str(fold)
     assert text.index("t+1'") < text.index("t+5'") < text.index("t+10'")
 
 
 def test_a_session_without_forecasts_or_alarms_has_its_rows() -> None:
-    (fold,) = events.live_folds(context({"live": {**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}}))
+    (fold,) = events.live_folds(context({**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}))
     assert "1,500" in str(fold) and "published live" not in str(fold)
 
 
 def test_another_result_has_no_such_part() -> None:
-    assert events.live_folds(context({"counts": {}})) == []
+    assert events.live_folds(context(None)) == []

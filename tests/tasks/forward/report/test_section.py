@@ -163,7 +163,8 @@ def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_c
     rows = [(4, 0.5, 6.0, None, 1), (12, 1.0, 2.0, 1.0, 3), (0, None, None, None, 9)]
     results = [result(seed=seed) for seed in range(3)]
     for dataset, row in zip(results, rows, strict=True):
-        content = {"anticipation": {"model": dict(zip(names, row, strict=True))}}
+        content = json.loads(dataset.files["metrics.json"])
+        content["anticipation"] = {"model": dict(zip(names, row, strict=True))}
         dataset.files["metrics.json"] = json.dumps(content).encode()
     (method,) = grouped(methods.read_runs(results))
     assert events.anticipation_scores(method, "model") == pytest.approx(

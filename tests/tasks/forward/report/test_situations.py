@@ -21,7 +21,7 @@ def run(**measured: tuple[int, float, float, float]) -> Any:
         }
         for name, (windows, persistence, model, skill) in measured.items()
     }
-    return SimpleNamespace(details=SimpleNamespace(metrics={"situations": tree} if tree else {}))
+    return SimpleNamespace(details=SimpleNamespace(metrics=SimpleNamespace(situations=tree)))
 
 
 def test_several_runs_are_weighted_by_their_windows_and_one_has_its_interval() -> None:

@@ -17,7 +17,7 @@ NAMES = ("events", "led", "median_lead_ms", "false_alarms", "minutes")
 def run(**measures: tuple[int, int, float | None, int, float]) -> Any:
     """A run with what the alarm was worth by predictor."""
     tree = {name: dict(zip(NAMES, values, strict=True)) for name, values in measures.items()}
-    return SimpleNamespace(details=SimpleNamespace(metrics={"slips": tree} if tree else {}))
+    return SimpleNamespace(details=SimpleNamespace(metrics=SimpleNamespace(slips=tree)))
 
 
 def method(name: str, *runs: Any) -> Any:

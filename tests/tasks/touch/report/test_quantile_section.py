@@ -43,10 +43,15 @@ def rows(seed: int = 0) -> pd.DataFrame:
 
 
 def calibrated(seed: int = 0, **options: Any) -> Any:
-    base = result(novel=OBJECTS[2:], seed=seed, metrics={"quantiles": {"levels": [10, 50, 90]}}, **options)
+    base = result(novel=OBJECTS[2:], seed=seed, **options)
+    config = {**json.loads(base.files["config.json"]), "quantiles": {"levels": [10, 50, 90]}}
     file = io.BytesIO()
     rows(seed).to_parquet(file)
-    return FakeDataset(base.recordings, {**base.files, "coverage.parquet": file.getvalue()}, base.manifest)
+    return FakeDataset(
+        base.recordings,
+        {**base.files, "config.json": json.dumps(config).encode(), "coverage.parquet": file.getvalue()},
+        base.manifest,
+    )
 
 
 def folds(*results: Any) -> list[Fold]:
@@ -97,4 +102,3 @@ def test_an_electrode_whose_band_holds_nothing_is_drawn_so() -> None:
 
 def test_results_without_quantiles_have_no_such_part() -> None:
     assert folds(result()) == []
-    assert "quantiles" not in json.loads(result().files["metrics.json"])
