@@ -154,7 +154,7 @@ def _run(
         RigView(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(is_over)
-        if plan is not None and supervisor.alarms.get("levels"):
+        if plan is not None and supervisor.alarms and supervisor.alarms["levels"]:
             levels = json.dumps(supervisor.alarms, separators=(",", ":"))
             plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
@@ -202,7 +202,7 @@ def _report(
             "output": None if output is None else str(output),
             "recordings": [asdict(recording) for recording in recorded],
             "live": figures,
-            "alarm_levels": supervisor.alarms,
+            "alarm_levels": supervisor.alarms or {},
         }
         error = {} if failed is None else {"error": str(failed), "exit_code": failed.exit_code}
         terminal.result_json({**value, **error})

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
+from tacpipe.io import Json
 from tacpipe.live import wire
 from tacpipe.live.messages import Description, Message
 from tacpipe.recording.spool import StreamNote
@@ -23,7 +24,7 @@ SETTLE_NS = 2_000_000  # time after a moment in which samples that belong to it 
 class Continuation(Protocol):
     """The state that a new process needs to continue the recording of the process before."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return it as the note `wire.CONTINUE` holds it."""
 
 
@@ -91,9 +92,9 @@ class Engine(ABC):
         if self._offset_ns is not None and message.answers:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
-    def ready(self) -> dict[str, Any]:
-        """Return what the recording process needs to know before the session begins; ``alarms`` are their levels."""
-        return {"alarms": {}}
+    def alarm_levels(self) -> wire.AlarmsJson | None:
+        """Return the levels of the alarms, or None if the task has no alarms."""
+        return None
 
     def finish(self) -> Sequence[Message]:
         """Return the messages that are left when the session is over."""

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Float32s
+from tacpipe.io import Json
 from tacpipe.sensors.live import LSL, Declaration, Live, MessageSizes, Value, blocks
 from tacpipe.sensors.sensor import Samples
 
@@ -52,7 +53,7 @@ class Message:
         """Declared values that this message does not have."""
         return ABSENT
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the message as JSON and msgpack hold it; numbers that are not finite are null."""
         fields = {
             value.name: _plain(value.read(self), value.digits)
@@ -120,7 +121,7 @@ class Description:
         """Return name and unit of each of `Message.numbers`."""
         return [(column.name, column.unit) for _, column in self.declaration.columns(LSL, self.sizes)]
 
-    def schema(self) -> dict[str, Any]:
+    def schema(self) -> Json:
         """Return the properties of `Message.to_dict`, as JSON schema has them."""
         values = [value for value in self.declaration.values if value.json and value.name not in self.absent]
         fields = {
@@ -128,7 +129,7 @@ class Description:
         }
         return {"version": {"type": "integer"}, "kind": {"type": "string"}, **fields}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the description as JSON and msgpack hold it."""
         raise NotImplementedError
 
@@ -141,7 +142,7 @@ def head_values() -> tuple[Value, ...]:
     )
 
 
-def to_json(content: Mapping[str, Any]) -> bytes:
+def to_json(content: Json) -> bytes:
     """Return a message or description as JSON."""
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 

@@ -8,13 +8,14 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.live import publishing, wire
-from tacpipe.live.settings import LiveTask, SessionOptions, Settings, parse_option
+from tacpipe.live.settings import LiveTask, SessionOptions, Settings, SettingValues, parse_option
 from tacpipe.plugins import fields
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.recording import recorder
 from tacpipe.recording import rig as rigs
@@ -41,10 +42,10 @@ class PreparedSession:
 
     rig: Rig  # includes the session's own streams
     options: SessionOptions
-    attributes: Mapping[str, Any]  # further attributes of the recordings
+    attributes: Mapping[str, Attribute]  # further attributes of the recordings
 
 
-def prepare(rig: Rig, rig_file: str, options: Mapping[str, Any]) -> PreparedSession:
+def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
     """Return a session with a rig (read from the file ``rig_file``) and options of the command; None: not given.
 
     Raises `UsageError` that names option, or file and key, for what this computer, the model or the rig does not allow.
@@ -100,7 +101,7 @@ def with_absolute_paths(settings: Settings) -> Settings:
     return replace(settings, model=str(Path(settings.model).absolute()), task=replace(settings.task, **task))
 
 
-def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
+def add_streams(rig: Rig, streams: Mapping[str, SettingValues]) -> Rig:
     """Return a rig with further streams of the sensor ``live``, given by their options, at free ports of this computer.
 
     Raises `UsageError` if the rig has a stream of such a name, and for messages too large for a packet.

@@ -15,7 +15,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -72,7 +71,7 @@ class Latencies:
         first = int(math.log10(limit_ms / SHORTEST_MS) * PER_DECADE) + 1
         return int(self._bins[first:].sum())
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> wire.LatencyFigures:
         """Return count, median, 99th percentile and maximum."""
         return {
             "count": self.count,
@@ -124,7 +123,7 @@ class Loop:
 
     def report(self) -> None:
         """Send the recording process what the session did so far; where it does not read, the report is left out."""
-        figures = {
+        figures: wire.SessionFigures = {
             "kind": self.publishers.about.kind,
             "answers": self.publishers.about.answers,
             "forecasts": self.forecasts,
@@ -162,7 +161,7 @@ class Loop:
                 self.engine.take(stream, block)
 
 
-def send(connection: socket.socket, content: dict[str, Any]) -> None:
+def send(connection: socket.socket, content: wire.ModelLine) -> None:
     """Send a line to the recording process, unless it does not read or is gone."""
     try:
         connection.send(wire.line(content))
@@ -205,7 +204,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     sys.setswitchinterval(SWITCH_S)
     if options.settings.realtime:
         wire.realtime(wire.MODEL)
-    send(connection, {"ready": engine.ready()})
+    send(connection, {"ready": True, "alarms": engine.alarm_levels()})
     from tacpipe.models.tensors import one_thread  # torch, which the engine has loaded
 
     with publishers, one_thread():  # once, not in each forecast

@@ -10,10 +10,11 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 from urllib.parse import parse_qsl
 
 from tacpipe.errors import DeviceError, UsageError
+from tacpipe.io import Json
 from tacpipe.links import lsl, network
 from tacpipe.live.messages import Description, Message, packets, to_json
 from tacpipe.live.settings import SessionOptions
@@ -281,11 +282,11 @@ class UdpPublisher:
         self._socket.close()
 
 
-def _msgpack() -> Callable[[Mapping[str, Any]], bytes]:
+def _msgpack() -> Callable[[Json], bytes]:
     with extras.explain_missing("--publish udp with format=msgpack"):
         import msgpack
 
-    def packed(content: Mapping[str, Any]) -> bytes:
+    def packed(content: Json) -> bytes:
         datagram: bytes = msgpack.packb(content)
         return datagram
 

@@ -13,12 +13,13 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Literal, get_args
 
 from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
+from tacpipe.io import Json
 from tacpipe.live import wire
 from tacpipe.live.settings import SessionOptions
-from tacpipe.live.wire import RecorderTap
+from tacpipe.live.wire import AlarmsJson, RecorderTap, SessionFigures
 from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import StreamNote
@@ -28,6 +29,7 @@ MODULE = "tacpipe.live.process"  # runs as the model's process
 RESTART_S = (0.5, 10.0)  # wait from its end to the next start: the first, and the longest
 STOP_S = 5.0  # time that it has to end and to close its publishers
 LOOK_S = 0.05
+Counted = Literal["forecasts", "skipped", "late", "dropped"]  # figures that add up over processes
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
 SWITCH_S = 0.0005  # time that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
@@ -50,7 +52,7 @@ def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[],
         sys.setswitchinterval(before_s)
 
 
-def lines(figures: Mapping[str, Any]) -> list[str]:
+def lines(figures: SessionFigures) -> list[str]:
     """Return what a session did so far in words.
 
     >>> lines({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
@@ -58,23 +60,23 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
     ...     "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
     ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
     """
-    latency = figures.get("latency") or {}
+    latency = figures.get("latency")
     answers = figures.get("answers", "answers")
     parts = [f"{answers} {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
-    if latency.get("count"):
+    if latency and latency["count"]:
         parts.append(
             f"latency median {latency['p50_ms']:.1f} ms, 99 % {latency['p99_ms']:.1f} ms, "
             f"largest {latency['max_ms']:.1f} ms"
         )
     states = ", ".join(f"{name} {state}" for name, state in figures.get("states", {}).items())
     parts += [states] if states else []
-    for name, label in (
-        ("late", "samples late"),
-        ("dropped", "messages not taken by subscribers"),
-        ("overflows", "times the model's process did not keep up"),
-        ("restarts", "restarts of the model's process"),
+    for count, label in (
+        (figures.get("late"), "samples late"),
+        (figures.get("dropped"), "messages not taken by subscribers"),
+        (figures.get("overflows"), "times the model's process did not keep up"),
+        (figures.get("restarts"), "restarts of the model's process"),
     ):
-        parts += [f"{figures[name]} {label}"] if figures.get(name) else []
+        parts += [f"{count} {label}"] if count else []
     line = "; ".join(parts)
     return [line, f"{figures.get('kind', 'model')}: {figures['cause']}"] if figures.get("cause") else [line]
 
@@ -85,16 +87,16 @@ class Supervisor:
     def __init__(self, options: SessionOptions, tap: RecorderTap) -> None:
         self.options, self.tap = options, tap
         self._noted_stream = options.own_streams[0]  # stream that gets the notes on the process
-        self.report: dict[str, Any] = {}  # the last report of the running process
-        self.alarms: dict[str, Any] = {}  # levels of the alarms
+        self.report: SessionFigures = {}  # the last report of the running process
+        self.alarms: AlarmsJson | None = None  # levels of the alarms
         self.deaths = 0
         self.ready = False
-        self._totals = {"forecasts": 0, "skipped": 0, "late": 0, "dropped": 0}  # counts of processes that ended
+        self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)  # counts of processes that ended
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         self._lines = wire.LineCutter()
         self._offset_ns: int | None = None  # offset of the running recording
-        self._beginning: dict[str, Any] | None = None  # state that a new process continues from
+        self._beginning: Json | None = None  # state that a new process continues from
         self._restart_s = RESTART_S[0]
         self._due_s = 0.0
         self._refusal: tuple[str, int] | None = None
@@ -178,10 +180,13 @@ class Supervisor:
             self._socket.close()
         self._process = self._socket = None
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> SessionFigures:
         """Return what the session did so far, over all its processes."""
-        totals = {name: count + int(self.report.get(name, 0)) for name, count in self._totals.items()}
-        return {**self.report, **totals, "restarts": self.deaths, "overflows": self.tap.overflows}
+        figures = self.report.copy()
+        for name, count in self._totals.items():
+            figures[name] = count + self.report.get(name, 0)
+        figures["restarts"], figures["overflows"] = self.deaths, self.tap.overflows
+        return figures
 
     def _spawn(self) -> None:
         ours, theirs = socket.socketpair()
@@ -210,8 +215,10 @@ class Supervisor:
             self._socket.close()
         self._process = self._socket = None
         for name in self._totals:
-            self._totals[name] += int(self.report.get(name, 0))
-        self.report = {"cause": "the model's process is started anew", "latency": self.report.get("latency", {})}
+            self._totals[name] += self.report.get(name, 0)
+        before, self.report = self.report, {"cause": "the model's process is started anew"}
+        if "latency" in before:
+            self.report["latency"] = before["latency"]
 
     def _read(self) -> None:
         if self._socket is None:
@@ -225,7 +232,7 @@ class Supervisor:
                 return
             for content in self._lines.feed(data):
                 if "ready" in content:
-                    self.ready, self.alarms = True, content["ready"]["alarms"]
+                    self.ready, self.alarms = True, content["alarms"]
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
                 elif "beginning" in content:

@@ -14,23 +14,25 @@ import contextlib
 import dataclasses
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args, get_origin
 
 from tacpipe.errors import UsageError
+from tacpipe.io import Json, Scalar
 from tacpipe.plugins import fields, params, registry
 from tacpipe.plugins.constraints import Range
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.engine import Engine
-    from tacpipe.plugins.stage import Result
+    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.task import PredictionRequest
 
+SettingValues = Mapping[str, Scalar | Sequence[Scalar] | None]  # by name, from a rig file or options
 NOT_SET = ("task", "places")  # fields of `Settings` that are neither keys nor options
 
 
@@ -39,7 +41,7 @@ class TaskSettings:
     """The settings that only sessions of one task have. A subclass is a frozen dataclass; its comments are the help."""
 
     @classmethod
-    def override(cls, file_settings: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+    def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:
         """Return what a rig file states, without the keys that ``options`` make void."""
         return file_settings
 
@@ -65,9 +67,9 @@ class Settings:
     def from_sources(
         cls,
         task_settings: type[TaskSettings],
-        file_settings: Mapping[str, Any],
+        file_settings: SettingValues,
         rig_file: str,
-        options: Mapping[str, Any],
+        options: SettingValues,
     ) -> Self:
         """Return the settings that a rig file ``rig_file`` states in its table ``[live]``, overridden by ``options``.
 
@@ -143,7 +145,7 @@ class SessionOptions:
         return cls(**{**_tuples(content), "settings": settings})
 
 
-def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+def _tuples(values: Json) -> Json:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
@@ -190,8 +192,8 @@ class SessionPlan:
 
     rig: Rig  # includes streams that the engine needs beyond those of the rig file
     settings: TaskSettings  # completed
-    streams: Mapping[str, Mapping[str, Any]]  # recorded streams with the options of the sensor ``live``
-    attributes: Mapping[str, Any] = field(default_factory=dict)  # further attributes of the recording
+    streams: Mapping[str, SettingValues]  # recorded streams with the options of the sensor ``live``
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # further attributes of the recording
 
 
 class LiveTask(ABC):

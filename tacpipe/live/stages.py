@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params, registry
-from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.plugins.stage import Attribute, RecordingOutput
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
+    from tacpipe.store.records import Step
 
 EARLIER_VERSIONS = {"synchronize": (2,)}  # today's stage reads their params and gives the same rows
 
 
-def stage_params(step: Mapping[str, Any]) -> Any:
+def stage_params(step: Step) -> Any:
     """Return the params of a stage of a chain. Raises `UsageError` if it has another version now."""
     name = step["stage"]
     stage = registry.load(name)
@@ -38,7 +39,7 @@ class RecordingInMemory:
 
     name: str
     tables: Mapping[str, pa.Table]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -66,7 +67,7 @@ class RecordingInMemory:
 class RecordingsInMemory:
     """A dataset as a task reads it: recordings by name, and files."""
 
-    recordings: Mapping[str, Any]
+    recordings: Mapping[str, RecordingInMemory]
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
@@ -85,13 +86,13 @@ def run_stages(recording: Recording, model: Dataset) -> Any:
     current: Any = recording
     for step in model.source.chain:
         stage = registry.load(step["stage"])
-        arguments: dict[str, Any] = {
+        arguments = {
             name: current if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
             for name, kind in stage.arguments.items()
         }
         returned = stage(params.from_json(stage, step["params"]), **arguments)
         output = returned if isinstance(returned, RecordingOutput) else RecordingOutput(returned)
-        tables: dict[str, Any] = {
+        tables = {
             name: table.read_all() if hasattr(table, "read_all") else table for name, table in output.streams.items()
         }
         current = RecordingInMemory(recording.name, tables, {**current.attributes, **output.attributes})

@@ -19,9 +19,10 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import Json
 from tacpipe.recording import clock, spool
 from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, StreamNote
 from tacpipe.recording.station import BEGAN
@@ -74,19 +75,68 @@ class Blocks:
         del self._text[:place]
 
 
+class AlarmsJson(TypedDict):
+    """The levels of the alarms of a session; null where there is none."""
+
+    axes: list[list[str]]  # stream and axis of each load
+    levels: dict[str, list[float | None]]  # by alarm
+    floors: NotRequired[list[float]]
+    per_hour: float
+
+
+class LatencyFigures(TypedDict):
+    """The latencies of the answers of a session."""
+
+    count: int
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+
+class SessionFigures(TypedDict, total=False):
+    """The state of a session, as the model's process reports it, and as the recording process completes it."""
+
+    kind: str
+    answers: str  # plural noun for answers of the model
+    forecasts: int
+    skipped: int
+    late: int
+    overflows: int
+    dropped: int
+    cause: str
+    states: dict[str, str]
+    cpu_s: float
+    latency: LatencyFigures
+    above_10_ms: int
+    above_20_ms: int
+    restarts: int
+
+
+class ModelLine(TypedDict, total=False):
+    """A line from the model's process: its readiness, a refusal, a report, or the beginning of a recording."""
+
+    ready: bool
+    alarms: AlarmsJson | None
+    refused: str
+    exit_code: int
+    report: SessionFigures
+    beginning: Json  # see `tacpipe.live.engine.Continuation`
+    offset_ns: int | None
+
+
 class LineCutter:
     """Cuts received bytes into objects, one a line."""
 
     def __init__(self) -> None:
         self._text = b""
 
-    def feed(self, data: bytes) -> list[dict[str, Any]]:
+    def feed(self, data: bytes) -> list[ModelLine]:
         """Return the objects that are complete now."""
         *lines, self._text = (self._text + data).split(b"\n")
         return [json.loads(line) for line in lines if line]
 
 
-def line(content: dict[str, Any]) -> bytes:
+def line(content: ModelLine) -> bytes:
     """Return an object as a line."""
     return json.dumps(content, separators=(",", ":")).encode() + b"\n"
 

@@ -12,7 +12,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypedDict
+
+from tacpipe.io import Json
 
 FILE = "headline.json"
 MIN_CLUSTERS = (
@@ -85,14 +87,14 @@ class Headline:
             f"{f', the best of {self.methods} methods' if self.methods > 1 else ''}"
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict are next to it."""
         fields = asdict(self)
         best = self.best
         return {**_json(fields), "best_baseline": best.name if best else None, "verdict": self.verdict}
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Headline:
+    def from_json(cls, value: Json) -> Headline:
         """Return the headline that `to_json` wrote."""
         fields = {name: value[name] for name in cls.__dataclass_fields__ if name in value}
         fields |= {name: _number(fields.get(name)) for name in ("gain", "low", "high", "effective")}
@@ -264,7 +266,14 @@ def _json(value: Any) -> Any:
     return value
 
 
-def _row(value: Mapping[str, Any]) -> HeadlineRow:
+class StoredRow(TypedDict):
+    """A `HeadlineRow` in ``headline.json``; null stands for a value that is not defined."""
+
+    name: str
+    values: list[float | None]
+
+
+def _row(value: StoredRow) -> HeadlineRow:
     return HeadlineRow(value["name"], tuple(_number(number) for number in value["values"]))
 
 

@@ -134,7 +134,7 @@ def is_published(result: Dataset, sets: Collection[str]) -> bool:
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
 
 
-def _params_of_step(step: Json) -> Json:
+def _params_of_step(step: Json) -> Settings:
     """Return the params of a step of a chain by today's names."""
     return params_of.with_current_names(str(step.get("stage")), step.get("params") or {})
 

@@ -17,6 +17,7 @@ from tacpipe.store.records import Step
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.store.records import Step
 
 
 @dataclass(frozen=True)

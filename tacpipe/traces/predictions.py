@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from tacpipe.traces.taxels import Taxels
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from tacpipe.plugins.stage import Attribute
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[DrawnForecast]
     ]
 
 
-def of_values(values: Mapping[str, float], measured: Sequence[Taxels]) -> list[DrawnForecast]:
+def of_values(values: Mapping[str, Attribute], measured: Sequence[Taxels]) -> list[DrawnForecast]:
     """Return what a model predicted for the only reading of two BioTac SP, finger by finger, as forecasts of step 0.
 
     ``values`` are named by target, as `tacpipe.channels.biotac_sp.value_columns` names them.
@@ -136,7 +138,7 @@ class Classification:
         return f"{self.key}: {name} predicted, {'as labelled' if name == self.label else f'but labelled {self.label}'}"
 
 
-def of_row(row: pa.Table, attributes: Mapping[str, Any]) -> Classification | None:
+def of_row(row: pa.Table, attributes: Mapping[str, Attribute]) -> Classification | None:
     """Return the names in a recording's row of `tacpipe predict`, or of `tacpipe evaluate`, or None if it has none.
 
     The quantity of a column (``label``, ``prediction``, ``score``) states what it holds. A row of `predict` names the

@@ -174,7 +174,7 @@ def events(table: pa.Table) -> list[FaultMark]:
     return sorted(parsed)
 
 
-def _event_text(row: Mapping[str, object]) -> str:
+def _event_text(row: Mapping[str, str | int | None]) -> str:
     parts = [str(row.get("cause") or "event")]
     parts += [f"{row[name]} {name}" for name in ("frames", "bytes") if row.get(name)]
     parts += [str(row["detail"])] if row.get("detail") else []

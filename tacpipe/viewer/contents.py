@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Attribute
+    from tacpipe.store.records import Step
 
-StageChain = Sequence[Mapping[str, Any]]  # the chain of a manifest: stages with their params
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 MAX_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
@@ -88,7 +88,9 @@ class DrawnContents:
     clouds: list[Points] = field(default_factory=list)
     frames: list[Frames] = field(default_factory=list)
     forecasts: list[DrawnForecast] = field(default_factory=list)
-    predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
+    predicted: Mapping[str, Attribute] = field(
+        default_factory=dict
+    )  # values that a model predicted for the whole recording
     classification: Classification | None = None  # class that it predicted for the whole recording
     strips: list[FrameStrip] = field(default_factory=list)
 
@@ -130,7 +132,11 @@ class DrawnContents:
 
 
 def of(
-    recording: Recording, predictions: pa.Table | None = None, row: pa.Table | None = None, *, chain: StageChain = ()
+    recording: Recording,
+    predictions: pa.Table | None = None,
+    row: pa.Table | None = None,
+    *,
+    chain: Sequence[Step] = (),
 ) -> DrawnContents:
     """Return what is drawn of a recording.
 
@@ -142,7 +148,7 @@ def of(
     return _split_contacts(contents, chain)
 
 
-def for_picture(recording: Recording, *, chain: StageChain = ()) -> DrawnContents:
+def for_picture(recording: Recording, *, chain: Sequence[Step] = ()) -> DrawnContents:
     """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
 
     These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
@@ -169,7 +175,7 @@ def _strip(stream: str, stored: Columns) -> FrameStrip:
     return FrameStrip(stream, t_ns[decoded_rows], [images[row] for row in decoded_rows], t_ns[[0, -1]])
 
 
-def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: StageChain) -> DrawnContents:
+def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: Sequence[Step]) -> DrawnContents:
     long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MAX_VALUES}
     tables = {
         stream: _thinned(stored) if stream in long else stored.read(stored.column_names)
@@ -188,7 +194,7 @@ def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: St
     return replace(contents, gaps=gaps)
 
 
-def _split_contacts(contents: DrawnContents, chain: StageChain) -> DrawnContents:
+def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnContents:
     """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
     params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
     if not params or params[-1].get("begins") == "grasped" or not contents.taxels:
@@ -285,7 +291,7 @@ def _of_tables(
     )
 
 
-def _values(row: pa.Table) -> dict[str, Any]:
+def _values(row: pa.Table) -> dict[str, Attribute]:
     """Return what a row of predictions holds for a reader: neither the recording's name nor latents."""
     names = [field.name for field in row.schema if described(field).get("quantity") != "latent"]
     return {name: row.column(name)[0].as_py() for name in names if name != "recording"}

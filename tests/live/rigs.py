@@ -13,6 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.store.records import Step
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
@@ -27,7 +28,7 @@ ASKED = CalibrationRequest(
 )  # the defaults of `tacpipe calibrate`
 # Four epochs of small batches: with fewer steps the weight of the forecast is 0, and every forecast is persistence.
 SMALL = {"architecture": "gru", "hidden": 8, "epochs": 4, "batch": 16, "context": 4, "horizon": 3}
-Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]
+Made = tuple[Mapping[str, bytes], Sequence[Step]]
 
 
 def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0, *, wraps: bool = True) -> FakeRecording:
@@ -69,7 +70,7 @@ def segmented(recording: FakeRecording, **values: Any) -> FakeShard:
     return stage("segment.contacts", stage("synchronize", recording, **values))
 
 
-def step(name: str, **values: Any) -> Mapping[str, Any]:
+def step(name: str, **values: Any) -> Step:
     """A link of a chain as manifests have it."""
     loaded_stage = registry.load(name)
     params = params_of.to_json(loaded_stage.params(**values))

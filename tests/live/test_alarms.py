@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +120,7 @@ def test_levels_are_written_and_read_again_and_an_older_score_for_slips_is_left_
     assert math.isinf(fitted.levels[SLIP][0])  # nothing was predicted of slips
     stored = json.loads(json.dumps(fitted.to_json()))
     assert stored["levels"][SLIP] == [None] and Alarms.from_json(stored) == fitted
-    older = {"axes": stored["axes"], "levels": {LOAD: [4.0, 4.0, 8.0], SLIP: [4.0, 4.0, None]}, "per_hour": 60}
+    older: Any = {"axes": stored["axes"], "levels": {LOAD: [4.0, 4.0, 8.0], SLIP: [4.0, 4.0, None]}, "per_hour": 60}
     read = Alarms.from_json(older)
     assert read.levels == {LOAD: (4.0, 4.0, 8.0), SLIP: (math.inf,)}
     assert read.states(np.ones((HORIZON, 6)), np.zeros(6), LAYOUT)[SLIP].state == UNKNOWN

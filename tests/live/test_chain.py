@@ -18,6 +18,7 @@ from tacpipe.channels import schema
 from tacpipe.codecs import tactile
 from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError
+from tacpipe.store.records import Step
 from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -331,12 +332,12 @@ def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_p
     assert LiveChain.for_model(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
     older = json.loads(interpolated[0]["config.json"])
     del older["look_ahead"]
-    step = {"stage": "synchronize", "version": 2, "params": {"grid": "logged", "rate_hz": 50.0}, "fitted": None}
+    step: Step = {"stage": "synchronize", "version": 2, "params": {"grid": "logged", "rate_hz": 50.0}, "fitted": None}
     files = {**interpolated[0], "config.json": json.dumps(older).encode()}
     contacts = rigs.step("segment.contacts")
     with pytest.raises(TacpipeError, match="interpolated"):
         LiveChain.for_model(files, [step, contacts], schemas)
-    causal_step = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
+    causal_step: Step = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
     assert LiveChain.for_model(files, [causal_step, contacts], schemas).streams
 
 

@@ -179,15 +179,14 @@ def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
         return [_renumbered(child, numbers) for child in node]
     if not isinstance(node, Mapping):
         return node
-    renumbered: dict[str, Any] = {}
-    for name, value in node.items():
-        if name == "__id__":
-            renumbered[name] = numbers.setdefault(value, len(numbers) + 1)
-        elif name == "file":
-            renumbered[name] = _member(value, numbers)
-        else:
-            renumbered[name] = _renumbered(value, numbers)
-    return renumbered
+    return {
+        name: numbers.setdefault(value, len(numbers) + 1)
+        if name == "__id__"
+        else _member(value, numbers)
+        if name == "file"
+        else _renumbered(value, numbers)
+        for name, value in node.items()
+    }
 
 
 def _member(name: str, numbers: dict[Any, int]) -> str:

@@ -21,7 +21,7 @@ of squared distances of a slide:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
@@ -267,7 +267,7 @@ def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
     return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
 
 
-def unpack_calibrations(content: bytes, sensors: Mapping[str, object]) -> dict[str, SensorCalibration]:
+def unpack_calibrations(content: bytes, sensors: Iterable[str]) -> dict[str, SensorCalibration]:
     """Return the calibrations that `pack_calibrations` wrote. Raises `TacpipeError` for another file."""
     tensors = model_files.arrays(content, CALIBRATION_FILE)
     return {name: SensorCalibration.from_tensors(tensors_under(f"{name}.", tensors)) for name in sensors}

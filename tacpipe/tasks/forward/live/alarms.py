@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from tacpipe.tasks.forward.slips import rise_and_fall
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.live.wire import AlarmsJson
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.slips import SlipAlarms
 
@@ -66,7 +67,7 @@ class Alarms:
         return cls(axes(layout), {})
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
+    def from_json(cls, content: AlarmsJson) -> Self:
         """Return what `to_json` gave. A level for slips of before these had floors is of another score, and left out."""
         levels = {
             name: tuple(math.inf if level is None else float(level) for level in values)
@@ -92,7 +93,7 @@ class Alarms:
         moved: AnyFloats = np.abs(last - present)
         return moved
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> AlarmsJson:
         """Return the levels as JSON can hold them: null where there is none."""
         levels = {
             name: [value if math.isfinite(value) else None for value in values] for name, values in self.levels.items()

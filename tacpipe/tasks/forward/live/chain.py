@@ -17,6 +17,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import Json
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.live.decoding import BatchColumns
+    from tacpipe.store.records import Step
 
 CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
 
@@ -82,12 +84,12 @@ class Beginning(NamedTuple):
     origin_ns: int  # first point of the grid
     rest: tuple[float, ...]  # level at rest of each channel
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return what `from_json` reads."""
         return self._asdict()
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any]) -> Beginning:
+    def from_json(cls, stored: Json) -> Beginning:
         """Return the beginning that `to_json` wrote."""
         return cls(int(stored["origin_ns"]), tuple(map(float, stored["rest"])))
 
@@ -114,7 +116,7 @@ class LiveChain:
     def __init__(
         self,
         forecaster: Forecaster,
-        steps: Sequence[Mapping[str, Any]],
+        steps: Sequence[Step],
         layout: InputLayout,
         beginning: Beginning | None = None,
         targets: Targets | None = None,
@@ -151,7 +153,7 @@ class LiveChain:
     def for_model(
         cls,
         model: Mapping[str, bytes] | Forecaster,
-        steps: Sequence[Mapping[str, Any]],
+        steps: Sequence[Step],
         layouts: Mapping[str, pa.Schema],
         master: str = "",
         beginning: Beginning | None = None,

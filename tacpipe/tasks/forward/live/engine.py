@@ -28,6 +28,8 @@ from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMes
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.live.wire import AlarmsJson
+
 PERIODS = 2.0  # periods without a forecast after which a message states the cause
 SLACK_NS = 5_000_000  # additional time for jitter
 EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
@@ -132,9 +134,9 @@ class ForecastEngine(Engine):
         chain = self.chain
         return ForecastDescription(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
 
-    def ready(self) -> dict[str, Any]:
-        """Return how many channels are predicted, and the levels of the alarms."""
-        return {"channels": len(self.chain.channels), "alarms": self.alarms.to_json()}
+    def alarm_levels(self) -> AlarmsJson:
+        """Return the levels of the alarms."""
+        return self.alarms.to_json()
 
     def continue_recording(self, beginning: str) -> None:
         """Take grid and level at rest of a process that ended; the next recording continues them."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
@@ -203,7 +204,7 @@ def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
 def _alarms(
     forecaster: Forecaster,
     recording: Recording,
-    tables: Mapping[str, Any],
+    tables: Mapping[str, pa.Table],
     track: Track,
     predicted: _Offline,
 ) -> dict[str, dict[str, Leads]]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s
+from tacpipe.io import Json
 from tacpipe.live import messages
 from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
@@ -129,7 +130,7 @@ class ForecastMessage(messages.Message):
         return {name: alarm.word for name, alarm in self.alarms.items()}
 
     @property
-    def quantiles_by_level(self) -> dict[str, Any] | None:
+    def quantiles_by_level(self) -> dict[str, list[list[float]]] | None:
         """The quantiles (step, channel) by level, None without a forecast."""
         if self.quantiles is None:
             return None
@@ -181,7 +182,7 @@ class ForecastDescription(messages.Description):
         """The quantiles in a session that publishes none."""
         return ABSENT if self.quantiles else QUANTILES
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the description as JSON and msgpack hold it."""
         return {
             "version": VERSION,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Model, Recording
+    from tacpipe.store.records import Step
 
 PIECE_NS = 1_000_000_000  # length of the pieces of a recording that a chain gets
 
@@ -105,7 +106,7 @@ def _predicted(
 
 def chain_of(
     forecaster: Forecaster,
-    steps: Sequence[Mapping[str, Any]],
+    steps: Sequence[Step],
     recording: Recording,
     tables: Mapping[str, pa.Table],
     quantiles: Sequence[int] = (),

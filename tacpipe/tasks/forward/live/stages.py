@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.channels.streams import GRID, apart
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params
+
+if TYPE_CHECKING:
+    from tacpipe.store.records import Step
+    from tacpipe.tasks.forward.params import ForwardConfig
 
 SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
 
@@ -24,12 +28,12 @@ class CausalStages(NamedTuple):
         return apart({GRID: self.synchronize.timeline})
 
 
-def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
+def causal_stages(steps: Sequence[Step]) -> CausalStages:
     """Return the params of the stages of a chain, as manifests list them.
 
     Raises `UsageError` if a stage has another version now, `TacpipeError` if one has no causal rule or is absent.
     """
-    params_by_stage: dict[str, Any] = {}
+    params_by_stage = {}
     for step in steps:
         name = step["stage"]
         if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
@@ -52,12 +56,12 @@ def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
     return CausalStages(params_by_stage[SYNCHRONIZE], params_by_stage[CONTACTS])
 
 
-def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> None:
+def refuse_look_ahead(config: ForwardConfig, steps: Sequence[Step]) -> None:
     """Raise `TacpipeError` for a model that was trained on rows that look ahead.
 
     ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
     """
-    look_ahead: Mapping[str, float] | None = config.get("look_ahead")
+    look_ahead = config.get("look_ahead")
     if look_ahead is None:  # a model of an older version, or of rows that state nothing
         interpolated = [
             step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings, option
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, SettingValues, TaskSettings, option
 from tacpipe.plugins.constraints import PositiveInt, Range
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.tasks.forward.live.messages import ALARM, DECLARATION, FORECAST
@@ -16,12 +16,13 @@ from tacpipe.tasks.forward.live.messages import ALARM, DECLARATION, FORECAST
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.engine import Engine
-    from tacpipe.plugins.stage import Result
+    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.forward.live.alarms import Alarms
     from tacpipe.tasks.forward.live.engine import CausalChain
+    from tacpipe.tasks.forward.params import ForwardConfig
     from tacpipe.tasks.task import PredictionRequest
 
 ALARM_KEYS = ("alarms_per_hour", "alarms_on", "split")
@@ -42,7 +43,7 @@ class ForwardSettings(TaskSettings):
     split: str = ""  # Split whose validation recordings --alarms-on means
 
     @classmethod
-    def override(cls, file_settings: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+    def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:
         """Return what a rig file states, without its alarms or its split where the options have others."""
         void: tuple[str, ...] = ()
         if options.get("alarms_per_hour") == 0:  # the option 0 switches off the alarms of the file
@@ -86,7 +87,9 @@ class ForwardLive(LiveTask):
         from tacpipe.tasks.forward.live.alarms import NAMES
         from tacpipe.tasks.forward.live.stages import refuse_look_ahead
 
-        config = model_files.tree(model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list})
+        config: ForwardConfig = model_files.tree(
+            model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list}
+        )
         own_settings = _own(settings)
         if not settings.allow_look_ahead:
             with settings.naming("model"):
@@ -100,13 +103,16 @@ class ForwardLive(LiveTask):
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
         unit = str(config["inputs"].get("unit", "count"))
-        forecast: dict[str, Any] = {"channels": list(config["inputs"]["tactile"]), "steps": list(steps), "unit": unit}
-        streams: dict[str, dict[str, Any]] = {
+        forecast: SettingValues = {"channels": config["inputs"]["tactile"], "steps": list(steps), "unit": unit}
+        streams: dict[str, SettingValues] = {
             FORECAST: {**forecast, **({"quantiles": list(levels)} if levels else {})},
             ALARM: {"alarms": list(NAMES)},
             "latency": {},
         }
-        attributes = {"live_plan": own_settings.plan, "live_alarms_per_hour": own_settings.alarms_per_hour}
+        attributes: dict[str, Attribute] = {
+            "live_plan": own_settings.plan,
+            "live_alarms_per_hour": own_settings.alarms_per_hour,
+        }
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
@@ -161,10 +167,11 @@ def _own(settings: Settings) -> ForwardSettings:
 
 
 def _refuse_absent_quantiles(
-    config: Mapping[str, Any], levels: tuple[int, ...], find_quantiles: Callable[[Any, tuple[int, ...]], Any]
+    config: ForwardConfig, levels: tuple[int, ...], find_quantiles: Callable[[Any, tuple[int, ...]], Any]
 ) -> None:
     """Raise `UsageError` for quantiles that the model does not have."""
-    calibrated_levels = CalibratedLevels(tuple(map(int, config.get("quantiles", {}).get("levels", []))))
+    description = config.get("quantiles")
+    calibrated_levels = CalibratedLevels(tuple(description["levels"]) if description else ())
     try:
         find_quantiles(calibrated_levels if calibrated_levels.percents else None, levels)
     except TacpipeError as error:

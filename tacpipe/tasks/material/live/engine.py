@@ -10,8 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from tacpipe.io import Json
 from tacpipe.live.decoding import Decoder, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
 from tacpipe.live.messages import Message
@@ -36,7 +37,7 @@ THROWN = "blocks were thrown away under overload"
 class Begun:
     """States that a recording runs, for a process that replaces another one and lacks the samples so far."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return nothing: there is no more to know."""
         return {}
 
@@ -83,10 +84,6 @@ class MaterialEngine(Engine):
     def describe(self, model: str) -> MaterialDescription:
         """Return what its messages are."""
         return self._description
-
-    def ready(self) -> dict[str, Any]:
-        """Return the materials; there are no alarms."""
-        return {"materials": list(self._description.channels), "alarms": {}}
 
     def continue_recording(self, beginning: str) -> None:
         """Take note that the next recording lacks its first samples."""
@@ -243,6 +240,6 @@ def find_finger(sensors: Mapping[str, Sensor]) -> str:
     from tacpipe.channels.streams import finger
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
-    tables: Mapping[str, Any] = {name: schema.empty_table() for name, schema in schemas.items()}
+    tables = {name: schema.empty_table() for name, schema in schemas.items()}
     finger_table = finger("of this rig", tables)
     return next(name for name, table in tables.items() if table is finger_table)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from tacpipe.arrays import Float32s
+from tacpipe.io import Json
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
@@ -148,7 +149,7 @@ class MaterialDescription(messages.Description):
         """The names of the materials."""
         return Sizes(self.channels)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the description as JSON and msgpack hold it."""
         return {
             "version": VERSION,

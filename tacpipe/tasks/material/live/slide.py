@@ -29,6 +29,9 @@ from tacpipe.tasks.material.slides import STREAM, difference
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.plugins.stage import Attribute
+    from tacpipe.store.records import Step
+
     Tables = Mapping[str, pa.Table]
     import pyarrow as pa
 
@@ -39,7 +42,7 @@ ENDED_NS = 200_000_000  # time without a row of the slide after which it is over
 UNLIKE = "the slide is like none of the materials that the model knows"
 
 
-def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
+def slide_params(steps: Sequence[Step]) -> Any:
     """Return the params of `segment slides` that a model of materials was trained behind.
 
     Raises `UsageError` if that stage has another version now, `TacpipeError` if the model was trained behind others.
@@ -65,7 +68,7 @@ class Held:
     """The streams of a recording so far, as a stage reads a recording."""
 
     tables: Mapping[str, pa.Table]
-    attributes: Mapping[str, Any]
+    attributes: Mapping[str, Attribute]
     name: str = "so far"
 
     @property
@@ -268,16 +271,16 @@ def predict(model: Model, recordings: Dataset) -> Result:
 
 def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
     tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD}
-    attributes: Mapping[str, Any] = recording.attributes
+    attributes = recording.attributes
     table = finger(recording.name, tables)
     stream = next(name for name, candidate in tables.items() if candidate is table)
     sensor = str(
         attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))
     )
     rate_hz = attributes.get("rate_hz")
-    least_seen = float(attributes.get(LEAST, MIN_SEEN))
+    least_seen = float(attributes.get(LEAST) or MIN_SEEN)
     slide = SlideSoFar(classifier, params, sensor, least_seen, float(rate_hz) if rate_hz else None)
-    pause_ns = round(float(attributes.get(PAUSE, 0.0)) * 1e9)
+    pause_ns = round(float(attributes.get(PAUSE) or 0.0) * 1e9)
     numbered_parts = enumerate(parts(slide, stream, pause_ns, tables), start=1)
     return [(recording.name, number, end_ns, slide.answer(part)) for number, (end_ns, part) in numbered_parts]
 

@@ -182,10 +182,6 @@ class TouchEngine(Engine):
         """Return what its messages are."""
         return TouchDescription(self._predictor.targets, self._criterion.text, model)
 
-    def ready(self) -> dict[str, Any]:
-        """Return what is predicted; there are no alarms."""
-        return {"targets": list(self._predictor.targets), "alarms": {}}
-
     def begin_recording(self, offset_ns: int) -> None:
         """Await the streams of requests."""
         self._recorded_streams = set()

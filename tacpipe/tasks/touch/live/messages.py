@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar, TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.channels import biotac_sp
+from tacpipe.io import Json
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, Value, latency_values
@@ -74,6 +75,17 @@ DECLARATION = Declaration(
 )
 
 
+class CandidateJson(TypedDict):
+    """A candidate of a request, in its message."""
+
+    grasp: int
+    rank: int
+    score: float | None
+    level_th: float | None
+    level_mf: float | None
+    touch: dict[str, float | None]  # by column, device counts
+
+
 @dataclass
 class TouchMessage(messages.Message):
     """The ranking of the candidates of one request, or why there is none."""
@@ -111,16 +123,22 @@ class TouchMessage(messages.Message):
         return self.ranks.index(1) if self.ranks else None
 
     @property
-    def candidates(self) -> list[dict[str, Any]] | None:
+    def candidates(self) -> list[CandidateJson] | None:
         """Each grasp as JSON has it."""
         return None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))]
 
-    def _candidate(self, row: int) -> dict[str, Any]:
+    def _candidate(self, row: int) -> CandidateJson:
         assert self.touch is not None
         values = [None if math.isnan(value) else value for value in self.touch[row].astype(np.float32).tolist()]
         thumb, middle = map(rounded, self.levels[row].tolist())
-        about = {"grasp": row, "rank": self.ranks[row], "score": rounded(float(self.scores[row]))}
-        return {**about, "level_th": thumb, "level_mf": middle, "touch": dict(zip(COLUMNS, values, strict=True))}
+        return {
+            "grasp": row,
+            "rank": self.ranks[row],
+            "score": rounded(float(self.scores[row])),
+            "level_th": thumb,
+            "level_mf": middle,
+            "touch": dict(zip(COLUMNS, values, strict=True)),
+        }
 
     @property
     def best_grasp(self) -> Float32s:
@@ -161,7 +179,7 @@ class TouchDescription(messages.Description):
         """The names of the predicted values."""
         return Sizes(COLUMNS)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the description as JSON and msgpack hold it."""
         return {
             "version": VERSION,

@@ -102,3 +102,4 @@ def test_an_electrode_whose_band_holds_nothing_is_drawn_so() -> None:
 
 def test_results_without_quantiles_have_no_such_part() -> None:
     assert folds(result()) == []
+    assert "quantiles" not in json.loads(result().files["config.json"])
