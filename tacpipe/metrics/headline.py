@@ -267,7 +267,7 @@ def _json(value: Any) -> Any:
 
 
 class StoredRow(TypedDict):
-    """A `HeadlineRow` in ``headline.json``; null stands for a value that is not defined."""
+    """A `HeadlineRow` in ``headline.json``; an undefined value is null."""
 
     name: str
     values: list[float | None]

@@ -108,7 +108,7 @@ class ChartEncoding(TypedDict, total=False):
 
 
 class ChartMark(TypedDict, total=False):
-    """The geometry that stands for a row of data, and how it looks."""
+    """The geometry of a row of data, and how it looks."""
 
     type: str
     clip: bool
