@@ -13,7 +13,7 @@ fraction of true values in the band between the lowest and the highest quantile;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
