@@ -1,9 +1,8 @@
 """Measure how uncertain a trained model is.
 
-Writes the model with what it needs to state that. Models of the tasks ``forward`` and ``touch`` get quantiles: fitted to
-their errors on training recordings, then corrected on calibration recordings, so that a band holds as often as it states.
-Models of the task ``material`` get probabilities that are frequencies, and a threshold for the answer ``unknown``. The
-model's predictions stay as they are.
+Writes the model with what it needs to state that. A model of forecasts or of touch gets quantiles: fitted to its errors on
+training recordings, then corrected on calibration recordings, so that a band holds as often as it states. A classifier gets
+probabilities that are frequencies, and a threshold for the answer ``unknown``. The model's predictions stay as they are.
 
 Calibration recordings have the role calibration in the split, which `tacpipe split --calibration` gives; without any, those
 with the role val. Recordings that the model learned from are refused.
@@ -30,10 +29,10 @@ LEVELS = CommaList(PositiveInt, min_items=1)
 class Params:
     """How a model is to state its uncertainty."""
 
-    quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50, of forward and touch
-    # forward and touch: widen bands until they hold in a new recording with at least their level; else they do on average
+    quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50
+    # quantiles: widen bands until they hold in a new recording with at least their level; else they do on average
     promise: bool = False
-    # material: fraction of slides of known materials that may be answered unknown
+    # classifiers: fraction of recordings of known classes that may be answered unknown
     false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05
     seed: Seed = 0  # random seed of what is fitted
 

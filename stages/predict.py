@@ -1,8 +1,8 @@
 """Predict recordings with a trained model, row by row.
 
 `tacpipe evaluate` reports how good the predictions are. With ``--causal`` each prediction reads what had arrived by then
-and no more, from recordings as they were recorded: what a live session publishes, bit for bit; of a model of materials the
-final answer of each slide. ``--quantiles 10,50,90`` adds quantiles of a model that `tacpipe calibrate` made, also to causal
+and no more, from recordings as they were recorded: what a live session publishes, bit for bit; of a classifier the final
+answer of each recording. ``--quantiles 10,50,90`` adds quantiles of a model that `tacpipe calibrate` made, also to causal
 forecasts.
 
 Example: tacpipe predict models/forward data/segments -o data/predictions
@@ -37,7 +37,7 @@ class Params:
     allow_look_ahead: bool = added(False)
     # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
     quantiles: Annotated[str, CommaList(PositiveInt)] = added("")
-    # material: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
+    # classifiers: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
     probabilities: bool = added(False)
 
 

@@ -1,9 +1,8 @@
 """Show results on one self-contained HTML page.
 
 Each task has a section: which method is best and by how much, a chart and a table, then everything else behind headings
-that fold. Results of the same task are compared, seeds and folds of a method pooled. Outputs of ``tacpipe compress`` next to
-results of the task ``forward`` show the loss of codecs; slides next to those of ``material`` and grasps next to those of
-``touch`` are drawn.
+that fold. Results of the same task are compared, seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
+and grasps are drawn next to results of a task that uses them.
 
 Example: tacpipe report results/forward -o report.html
 """

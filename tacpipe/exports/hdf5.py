@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.exports.arrays import FrameArray
+    from tacpipe.exports.frames import FrameArray
     from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Roles
 
@@ -92,9 +92,9 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the file of one recording, or nothing if all are in one."""
     if params.structure == "robomimic":
-        from tacpipe.exports import arrays
+        from tacpipe.exports import frames
 
-        return Result({"": RecordingOutput(arrays.describe(recording))})
+        return Result({"": RecordingOutput(frames.describe(recording))})
     losses: list[Loss] = []
     columns: list[ColumnName] = []
     content = _recording(recording, losses, columns)
@@ -250,7 +250,7 @@ def _demos(
     """Return a temporary file with all demonstrations; what it does not carry of a recording is added to ``losses``."""
     import h5py
 
-    from tacpipe.exports import arrays, frames
+    from tacpipe.exports import frames
 
     rate_hz = frames.common_rate_hz(list(recordings))
     masks: dict[str, list[bytes]] = {}
@@ -261,7 +261,7 @@ def _demos(
         for number, recording in enumerate(recordings):
             demo = data.create_group(f"demo_{number}", track_order=True)
             table = frames.synchronized_columns(recording).select(columns)
-            for array in arrays.arrays_of_frames(table, params.actions):
+            for array in frames.arrays_of_frames(table, params.actions):
                 dataset = _array_dataset(demo, array, table)
                 dataset.attrs["columns"], dataset.attrs["units"] = array.columns, array.units
             losses += [(recording.name, loss) for loss in _attributes(demo, recording.attributes)]

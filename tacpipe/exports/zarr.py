@@ -64,9 +64,9 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
 @stage(version=2, reads=("grid", "grid_rate_hz"))
 def part(params: Params, recording: Recording) -> RecordingOutput:
     """Return what one recording holds."""
-    from tacpipe.exports import arrays
+    from tacpipe.exports import frames
 
-    return RecordingOutput(arrays.describe(recording))
+    return RecordingOutput(frames.describe(recording))
 
 
 @stage(version=2, part=part, first=first)
@@ -79,13 +79,13 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     """
     import numpy as np
 
-    from tacpipe.exports import arrays, frames
+    from tacpipe.exports import frames
 
     all_recordings = list(recordings)
     rate_hz = frames.common_rate_hz(all_recordings)
     columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
     described = frames.add_frame_losses(described, recordings, originals)
-    frame_arrays = arrays.arrays_of_frames(
+    frame_arrays = frames.arrays_of_frames(
         frames.synchronized_columns(all_recordings[0]).select(columns), params.actions
     )
     types: list[list[ArrayType]] = []  # by recording and array

@@ -30,7 +30,7 @@ from tacpipe.io import regular
 from tacpipe.io.spill import Piece, Spill, unpack
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
-from tacpipe.signals import clock_offsets, clocks
+from tacpipe.signals import clocks
 
 STAMP = "lsl_ns"
 RAW = "t_device_ns"
@@ -324,9 +324,9 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
     described: list[str] = []
     t_ns = raw_ns
     if len(measured):
-        lines = clock_offsets.fit_offsets(measured[:, 0], measured[:, 1])
+        lines = clocks.fit_offsets(measured[:, 0], measured[:, 1])
         starts = [0, *(_reset_row(stream, raw_ns, measured, line.start) for line in lines[1:])]
-        t_ns = clock_offsets.host_times(lines, starts, raw_ns)
+        t_ns = clocks.times_by_offsets(lines, starts, raw_ns)
         longest = max(lines, key=lambda line: line.stop - line.start)
         facts = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
     else:

@@ -16,7 +16,7 @@ import pytest
 
 from tacpipe.recording import triggers
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.udp import free_port
+from tacpipe.simulation.emulation.network import free_port
 from tests.conftest import Lab
 from tests.recording import live
 

@@ -50,11 +50,11 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
     if scheme == "udp":
         return _udp(stream)
     if scheme in ("tcp", "tcp+udp"):
-        from tacpipe.simulation.emulation.tcp import Tcp, TcpUdp
+        from tacpipe.simulation.emulation.network import Tcp, TcpUdp
 
         return TcpUdp(stream.sensor) if scheme == "tcp+udp" else Tcp(stream.sensor)
     if scheme == "ws":
-        from tacpipe.simulation.emulation.tcp import Websocket
+        from tacpipe.simulation.emulation.network import Websocket
 
         return Websocket(stream.sensor)
     if scheme == "can":
@@ -81,7 +81,7 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
 
 
 def _udp(stream: RigStream) -> Endpoint:
-    from tacpipe.simulation.emulation.udp import HOST, Udp, free_port
+    from tacpipe.simulation.emulation.network import HOST, Udp, free_port
 
     host, _, _ = stream.address.place.partition("?")[0].rpartition(":")
     if stream.sensor.listens or not host:

@@ -18,8 +18,8 @@ from tacpipe.plugins import extras
 from tacpipe.sensors.camera import Camera, read_shape, unpack_frame
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, gel
+from tacpipe.simulation.emulation.network import HOST, Connection, Tcp
 from tacpipe.simulation.emulation.source import BLOCK_S, KEPT, Timing
-from tacpipe.simulation.emulation.tcp import HOST, Connection, Tcp
 from tacpipe.simulation.emulation.world import Cycle, World
 from tacpipe.video import files
 from tacpipe.video.decoding import jpeg_images

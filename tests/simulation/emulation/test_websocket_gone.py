@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.simulation.emulation import tcp
+from tacpipe.simulation.emulation import network
 
 
 class Gone(socket.socket):
@@ -44,8 +44,8 @@ class Protocol:
 @pytest.mark.parametrize("pieces", [[b""], [b"bye", b""]])
 def test_a_client_that_is_gone_already_ends_no_emulation(pieces: list[bytes]) -> None:
     with Gone() as connection:
-        peer: Any = object.__new__(tcp.Client)
+        peer: Any = object.__new__(network.Client)
         peer.socket, peer.protocol = connection, Protocol(pieces)
-        served: Any = object.__new__(tcp.Websocket)
+        served: Any = object.__new__(network.Websocket)
 
         assert served.understood(peer, b"") == []
