@@ -512,6 +512,18 @@ def test_pages_are_short() -> None:
     assert len((ROOT / "CHANGELOG.md").read_text().split()) <= 800
 
 
+def test_decisions_follow_one_template_with_a_date() -> None:
+    sections = re.compile(r"^## (.+)$", re.MULTILINE)
+    template = sections.findall((ROOT / "docs" / "decisions" / "0000-template.md").read_text())
+    pages = [page for page in DOCS if page.parent.name == "decisions"]
+    assert len(pages) >= 50
+    for page in pages:
+        text = page.read_text()
+        titles = sections.findall(text)
+        assert re.match(rf"# {page.name[:4]}: .+\n\nDate: 20\d\d-\d\d-\d\d\. Status: ", text), page.name
+        assert titles in (template, [title for title in template if title != "Alternatives"]), page.name
+
+
 def test_command_lines_fit_a_block_of_code() -> None:
     long_lines = [
         f"{page.name}: {line}"
