@@ -38,7 +38,7 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
         raise UsageError("--trials and --duration-s must be above 0.")
     if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
-        raise UsageError("--trials needs --duration-s or --stop, or the first trial never ends.")
+        raise UsageError("--trials needs --duration-s or --stop, because otherwise the first trial never ends.")
     store.prepare()
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
@@ -73,7 +73,7 @@ def report_spools_of_others(store: Store) -> None:
     from tacpipe.recording import trials
 
     for folder, owner in trials.spools_of_others(store).items():
-        terminal.note(f"The spool {folder} belongs to {owner}, who alone can seal it.")
+        terminal.note(f"The spool {folder} belongs to {owner}. Only this user can seal it.")
 
 
 def measure(rig: Rig) -> dict[str, Figures]:

@@ -61,10 +61,10 @@ class AutoencoderParams:
     PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
-        """Refuse hidden layers next to a search, which tries its own."""
+        """Refuse hidden layers next to a search, which chooses its own widths."""
         if self.search and self.hidden:
             raise UsageError(
-                f"hidden is {self.hidden} and search is {self.search}, which tries its own; give one of them."
+                f"hidden is {self.hidden} and search is {self.search}, which chooses its own widths; give only one of them."
             )
 
 

@@ -433,14 +433,14 @@ def test_the_command_line_names_no_stage() -> None:
         ("split nowhere --folds 3", "--folds belongs to the scheme kfold, and the scheme is random. Leave it out, or"),
         (
             "split nowhere --val 0.6 --test 0.5",
-            "val is 0.6, calibration is 0 and test is 0.5, which leave nothing to train on",
+            "val is 0.6, calibration is 0 and test is 0.5, which leave no recordings to train on",
         ),
         ("split nowhere --few-by sensor", "few_by is sensor and few is 0; it must be 1 or more with few_by."),
         ("split nowhere --few 3 --few-of sensor", "few_of is 'sensor'; it must be an attribute and a value"),
         ("segment contacts nowhere --on-count 5", "off_count is 80, above on_count, 5"),
         ("segment slides nowhere --spike-frames 4", "spike_frames is 4; it must be odd"),
         ("compress autoencoder nowhere --split s --hidden 64,x", "each item a whole number of 1 or more"),
-        ("compress autoencoder nowhere --split s --hidden 8 --search 3", "search is 3, which tries its own"),
+        ("compress autoencoder nowhere --split s --hidden 8 --search 3", "search is 3, which chooses its own widths"),
         (
             "evaluate nowhere nowhere --split s --role best",
             "--role is 'best'; it must be one of train, val, calibration, test.",

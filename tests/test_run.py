@@ -200,7 +200,7 @@ def stages_of_dvc(folder: Path) -> tuple[list[str], list[tuple[str, str]]]:
         ("params: [5]", "its params is"),
         ("frozen: 'false'", "its frozen is 'false'; it must be true or false"),
         ("dep: [p]", "there is no key 'dep'; there are cmd"),
-        ("deps: [p], deps: [q]", "the key deps stands twice"),
+        ("deps: [p], deps: [q]", "the key deps occurs twice"),
         ("outs: [p], metrics: [p]", "it has p twice"),
         ("deps: [p], outs: [./p]", "it has p twice"),
         ("outs: [d], metrics: [d/f]", "writes d/f within d"),
@@ -222,8 +222,8 @@ def test_a_stage_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, defini
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("stages: {a: {cmd: x}, a: {cmd: y}}", "the key a stands twice"),
-        ("stages: {1: {cmd: x}, true: {cmd: y}}", "the key true stands twice"),
+        ("stages: {a: {cmd: x}, a: {cmd: y}}", "the key a occurs twice"),
+        ("stages: {1: {cmd: x}, true: {cmd: y}}", "the key true occurs twice"),
         ("stages: {1: {cmd: x}}", "its stages is"),
         ("stages: {a@b: {cmd: x}}", "without @"),
         ("stages: {'': {cmd: x}}", "a name"),

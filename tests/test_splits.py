@@ -187,14 +187,14 @@ def test_an_older_split_of_other_folds_is_refused() -> None:
     ("scheme", "message"),
     [
         (Scheme("lucky"), "no split scheme lucky"),
-        (Scheme(val=0.6, test=0.5), "leave nothing to train on"),
+        (Scheme(val=0.6, test=0.5), "leave no recordings to train on"),
         (Scheme("kfold", folds=1), "1 folds cannot be made"),
         (Scheme("leave-one-out", by="colour"), "has no attribute colour; it has object"),
         (Scheme(stratify="colour"), "has no attribute colour"),
         (Scheme(stratify="objcet"), "Did you mean object\\?"),
         (Scheme("kfold", folds=4, apart="object"), "3 values of object cannot be kept apart in 4 folds"),
         (Scheme("kfold", folds=2, apart="colour"), "has no attribute colour"),
-        (Scheme("random", apart="object"), "apart object goes with the scheme kfold alone"),
+        (Scheme("random", apart="object"), "apart object belongs to the scheme kfold"),
     ],
 )
 def test_a_split_that_cannot_be_says_why(scheme: Scheme, message: str) -> None:
@@ -355,9 +355,9 @@ def test_few_counts_those_that_an_older_split_trains_on() -> None:
 @pytest.mark.parametrize(
     ("scheme", "message"),
     [
-        (Scheme(repeats=0), "repeats 0 cannot be"),
-        (Scheme("kfold", folds=2, repeats=2), "repeats 2 cannot be with the scheme kfold"),
-        (Scheme(reverse=True), "reverse goes with the scheme blocked alone"),
+        (Scheme(repeats=0), "repeats 0 does not fit"),
+        (Scheme("kfold", folds=2, repeats=2), "repeats 2 does not fit the scheme kfold"),
+        (Scheme(reverse=True), "reverse belongs to the scheme blocked"),
         (Scheme(few=-1), "few is -1"),
         (Scheme(few_by="object"), "few is 0; it must be the number"),
         (Scheme(few=2, few_of="object"), "few_of is 'object'; it must be an attribute and a value"),

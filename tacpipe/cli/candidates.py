@@ -100,12 +100,12 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
 
     if path.suffix.lower() in files.SUFFIXES or (path.is_file() and path.name != "manifest.json"):
         if recording is not None:
-            raise UsageError(f"{path} is one cloud; --recording {recording} picks one of a dataset. Leave it out.")
+            raise UsageError(f"{path} is a single cloud; --recording {recording} selects from a dataset. Leave it out.")
         return files.read(path)
     shards = pipeline.open_dataset(path).recordings
     if recording is None and len(shards) != 1:
         raise UsageError(
-            f"{path} has {len(shards)} recordings; pick one with --recording: {_name_excerpt(list(shards))}."
+            f"{path} has {len(shards)} recordings. Choose one with --recording: {_name_excerpt(list(shards))}."
         )
     name = next(iter(shards)) if recording is None else recording
     if name not in shards:
@@ -178,7 +178,7 @@ def _require_names(output: Path | None, picture: Path | None) -> None:
     """Raise `UsageError` before anything is computed if an output has another suffix or belongs to another program."""
     if output is not None:
         if output.suffix.lower() != ".csv":
-            raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
+            raise UsageError(f"{output} must end in .csv, because the command writes CSV. --json prints JSON instead.")
         replacing.refuse_foreign(output, HEADER.encode())
     if picture is not None and picture.suffix.lower() not in PICTURES:
         raise UsageError(f"{picture} is not a name for a picture; it must end in one of {', '.join(PICTURES)}.")

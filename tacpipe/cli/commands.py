@@ -136,7 +136,7 @@ def _compare(program: typer.Typer) -> None:
         from tacpipe.cli import compare as comparing
 
         if as_csv and as_json:
-            raise UsageError("--csv and --json exclude each other. Give one of them.")
+            raise UsageError("--csv and --json exclude each other. Give only one of them.")
         comparison = comparing.run(results, pool=not unpooled)
         with _ends_with_its_reader():
             if as_json:
@@ -254,16 +254,16 @@ def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclu
     """Raise `UsageError` if labels come from a table and from the command line."""
     if names or sets or exclude is not None or include:
         raise UsageError(
-            "--from names recordings and labels itself; leave out names, --label, --exclude and --include."
+            "--from names recordings and labels itself. Leave out names, --label, --exclude and --include."
         )
 
 
 def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
     """Raise `UsageError` for options of --from without it, and where no recording is named."""
     if key or dry_run:
-        raise UsageError("--key and --dry-run go with --from; leave them out, or give a table with --from.")
+        raise UsageError("--key and --dry-run belong to --from. Leave them out, or give a table with --from.")
     if not names:
-        raise UsageError("Name the recordings to label, or give a table with --from; * and ? match any letters.")
+        raise UsageError("Name the recordings to label (* and ? are wildcards), or give a table with --from.")
 
 
 def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) -> None:

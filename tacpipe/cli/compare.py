@@ -204,7 +204,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
     if not compared.comparisons:
         raise UsageError(
-            "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
+            "These results do not hold the errors of single recordings. Run `tacpipe evaluate` again, or give "
             "results of recordings that the model has not seen."
         )
     reason = "no errors of single recordings that the model has not seen are stored"

@@ -225,7 +225,7 @@ def _collect_distant(
     distant = caches.distant(store)
     if cache:
         if forget or recordings:
-            raise UsageError("--cache removes copies alone; give --forget and --recordings without it.")
+            raise UsageError("--cache removes copies only. Give --forget and --recordings without it.")
         return caches.clear(distant, dry_run=dry_run)
     _forget(distant.bucket, forget, dry_run=dry_run)
     return caches.collect(distant, dry_run=dry_run, recordings=recordings, grace_days=grace_days)

@@ -66,7 +66,7 @@ def view(
     recordings = list(chosen)[:limit]
     if save is not None and len(recordings) > 1 and save.suffix.lower() == ENDING:
         raise UsageError(
-            f"{save} is one file, for one recording, and {len(recordings)} are chosen; name one, or a folder for a "
+            f"{save} is one file for one recording, and {len(recordings)} are selected. Select one, or give a folder for a "
             f"file each."
         )
     if len(recordings) < len(chosen):
@@ -90,7 +90,7 @@ def _require(save: Path | None, *, web: bool, port: int | None) -> None:
     from tacpipe.datasets import replacing
 
     if save is not None and web:
-        raise UsageError("--save and --web contradict each other; give one.")
+        raise UsageError("--save and --web contradict each other. Give only one.")
     if port is not None and not web:
         raise UsageError(f"--port {port} is the port of --web; give --web too.")
     if save is not None and save.suffix.lower() == ENDING:

@@ -103,11 +103,9 @@ def candidates(
 
 def _require_possible(count: int, shift: float, opening_m: tuple[float, float]) -> None:
     if count < 1:
-        raise UsageError(f"{count} candidates were asked for; it must be 1 or more.")
+        raise UsageError(f"{count} candidates are requested; the number must be 1 or more.")
     if not 0 <= shift <= 0.5:
-        raise UsageError(
-            f"The shift is {shift:g} of the object's length; it must lie between 0 and 0.5, where it ends."
-        )
+        raise UsageError(f"The shift is {shift:g} of the object's length; it must lie between 0 and 0.5, its end.")
     if not 0 < opening_m[0] < opening_m[1]:
         raise UsageError(
             f"The fingers open {opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm; the first must be above 0 and below "
@@ -131,7 +129,7 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
 def _thinned(cloud: Cloud, seed: int) -> Cloud:
     if len(cloud) < MIN_POINTS:
         raise TacpipeError(
-            f"The cloud has {len(cloud)} points; to find its shape it takes {MIN_POINTS} or more. Is it the object's cloud?"
+            f"The cloud has {len(cloud)} points; to find its shape, it needs {MIN_POINTS} or more. Is it the object's cloud?"
         )
     if len(cloud) <= MAX_POINTS:
         return cloud

@@ -208,12 +208,14 @@ class DepthFrame:
         pixels = width * height
         if len(content) != HEADER.size + pixels * (5 if coloured else 2):
             raise TacpipeError(
-                f"A depth frame of {width} x {height} pixels came with {len(content)} bytes; it was cut off."
+                f"A depth frame of {width} x {height} pixels came with {len(content)} bytes, so it is incomplete."
             )
         if not (all(NEAREST <= length <= FARTHEST for length in optics[:2]) and max(map(abs, optics[2:4])) <= FARTHEST):
             raise TacpipeError(f"A depth frame has the optics {optics[:4]}, pixels; no camera has.")
         if not 0 < optics[4] <= 1:
-            raise TacpipeError(f"A depth frame counts in units of {optics[4]:g} m; it must be above 0 and at most 1.")
+            raise TacpipeError(
+                f"A depth frame counts in units of {optics[4]:g} m; the unit must be above 0 and at most 1."
+            )
         depth = np.frombuffer(content, "<u2", pixels, HEADER.size).reshape(height, width).astype(np.uint16)
         start = HEADER.size + 2 * pixels
         colours = np.frombuffer(content, np.uint8, 3 * pixels, start).reshape(height, width, 3) if coloured else None

@@ -80,7 +80,7 @@ def _declared_points(path: Path) -> int:
     if path.suffix.lower() != ".pts":
         return len(filled)
     if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > DIGITS:
-        raise TacpipeError(f"{path} is not a PTS file: its first line must be the number of points alone.")
+        raise TacpipeError(f"{path} is not a PTS file: its first line must hold only the number of points.")
     declared = int(filled[0][0])
     if _rows(path) < declared:  # open3d takes memory for as many as are declared
         raise TacpipeError(

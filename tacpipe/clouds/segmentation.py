@@ -52,14 +52,14 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: in
     labels = _clusters(points_m[front], limits)
     if not (labels >= 0).any():
         raise TacpipeError(
-            f"Nothing stands on the table: of {len(front)} points in front of it no {limits.object_points} are near one "
+            f"No object is on the table: of {len(front)} points in front of it no {limits.object_points} are near one "
             f"another, within {1e3 * limits.cluster_m:g} mm. Check the scene, or lower --object-points."
         )
     distances_m = np.where(labels >= 0, from_grasp_m(points_m[front], grasp), np.inf)
     nearest = int(distances_m.argmin())
     if distances_m[nearest] > limits.near_m:
         raise TacpipeError(
-            f"No object is near the grasp: of {len(np.unique(labels[labels >= 0]))} things on the table the nearest is "
+            f"No object is near the grasp: of {len(np.unique(labels[labels >= 0]))} objects on the table, the nearest is "
             f"{1e3 * distances_m[nearest]:.1f} mm from the lines of the grasp; it must be "
             f"{1e3 * limits.near_m:g} mm or less, in one frame. Check the grasp, or allow more with --near-mm."
         )

@@ -60,12 +60,14 @@ def networks(
         raise TacpipeError(f"frames is {frames}; an autoencoder reads 1, 2 or 3 frames in a row.")
     if not 0 <= search <= MAX_TENSORS:
         raise TacpipeError(
-            f"search is {search}; it is how many networks to try, 1 to {MAX_TENSORS}, or 0 for no search."
+            f"search is {search}; it must be the number of networks to try, 1 to {MAX_TENSORS}, or 0 for no search."
         )
     if not weight_decay >= 0:
         raise TacpipeError(f"weight_decay is {weight_decay}; it must be 0 or above.")
     if search and hidden:
-        raise TacpipeError(f"hidden is {hidden!r} and search is {search}, which tries its own. Give one of them.")
+        raise TacpipeError(
+            f"hidden is {hidden!r} and search is {search}, which chooses its own widths. Give only one of them."
+        )
     if not search:
         return [NetworkShape(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
     tried = [
@@ -102,7 +104,7 @@ def fit(
     train, val = rows.parts
     if len(train) < 2 or not len(val):
         raise TacpipeError(
-            f"An autoencoder cannot be fitted on {len(train)} rows and stopped by {len(val)}. Give it longer training "
+            f"An autoencoder cannot be fitted to {len(train)} rows and stopped by {len(val)}. Give it longer training "
             "recordings with contact."
         )
     mean, scale = standard(train[:, -width:], representation)

@@ -233,7 +233,7 @@ def to_files(codec: FittedCodec) -> dict[str, bytes]:
     read = load(files)
     if type(read) is not type(codec):
         raise TacpipeError(
-            f"{type(codec).__name__} is of kind {codec.kind}, and the entry point of that name in {registry.CODECS} is "
+            f"{type(codec).__name__} is of kind {codec.kind}, but the entry point of that name in {registry.CODECS} is "
             f"{type(read).__name__}."
         )
     package = registry.brought_by(registry.CODECS, codec.kind)

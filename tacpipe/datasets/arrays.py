@@ -75,7 +75,7 @@ class Arrays:
             if common.kind == "f" and array.dtype.kind in "iu" and _beyond(array):
                 raise UsageError(
                     f"The channel {name} ({array.dtype}) holds integers beyond 2^53, which {common} would round, so "
-                    f"there is no one matrix of these channels. Read it alone: arrays[{name!r}] has its own type."
+                    f"there is no one matrix of these channels. Read it separately: arrays[{name!r}] has its own type."
                 )
             with np.errstate(invalid="ignore"):  # a signalling NaN is NaN in any type
                 values[:, index] = np.ma.getdata(array)

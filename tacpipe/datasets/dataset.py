@@ -313,7 +313,7 @@ class Dataset:
 
         name = self._only_stream() if stream is None else stream
         if not self.recordings:
-            raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
+            raise TacpipeError("This dataset has no recordings to read. `tacpipe show` lists its content.")
         tables = {recording.name: recording.table(name, columns) for recording in self}
         if labels is not False:
             from tacpipe.datasets import arrays

@@ -309,7 +309,7 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
         computed = _inline_digest(manifest)
     if computed != declared:
         raise DamagedError(
-            f"{source} was edited by hand: what it names has the digest {computed[:12]}, it states "
+            f"{source} was edited by hand: its content has the digest {computed[:12]}, it states "
             f"{excerpt(declared)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )

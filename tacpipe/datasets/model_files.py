@@ -56,7 +56,7 @@ def validated(noun: str) -> Iterator[None]:
     except (*_MISFITS, RecursionError) as error:
         described = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise TacpipeError(
-            f"The files of {noun} do not fit one another ({plain(described, 200)}). Copy them again from whoever made them, "
+            f"The files of {noun} do not fit one another ({plain(described, 200)}). Copy them again from their source, "
             f"or train one."
         ) from error
 
@@ -137,7 +137,7 @@ def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Ten
         if expected.get(name) != shapes.get(name):
             raise TacpipeError(
                 f"The model's weights do not fit its {CONFIG}: {plain(name)} is {shapes.get(name, 'missing')} and should "
-                f"be {expected.get(name, 'missing')}. Copy its files again from whoever made them."
+                f"be {expected.get(name, 'missing')}. Copy its files again from their source."
             )
     kinds = {name: value.dtype for name, value in network.state_dict().items()}
     # `to_empty` imports sympy, which takes as long as a small network's evaluation
@@ -152,7 +152,7 @@ def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
     except (kind, ValueError, TypeError, LookupError, OverflowError, AttributeError, RuntimeError) as error:
         raise TacpipeError(
             f"{name} is not a safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
-            f"from whoever made it."
+            f"from its source."
         ) from error
 
 
@@ -161,7 +161,7 @@ def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
     if wrong is not None:
         raise TacpipeError(
             f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be predicted from them. "
-            f"Train the model again, or copy it from whoever made it."
+            f"Train the model again, or copy it from its source."
         )
 
 
@@ -178,7 +178,7 @@ def _require(name: str, path: str, value: Any, kind: Kind) -> None:
         described = "is missing" if value is None else f"is {excerpt(value)}"
         description = " or ".join(_KINDS[allowed] for allowed in kinds)
         raise TacpipeError(
-            f"{name}: {path} {described}; it must be {description}. Copy the model again from whoever made it."
+            f"{name}: {path} {described}; it must be {description}. Copy the model again from its source."
         )
     if isinstance(value, int) and not 0 <= value <= MAX_SIZE:
         raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MAX_SIZE}.")

@@ -109,7 +109,7 @@ def refuse_shared_names(recordings: Iterable[tuple[str, Path]]) -> None:
             name = plain(recording[0])
             names = name if earlier[0] == recording[0] else f"{plain(earlier[0])} and {name}, which differ only in case"
             raise UsageError(
-                f"{first} and {second} would both be named {names}. Rename one, or give a folder that holds one alone."
+                f"{first} and {second} would both be named {names}. Rename one, or give a folder with only one of them."
             )
 
 

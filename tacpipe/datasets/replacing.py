@@ -80,7 +80,7 @@ def refuse_foreign(path: Path, mark: bytes) -> None:
         with regular.opened(path) as file:
             beginning = file.read(2**16)
     if mark not in beginning:
-        raise UsageError(f"{path} is there already and this command did not write it. Give -o another place.")
+        raise UsageError(f"{path} already exists, and this command did not write it. Give -o another path.")
 
 
 def occupant(store: Store, output: Path) -> Manifest | None:
@@ -99,7 +99,7 @@ def occupant(store: Store, output: Path) -> Manifest | None:
         former_manifest = former(store, output)
         if former_manifest is None:
             raise DamagedError(
-                f"{error} Labels that were set by hand may be in it, and would be lost: bring it back with git, or remove "
+                f"{error} Labels that were set by hand may be in it, and would be lost. Restore it with git, or remove "
                 f"it to continue without them."
             ) from None
         return former_manifest

@@ -134,11 +134,12 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
     if scheme.name not in SCHEMES:
         raise TacpipeError(f"There is no split scheme {scheme.name}; there are {', '.join(SCHEMES)}.")
     if not attributes:
-        raise TacpipeError("A split of no recordings has no roles to give; give it a dataset with recordings.")
+        raise TacpipeError("There are no recordings to split. Give a dataset with recordings.")
     shares = (scheme.val, scheme.calibration, scheme.test)
     if min(shares) < 0 or sum(shares) >= 1:
         raise TacpipeError(
-            f"val {scheme.val}, calibration {scheme.calibration} and test {scheme.test} leave nothing to train on; each "
+            f"val {scheme.val}, calibration {scheme.calibration} and test {scheme.test} leave no recordings to "
+            f"train on; each "
             f"must be 0 or more, and their sum below 1."
         )
     if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
@@ -151,16 +152,16 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
 def _check_options(scheme: Scheme) -> None:
     if scheme.apart and scheme.name != "kfold":
         raise TacpipeError(
-            f"apart {scheme.apart} goes with the scheme kfold alone, not with {scheme.name}. "
+            f"apart {scheme.apart} belongs to the scheme kfold, not to {scheme.name}. "
             f"To keep values apart one by one, choose leave-one-out by {scheme.apart}."
         )
     if scheme.repeats < 1 or (scheme.repeats > 1 and scheme.name != "random"):
         raise TacpipeError(
-            f"repeats {scheme.repeats} cannot be with the scheme {scheme.name}; it must be 1 or more, and 1 with all "
+            f"repeats {scheme.repeats} does not fit the scheme {scheme.name}; it must be 1 or more, and 1 with all "
             f"schemes but random."
         )
     if scheme.reverse and scheme.name != "blocked":
-        raise TacpipeError(f"reverse goes with the scheme blocked alone, not with {scheme.name}; leave it out.")
+        raise TacpipeError(f"reverse belongs to the scheme blocked, not to {scheme.name}; leave it out.")
     if scheme.few < 0 or (not scheme.few and (scheme.few_by or scheme.few_of)):
         raise TacpipeError(
             f"few is {scheme.few}; it must be the number of recordings to train on, or 0 for all, without few_by and "
@@ -345,7 +346,7 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
         raise TacpipeError(
             f"The older split has no fold that tests all recordings of {scheme.apart} {values_in_training[0]}, "
             f"so it did not keep "
-            f"{scheme.apart} apart. Make a split anew, or leave apart as it was."
+            f"{scheme.apart} apart. Make a new split, or leave apart as it was."
         )
     return {value: min(folds) for value, folds in tested.items()}
 
@@ -375,7 +376,7 @@ def _older_roles(
     grown = scheme.name == "leave-one-out" and len(old) <= folds  # a new value adds a fold
     if keep and old != set(range(folds)) and not grown:
         raise TacpipeError(
-            f"The older split has {len(old)} folds and the scheme {scheme.name} makes {folds}; they must be as many. "
+            f"The older split has {len(old)} folds and the scheme {scheme.name} makes {folds}; the numbers must be equal. "
             f"Give the scheme and the folds of the older split."
         )
     return {(name, fold): role for (name, fold), role in keep.items() if name in attributes}

@@ -108,7 +108,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
         if columns is not None and not (inputs is None and targets is None):
-            raise UsageError("columns are inputs and targets at once; give columns, or inputs and targets.")
+            raise UsageError("columns sets both inputs and targets. Give either columns, or inputs and targets.")
         if rest_s is not None and not rest_s > 0:
             raise UsageError(f"rest_s is {rest_s}; it must be a number of seconds above 0.")
         self.dataset, self.context, self.horizon, self.stride = dataset, context, horizon, stride
@@ -216,7 +216,7 @@ class Windows(torch.utils.data.Dataset[Window]):
                 ) / total
                 mean, count = mean + difference * len(values) / total, total
         if not count:
-            raise UsageError("There is no window in these recordings, so there is nothing to scale by.")
+            raise UsageError("These recordings have no windows, so the scale cannot be computed.")
         std = np.sqrt(squares / count)
         return Scaling(mean, np.where(std > 0, std, 1.0))
 
@@ -224,7 +224,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         """Return the scaling of other windows for the channels of these."""
         scaling = source.scaling
         if scaling is None:
-            raise UsageError("scale is windows that are not scaled themselves; make them with scale=True.")
+            raise UsageError("The windows given as scale are not scaled themselves. Make them with scale=True.")
         missing = [name for name in self.columns if name not in source.columns]
         if missing:
             raise UsageError(
@@ -261,7 +261,8 @@ class Windows(torch.utils.data.Dataset[Window]):
         if (inputs, targets) != self._channels:
             odd = sorted(set(names) ^ set(self.columns)) or list(names)
             raise UsageError(
-                f"Recording {recording.name} has not the same channels as the others, or lacks one: {odd[0]}. Name the "
+                f"Recording {recording.name} does not have the same channels as the others, or lacks one: {odd[0]}. "
+                f"Name the "
                 f"columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
             )
         matrix = arrays.Arrays(read.by_column, names)
@@ -315,7 +316,7 @@ def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
     values = exact.astype(dtype)
     if exact.dtype.kind in "iu" and exact.dtype.itemsize > 2 and not np.array_equal(values.astype(exact.dtype), exact):
         raise UsageError(
-            f"Recording {name} holds whole numbers that {dtype} rounds. Give dtype='float64', or other columns."
+            f"Recording {name} holds integers that {dtype} would round. Give dtype='float64', or other columns."
         )
     return values
 

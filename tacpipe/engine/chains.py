@@ -195,7 +195,7 @@ def _stages(file: Path) -> Iterator[ChainStage]:
     for name, definition in content["stages"].items():
         place = f"{file}, stage {plain(name)}"
         if not name or "@" in name:
-            raise UsageError(f"{place}: give it a name without @, which stands in names of foreach and matrix.")
+            raise UsageError(f"{place}: give it a name without @, because names of foreach and matrix contain it.")
         is_group = "foreach" in definition or "do" in definition
         _check(definition, _FOREACH if is_group else _MATRIX, place)
         if is_group:

@@ -235,7 +235,7 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
         obstacle = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = obstacle or f"nothing in the store says how {path} was made"
     raise DamagedError(
-        f"{problem} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
+        f"{problem} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage again."
     )
 
 

@@ -50,7 +50,7 @@ def requests(request: Request, numbers: Sequence[int]) -> list[Request]:
     """
     if len(numbers) > 1 and PLACE not in str(request.output):
         raise UsageError(
-            f"{len(numbers)} folds cannot be written to {request.output} alone: put {PLACE} into the path, as in "
+            f"{len(numbers)} folds cannot be written to the single path {request.output}: put {PLACE} into the path, as in "
             f"-o {request.output.with_name(f'{request.output.stem}-{PLACE}{request.output.suffix}')}."
         )
     return [_fold_request(request, number) for number in numbers]

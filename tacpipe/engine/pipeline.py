@@ -197,7 +197,7 @@ class _RequestRun:
         try:
             manifest.check_pages(result, fresh=True)
         except (ValueError, TypeError, KeyError) as error:
-            raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
+            raise TacpipeError(f"{self.request.name} returned a result that no dataset can hold: {error}.") from None
         return result
 
     def _make(self) -> Manifest:
@@ -385,7 +385,10 @@ class _RequestRun:
             self.outcome.compare(record, computed.record, name)
             result = record["result"]  # later steps were computed from the stored result
         elif self.request.compare and not counted:
-            raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
+            raise UsageError(
+                f"There is no stored result of {name} to compare with. Run the command without "
+                f"--recompute-and-compare first."
+            )
         self.outcome.ran += computed.is_new and counted
         self.outcome.reused += counted and not computed.is_new
         return result

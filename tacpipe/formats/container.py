@@ -318,8 +318,8 @@ def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> d
     for name, part in parts:
         if name in parts_by_name:
             raise UsageError(
-                f"{path} has more than one {kind} {plain(name)}. Only one of them could be kept: rename the others, or take "
-                f"them away."
+                f"{path} has more than one {kind} {plain(name)}. Only one of them can be kept. Rename or remove the "
+                f"others."
             )
         parts_by_name[name] = part
     return parts_by_name

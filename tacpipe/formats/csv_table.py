@@ -105,9 +105,7 @@ def read_record(path: Path) -> dict[str, str]:
     names = text.header()
     rows = [(line, cells) for line, cells in text.rows() if any(cell.strip() for cell in cells)][1:]
     if len(rows) != 1:
-        raise TacpipeError(
-            f"{path} has {len(rows)} rows below its header; it must have one. Put it right and try again."
-        )
+        raise TacpipeError(f"{path} has {len(rows)} rows below its header; it must have one. Correct it and try again.")
     line, cells = rows[0]
     while len(cells) > len(names) and not cells[-1].strip():
         cells = cells[:-1]
@@ -135,7 +133,7 @@ def _table(path: Path, trailing_comma: bool = False) -> _NumericTable:
 def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
     doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
-        raise TacpipeError(f"{path} has more than one column {listed(doubled, 4)}; each name may stand once.")
+        raise TacpipeError(f"{path} has more than one column {listed(doubled, 4)}; each name must be unique.")
     header_names = set(names)
     missing = [name for name in columns if name not in header_names]
     if missing:

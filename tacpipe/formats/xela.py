@@ -129,7 +129,7 @@ class TrialMeta:
             pass
         problem = f"holds {excerpt(cell)}" if cell else "is missing or empty"
         raise TacpipeError(
-            f"{self.path}, column {name} {problem}; it must be {expected}. Put the file right and try again."
+            f"{self.path}, column {name} {problem}; it must be {expected}. Correct the file and try again."
         )
 
 

@@ -38,7 +38,7 @@ def load_yaml(content: str | bytes) -> Any:
                     key = self.construct_object(key_node)
                     if key in keys:
                         raise yaml.constructor.ConstructorError(
-                            None, None, f"the key {key_node.value} stands twice", key_node.start_mark
+                            None, None, f"the key {key_node.value} occurs twice", key_node.start_mark
                         )
                     keys.add(key)
             return super().construct_mapping(node, deep)
@@ -73,7 +73,7 @@ def _refuse_large(events: Any) -> None:
             anchor, size = event.anchor, 1
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor in (name for name, _ in open_nodes):
-                raise ValueError(f"the alias {plain(str(event.anchor))} stands within what it names")
+                raise ValueError(f"the alias {plain(str(event.anchor))} is part of its own value")
             size = sizes.get(str(event.anchor), 1)
         if size:
             open_nodes[-1] = open_nodes[-1][0], open_nodes[-1][1] + size

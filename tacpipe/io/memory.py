@@ -116,8 +116,8 @@ def _shortage_error(need: str) -> ShortageError:
         f", of the {_megabytes(resource.getrlimit(resource.RLIMIT_AS)[0])} that `ulimit -v` allows" if limited() else ""
     )
     return ShortageError(
-        f"This command needs more memory than there is: {need}; {_megabytes(available())} are left{limit}. What was "
-        f"finished is kept: run the same command again with more, or with a smaller --jobs."
+        f"This command needs more memory than there is: {need}; {_megabytes(available())} are left{limit}. Finished "
+        f"results are kept: run the same command again with more, or with a smaller --jobs."
     )
 
 

@@ -190,7 +190,7 @@ def _open(path: Path | str, *, follow: bool) -> tuple[int, int]:
 def _expect_size(path: Path | str, size: int, max_bytes: int | None, *, in_memory: bool = True) -> None:
     if max_bytes is not None and size > max_bytes:
         raise IrregularError(
-            f"{path} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged or was made up; remove it."
+            f"{path} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged or forged. Remove it."
         )
     if in_memory:
         memory.require(size, str(path), error=StorageError)

@@ -35,7 +35,8 @@ def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
         camera.start_capture()
     except RuntimeError as error:
         raise DeviceError(
-            f"{name}: the RealSense {serial} does not start; end what else uses it, and put it on a USB 3 port."
+            f"{name}: the RealSense {serial} does not start; stop other programs that use it, and connect it to a "
+            f"USB 3 port."
         ) from error
     return CameraLink(name, camera)
 

@@ -121,7 +121,7 @@ class HidLink(Opened):
         except (OSError, ValueError) as error:
             raise self.lost(f"it was unplugged ({error})") from error
         if sent < 0:
-            raise self.lost("it takes no report")
+            raise self.lost("it accepts no report")
 
     def _release(self) -> None:
         self.device.close()

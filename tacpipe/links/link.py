@@ -169,7 +169,7 @@ class Opened:
         raise NotImplementedError
 
     def _send(self, data: bytes) -> None:
-        raise DeviceError(f"{self.name} cannot be written to; take a sensor there that needs no word from us.")
+        raise DeviceError(f"{self.name} cannot be written to. Use a sensor that needs no commands.")
 
     def _wake(self) -> None:
         """Make a waiting reader return, where that is possible."""
@@ -204,7 +204,7 @@ class Descriptor(Opened):
                 remaining = remaining[os.write(self._fileno, remaining) :]
             except BlockingIOError:
                 if time.monotonic() - start_s > WRITE_S:
-                    raise self.lost(f"it took no byte for {WRITE_S:g} s") from None
+                    raise self.lost(f"it accepted no byte for {WRITE_S:g} s") from None
                 select.select([], [self._fileno], [], 0.1)
             except OSError as error:
                 raise self.lost(error.strerror or str(error)) from error

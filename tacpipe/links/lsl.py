@@ -55,8 +55,8 @@ def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
         inlet.open_stream(OPEN_S)
     except (pylsl.util.LostError, pylsl.util.TimeoutError, TimeoutError, RuntimeError) as error:
         raise DeviceError(
-            f"{name}: the outlet was found, and does not open within {OPEN_S:g} s; check that its program still runs, and "
-            "that no firewall keeps its ports (TCP and UDP 16572 to 16604) from this computer."
+            f"{name}: the outlet exists, but does not open within {OPEN_S:g} s; check that its program still runs, "
+            "and that no firewall blocks its ports (TCP and UDP 16572 to 16604)."
         ) from error
     return LslLink(name, inlet, _checked(text, sensor, name), pylsl)
 

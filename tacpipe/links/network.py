@@ -139,7 +139,7 @@ def bind_port(host: str, port: int, name: str) -> socket.socket:
         port_socket.close()
         if error.errno == errno.EADDRINUSE:
             users = ports.describe_holders(ports.holders_of_port("udp", port))
-            raise DeviceError(f"{name}: UDP port {port} is held by {users}; end it, or take another port.") from error
+            raise DeviceError(f"{name}: UDP port {port} is in use by {users}; end it, or take another port.") from error
         if error.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
                 f"{name}: {host} is not an address of this computer; listen on one of its own, or on all with udp::{port}."
@@ -271,7 +271,7 @@ class UdpLink(Descriptor):
     def _send(self, data: bytes) -> None:
         if not self._talks and self._sender is None:
             raise DeviceError(
-                f"{self.name}: nothing came there yet, so nobody can be answered; start the sender first."
+                f"{self.name}: nothing has arrived yet, so the address of the sender is unknown. Start the sender first."
             )
         try:
             if self._talks:

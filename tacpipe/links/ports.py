@@ -237,7 +237,7 @@ def _cause(error: OSError) -> OSError:
 
 def _busy(place: str, users: list[str], name: str) -> DeviceError:
     return DeviceError(
-        f"{name}: {place} is held by {describe_holders(users)}; end it, because two readers share no bytes."
+        f"{name}: {place} is in use by {describe_holders(users)}; end it, because two readers share no bytes."
     )
 
 

@@ -52,7 +52,7 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
     except (WebSocketException, TimeoutError, OSError, EOFError) as error:
         wire.close()
         raise DeviceError(
-            f"{name}: what answers at {host} port {port} is not a websocket ({error or type(error).__name__}); check "
+            f"{name}: the server at {host} port {port} is not a websocket ({error or type(error).__name__}); check "
             "the port."
         ) from error
     return WebsocketLink(name, connection)

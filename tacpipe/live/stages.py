@@ -75,8 +75,8 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
     """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
     if set(recording.streams) == {""}:
         raise UsageError(
-            "this recording went through a stage already, and what had arrived when cannot be seen from it. Give the "
-            "recordings themselves; the model's own stages are run on them."
+            "this recording already went through a stage, so the arrival of its samples is unknown. Give the "
+            "original recordings; the model's own stages run on them."
         )
     return {name: recording.table(name) for name in recording.streams}
 

@@ -63,7 +63,9 @@ class Blocks:
         while place + HEAD.size <= len(self._text):
             mark, _, kind, number, _, count, size = HEAD.unpack_from(self._text, place)
             if mark != MARK:
-                raise TacpipeError("The recording process sent what is not a block; do both run the same tacpipe?")
+                raise TacpipeError(
+                    "The recording process sent invalid data. Check that both run the same version of tacpipe."
+                )
             stop = place + HEAD.size + size
             if stop > len(self._text):
                 break

@@ -208,7 +208,7 @@ def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
         yield block
     if count != size:
         raise DamagedError(
-            f"{path} has {count:,} bytes, and its manifest declares {size:,}: the manifest was edited or made up. Run the "
+            f"{path} has {count:,} bytes, and its manifest declares {size:,}, so the manifest was edited or forged. Run the "
             f"stage that made it again."
         )
 

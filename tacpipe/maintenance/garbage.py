@@ -92,8 +92,8 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
     if damaged:
         raise DamagedError(
             f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
-            f"removed. `tacpipe store repair` finds those next to the store, and the commands that wrote the others write "
-            f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
+            f"removed. `tacpipe store repair` restores those next to the store, and rerunning the commands restores "
+            f"the others. To give up a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
     doubtful = _doubtful(store)
     needed.doubtful = set(doubtful)
@@ -293,7 +293,7 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
         raise
     except TacpipeError as error:
         raise DamagedError(
-            f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."
+            f"{error} Its dependencies are unknown, so nothing was removed; `tacpipe store repair` may restore it."
         ) from None
     return dataset
 

@@ -131,9 +131,10 @@ def refuse_newer(there: AnyStore, before: Root, seen: Collection[str | None], na
         return
     date = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
     raise UsageError(
-        f"{there.place} holds another {name} than this project has had here: {manifest[:12]}, pushed on {date}. `tacpipe "
-        f"store checkout {manifest[:12]} --remote {there.place} -o DIRECTORY` brings it; --replace pushes all the same, and "
-        f"keeps it as an earlier snapshot."
+        f"{there.place} holds another {name} than this project had here: {manifest[:12]}, pushed on {date}. `tacpipe "
+        f"store checkout {manifest[:12]} --remote {there.place} -o DIRECTORY` writes it to a directory. --replace "
+        f"pushes anyway, "
+        f"and keeps it as an earlier snapshot."
     )
 
 

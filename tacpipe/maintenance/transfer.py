@@ -187,7 +187,9 @@ def _publish_name(
             break
         before = _predecessor(target, local_store, dataset, owner, name, replace=replace)
     else:
-        raise TacpipeError(f"{name} is pushed to {target.place} by others all the time. Run the same command again.")
+        raise TacpipeError(
+            f"{name} is pushed to {target.place} by other commands again and again. Run the same command again later."
+        )
     _expect_kept(target, name, owner, dataset.digest)
 
 
@@ -215,8 +217,8 @@ def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> 
     root = target.roots.pushed(name, owner.id)
     if root is None or manifest not in pushed.manifests(root):
         raise TacpipeError(
-            f"Another push of {name} to {target.place} ended at the same time and wrote over this one: there are no locks. "
-            f"Run the same command again, and one push at a time."
+            f"Another push of {name} to {target.place} ended at the same time and replaced this one, because there are no "
+            f"locks. Run the same command again, one push at a time."
         )
 
 

@@ -314,7 +314,7 @@ def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
     first, second = np.asarray(first_correct, bool), np.asarray(second_correct, bool)
     if first.shape != second.shape or first.ndim != 1:
         raise TacpipeError(
-            f"Answers of {first.shape} and {second.shape} cannot be compared; give who is right on the same slides."
+            f"Answers of {first.shape} and {second.shape} cannot be compared; give the correct answers on the same slides."
         )
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
     if only_first + only_second == 0:
@@ -338,7 +338,7 @@ def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArr
     before, after = np.asarray(first, np.float64), np.asarray(second, np.float64)
     if before.shape != after.shape or before.ndim != 1 or len(before) < 2:
         raise TacpipeError(
-            f"Values of {before.shape} and {after.shape} are not two or more pairs; give as many of both, two at least."
+            f"Values of {before.shape} and {after.shape} are not two or more pairs; give equally many of both, at least two."
         )
     differences = np.round(after - before, 12)  # accuracies that differ alike shall not differ by rounding
     mean, error = float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(before)))

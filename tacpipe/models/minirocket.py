@@ -56,7 +56,7 @@ class Rocket:
         """
         _check(x)
         if features < KERNELS:
-            raise TacpipeError(f"{features} features do not go round {KERNELS} kernels; ask for {KERNELS} or more.")
+            raise TacpipeError(f"{features} features are too few for {KERNELS} kernels; use {KERNELS} or more.")
         slides, frames, channels = x.shape
         rng = np.random.default_rng(seed)
         dilations, counts_per_kernel = _dilations(frames, features // KERNELS)

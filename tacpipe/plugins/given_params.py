@@ -169,7 +169,7 @@ def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
         raise UsageError(f"{path} cannot be read: {error}.") from error
     for part in block.split("."):
         if not isinstance(content, dict):
-            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(content)}, which is not a mapping.")
+            raise UsageError(f"{path}: {part} of block {block} is in {excerpt(content)}, which is not a mapping.")
         if part not in content:
             if required:
                 raise UsageError(f"{path} has no block {block}; at {part} there are {listed(content)}.")

@@ -105,7 +105,7 @@ def _raise_empty(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
     received = sum(stream.received for stream in sealed.values())
     if not received and not spooled.damage:
         spooled.remove()
-        raise NothingError(f"No stream gave a single byte ({', '.join(sealed)}), so there is no recording.")
+        raise NothingError(f"No stream sent any data ({', '.join(sealed)}), so there is no recording.")
     spoiled = sum(damage.bytes for damage in spooled.damage)
     raise TacpipeError(
         f"{received:,} bytes came from {', '.join(sealed)} and hold no sample; {spoiled:,} more are spoiled. "
@@ -123,7 +123,7 @@ def existing(output: Path) -> Manifest | None:
     manifest = manifest_of.find(output).manifest
     if manifest.stage != ACQUIRE:
         raise UsageError(
-            f"{output} was made by {manifest.stage}, and acquire appends to acquired recordings alone. Give -o another "
+            f"{output} was made by {manifest.stage}, and acquire appends only to acquired recordings. Give -o another "
             f"directory; later stages read several datasets as one."
         )
     return manifest

@@ -113,7 +113,7 @@ def _stream(table: Mapping[str, Any], source: str) -> RigStream:
     name = table["name"]
     if not NAME.fullmatch(name) or name in RESERVED:
         raise UsageError(
-            f"{source}: {excerpt(name)} cannot name a stream; take small letters, digits and _, 64 at most, and "
+            f"{source}: {excerpt(name)} cannot name a stream; use lower-case letters, digits and _, 64 at most, and "
             f"neither of {', '.join(RESERVED)}."
         )
     kind, options, emulate = table["sensor"], _table(table, "options", source), _table(table, "emulate", source)

@@ -170,7 +170,7 @@ class Spool:
                 remaining = remaining[os.write(self._file, remaining) :]
         except OSError as error:
             raise TacpipeError(
-                f"The disk takes nothing more of the recording ({error.strerror}), so it ended. What came until then is in "
+                f"The disk accepts no more data of the recording ({error.strerror}), so it ended. The data so far are in "
                 f"{self.folder}; {RECOVER}."
             ) from error
 
@@ -247,7 +247,9 @@ class Spooled:
             self.header: dict[str, Any] = json.loads(content)
             self.streams: list[str] = [str(name) for name in self.header["streams"]]
         except FileNotFoundError:
-            raise TacpipeError(f"The spool {folder} has no header: its process ended before it recorded.") from None
+            raise TacpipeError(
+                f"The spool {folder} has no header: its process ended before it recorded anything."
+            ) from None
         except (OSError, ValueError, LookupError, TypeError, RecursionError, OverflowError) as error:
             raise TacpipeError(
                 f"The spool {folder} has no readable header ({error}): its recording ended before it began. "
@@ -349,7 +351,7 @@ class Spooled:
             regular.require(path, status.st_mode)
             if self._owners is not None and status.st_uid not in self._owners:
                 raise TacpipeError(
-                    f"{path} belongs to another user ({spool_folders.user(status.st_uid)}), who alone can seal it."
+                    f"{path} belongs to another user ({spool_folders.user(status.st_uid)}). Only this user can seal it."
                 )
         except BaseException:
             file.close()

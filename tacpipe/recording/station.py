@@ -131,7 +131,7 @@ class Station:
 
         self._orders.append(order)
         if not finished.wait(TARE_S):
-            raise DeviceError(f"Stream {name} could not be tared: its link is lost. Wait until it is back.")
+            raise DeviceError(f"Stream {name} could not be tared, because its link is lost. Wait until it returns.")
         if failed:
             raise failed[0]
         return True

@@ -58,7 +58,9 @@ def recording_name(name: str | None) -> str:
     """Return the name of a recording, by default the current time. Raises `UsageError` for an invalid file name."""
     name = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     if not NAME.fullmatch(name) or not spool_folders.is_name(name):
-        raise UsageError(f"--name {name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
+        raise UsageError(
+            f"--name {name!r} is not a valid file name. Use letters, digits, _, - and dots, without a dot in front."
+        )
     return name
 
 

@@ -60,7 +60,7 @@ def keys() -> Iterator[Keys]:
         waiting = waiting[count:]
         if must and closed and not is_pressed:
             raise UsageError(
-                "No key can be pressed: standard input is closed or at its end. Run it in a terminal, or start by time, "
+                "Keys cannot be read, because standard input is closed. Run the command in a terminal, or start by time, "
                 "contact or tap."
             )
         return is_pressed
@@ -93,7 +93,8 @@ class ContactTrigger:
         self._channels = {name: np.array(places) for name, places in tactile.items() if places}
         if not self._channels:
             raise UsageError(
-                "No stream of this rig has tactile channels, so no contact can be seen. Start and stop by key, time or tap."
+                "No stream of this rig has tactile channels, so contact cannot be detected. Start and stop by key, "
+                "time or tap."
             )
         self._watches, self._threshold = watches, threshold
         self._touched_s: float | None = None

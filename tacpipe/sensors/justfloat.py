@@ -58,7 +58,7 @@ class JustFloat(Sensor):
         for name in self.names:
             if not NAME.fullmatch(name) or self.names.count(name) > 1:
                 raise UsageError(
-                    f"justfloat: {name!r} cannot name a channel; take small letters, digits and _, and each name once."
+                    f"justfloat: {name!r} cannot name a channel; use lower-case letters, digits and _, and each name once."
                 )
         if self.names and self.channels not in (0, len(self.names)):
             raise UsageError(

@@ -147,7 +147,7 @@ def places(numbers: Iterable[Number], begin: int, order: Order) -> dict[str, Pla
     by_name: dict[str, Place] = {}
     for number in numbers:
         if not NAME.fullmatch(number.name):
-            _refuse(f"{number.name!r} cannot name a number; take small letters, digits and _")
+            _refuse(f"{number.name!r} cannot name a number; use lower-case letters, digits and _")
         if number.name in by_name:
             _refuse(f"two numbers are named {number.name}; names must be unique")
         if not 1 <= number.count <= 4096:

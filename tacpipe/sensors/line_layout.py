@@ -113,7 +113,9 @@ def layout_cells(columns: tuple[LineColumn, ...]) -> tuple[LineCell, ...]:
     for column in columns:
         for cell in _expanded(column):
             if not NAME.fullmatch(cell.name):
-                _refuse(f"{cell.name!r} cannot name a column; take small letters, digits and _, as in taxel{{1..16}}")
+                _refuse(
+                    f"{cell.name!r} cannot name a column; use lower-case letters, digits and _, as in taxel{{1..16}}"
+                )
             if cell.name in by_name:
                 _refuse(f"two columns are named {cell.name}; names must be unique")
             by_name[cell.name] = cell

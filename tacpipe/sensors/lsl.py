@@ -53,7 +53,8 @@ class Lsl(Sensor):
         for name in names:
             if lsl.identifiers([name]) != [name] or name in TAKEN or names.count(name) > 1:
                 raise UsageError(
-                    f"lsl: {name!r} cannot name a channel; take small letters, digits and _, each name once, and none of "
+                    f"lsl: {name!r} cannot name a channel; use lower-case letters, digits and _, each name once, "
+                    f"and none of "
                     f"{', '.join(TAKEN)}."
                 )
         if not 0 <= self.rate_hz < float("inf"):

@@ -65,7 +65,7 @@ class TfMini(Sensor):
             )
         if self.model == "original" and (self.rate_hz != 100 or self.unit != "cm"):
             raise UsageError(
-                f"tfmini: the original is asked for {self.rate_hz:g} Hz in {self.unit}; it gives 100 Hz in cm alone."
+                f"tfmini: the original is set to {self.rate_hz:g} Hz in {self.unit}; it gives only 100 Hz in cm."
             )
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - round(1000 / self.rate_hz)) > 1e-6 * self.rate_hz:
             raise UsageError(

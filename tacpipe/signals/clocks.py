@@ -94,15 +94,15 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
     """
     if len(device_ns) != len(arrival_ns) or not len(device_ns):
         raise TacpipeError(
-            f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals are not a clock to fit; there must be as many "
-            "of both, and one at least."
+            f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals do not define a clock; give equally many "
+            "of both, at least one."
         )
     if certain is not None and certain.any() and not certain.all():
         rows = np.flatnonzero(certain)
         return _spread(fit_clock(device_ns[rows], arrival_ns[rows]), rows, len(device_ns))
     if len(device_ns) > 1 and not np.any(device_ns != device_ns[0]):
         raise TacpipeError(
-            f"The device's clock stands still at {device_ns[0]} ns in all {len(device_ns)} rows. "
+            f"The device's clock stays at {device_ns[0]} ns in all {len(device_ns)} rows. "
             "Leave t_device_ns out, or use the time of arrival (`--clock arrival`)."
         )
     edges = [0, *clock_steps(device_ns, arrival_ns), len(device_ns)]

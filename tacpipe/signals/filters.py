@@ -60,7 +60,7 @@ def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
     """
     if not 0 < cutoff_hz < rate_hz / 2:
         raise TacpipeError(
-            f"A cutoff of {cutoff_hz:g} Hz cannot be had at {rate_hz:g} samples a second; it must lie above 0 and below "
+            f"A cutoff of {cutoff_hz:g} Hz is impossible at {rate_hz:g} samples a second; it must lie above 0 and below "
             f"half the rate, {rate_hz / 2:g} Hz."
         )
     warped = float(np.tan(np.pi * cutoff_hz / rate_hz))

@@ -196,4 +196,4 @@ def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
 
 def _require_samples(t_ns: Times) -> None:
     if not len(t_ns):
-        raise TacpipeError("A signal without samples has no value anywhere; leave the stream out or record it again.")
+        raise TacpipeError("A signal has no samples. Leave the stream out, or record it again.")

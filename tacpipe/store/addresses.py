@@ -85,7 +85,7 @@ def parsed(text: str) -> BucketAddress | Path:
     path = location.rstrip("/")
     if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown, because it may contain a password
         raise UsageError(
-            f"An address of a store is {scheme}://BUCKET/FOLDER, of letters, digits and ._=+,- alone. Credentials belong in "
+            f"An address of a store is {scheme}://BUCKET/FOLDER with letters, digits and ._=+,- only. Credentials belong in "
             f"the environment or in a profile, never in an address."
         )
     if scheme == "az" and "/" not in path:

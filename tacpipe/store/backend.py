@@ -96,7 +96,7 @@ def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes
         answers.append(answer)
     if answers[0] != answers[1]:
         raise StorageError(
-            f"{files.place} gives {name} with other content each time, so whether it is damaged is unknown. Check the "
+            f"{files.place} returns different content for {name} each time, so damage cannot be determined. Check the "
             f"connection and the server, then run the same command again."
         )
     return None

@@ -103,8 +103,8 @@ class Bucket:
                 f"{self.place} answers 404 Not Found to an upload. Check the address and AWS_ENDPOINT_URL."
             ) from None
         raise StorageError(
-            f"{self.place} refuses to create {name} as if it existed, and does not have it. Run the same command again: "
-            f"what went over stays there."
+            f"{self.place} refuses to create {name} as if it existed, but does not have it. Run the same command "
+            f"again; uploaded objects stay."
         )
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
@@ -127,7 +127,7 @@ class Bucket:
         if max_bytes is not None and size > max_bytes:
             raise regular.IrregularError(
                 f"{self.place}/{name} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged "
-                f"or was made up."
+                f"or forged."
             )
         if max_bytes is None:
             memory.require(size, f"{self.place}/{name}", error=StorageError)

@@ -357,7 +357,9 @@ class CachedStore(Store):
                 if roots.push(name, project, manifest, root, lasting=lasting, output=True):
                     return
                 root = roots.pushed(name, project["id"])
-        raise TacpipeError(f"{name} is written to {self.place} by others all the time. Run the same command again.")
+        raise TacpipeError(
+            f"{name} is written to {self.place} by other commands again and again. Run the same command again later."
+        )
 
     def _complete(self, sizes: Mapping[str, int]) -> None:
         """Upload announced objects that the bucket lacks. Raises `MissingError` if one is missing in the cache too.

@@ -57,7 +57,9 @@ def object_name(name: str) -> str:
     Raises `DamagedError` if the name is not a digest, because it could lead out of the store.
     """
     if not DIGEST.fullmatch(name):
-        raise DamagedError(f"{name[:80]!r} is not a digest (64 hex digits): what names it is damaged or was made up.")
+        raise DamagedError(
+            f"{name[:80]!r} is not a digest (64 hex digits): the file that names it is damaged or forged."
+        )
     return f"objects/{name[:2]}/{name}"
 
 
@@ -86,8 +88,8 @@ def check(root: Path) -> bool:
         for name in _FORMS:
             if _is_link(root / name):
                 raise UsageError(
-                    f"{root / name} is a symbolic link, and none is followed within a store. To keep a store on another "
-                    f"disk, move the whole of {root} there and make that a link, or name it in TACPIPE_STORE."
+                    f"{root / name} is a symbolic link, and none is followed within a store. To keep a store on "
+                    f"another disk, move {root} there and link to it, or set TACPIPE_STORE."
                 )
     return mark is not None
 
@@ -174,7 +176,7 @@ def _mark(root: Path) -> str | None:
         if root.is_symlink() and not root.exists():
             target = os.readlink(root)  # noqa: PTH115
             raise UsageError(
-                f"The store {root} is a symbolic link to {target}, which is not there. Mount its disk, or remove the link."
+                f"The store {root} is a symbolic link to {target}, which does not exist. Mount its disk, or remove the link."
             ) from None
         return None
     except NotADirectoryError:

@@ -148,7 +148,7 @@ class Leases:
         path = self.folder / f"{work}.lock"
         handle = _try_lock(path)
         if handle is None:
-            raise LockedError(f"{_holder(path)} is at work on `tacpipe store {work}` already. Wait for it.")
+            raise LockedError(f"{_holder(path)} already runs `tacpipe store {work}`. Wait for it.")
         try:
             with contextlib.suppress(OSError):
                 os.pwrite(handle, note(what=work), 0)
@@ -179,7 +179,9 @@ class Announcing:
                 try:
                     self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
                 except FileNotFoundError:
-                    raise TacpipeError("The process that began this run is gone; nothing more is written.") from None
+                    raise TacpipeError(
+                        "The process that started this run has ended, so nothing more is written."
+                    ) from None
             write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
         self._parsed.update(new)
 

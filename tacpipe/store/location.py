@@ -122,8 +122,8 @@ def _refuse_other_owner(root: Path) -> None:
     owner = _other_owner(root)
     if owner is not None:
         raise UsageError(
-            f"The store {root} belongs to another user (id {owner}; yours is {os.geteuid()}). Whoever owns a store can "
-            f"change the results in it. Set TACPIPE_STORE={root} to use it nevertheless."
+            f"The store {root} belongs to another user (id {owner}; yours is {os.geteuid()}). The owner of a store "
+            f"can change its results. Set TACPIPE_STORE={root} to use it anyway."
         )
 
 

@@ -327,7 +327,7 @@ class Look:
         finally:
             draft.unlink(missing_ok=True)
         if before is None or after is None or before == after or after[-1] < now_ns - SETTLED_NS:
-            raise TacpipeError(f"The file system of {folder} gives a folder no time for each change.")
+            raise TacpipeError(f"The file system of {folder} does not update the time of a folder with each change.")
         return now_ns
 
 

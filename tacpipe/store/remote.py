@@ -94,7 +94,8 @@ class RemoteStore:
         self.files.delete(tried)
         if replaced:
             raise UsageError(
-                f"The server of {self.place} writes over what is there although it is asked not to (If-None-Match: *), so "
+                f"The server of {self.place} replaces existing objects although the request forbids it "
+                f"(If-None-Match: *), so "
                 f"pushes could replace each other. Use one that supports conditional writes."
             )
 
@@ -112,8 +113,8 @@ class RemoteStore:
             yield
             if any(self.files.stat(name) is None for name in self._leases):
                 raise TacpipeError(
-                    f"A collection in {self.place} took this command for one that was killed long ago, and may have removed "
-                    f"what was there already. Run the same command again."
+                    f"A collection in {self.place} mistook this command for a killed one, and may have removed "
+                    f"its objects. Run the same command again."
                 )
         finally:
             with contextlib.suppress(TacpipeError):  # a later collection removes the remaining files
@@ -295,7 +296,8 @@ class RemoteStore:
                 return existing
             self.files.delete(layout.record_name(key))
         raise TacpipeError(
-            f"Others replace the record {key[:12]} in {self.place} all the time. Run the same command again."
+            f"Other commands replace the record {key[:12]} in {self.place} again and again. Run the same command "
+            f"again later."
         )
 
     def record(self, key: str) -> Record | None:

@@ -116,7 +116,7 @@ def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypat
     printed = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
     assert printed == rows(lab.run("candidates bottle.ply --count 3").out)
     for words, sentence in (
-        ("", "has 2 recordings; pick one with --recording: bleach-1, bleach-2"),
+        ("", "has 2 recordings. Choose one with --recording: bleach-1, bleach-2"),
         ("--recording wood-1", "no recording wood-1"),
         ("--recording bleach-2", "has no cloud; it has the streams grasp"),
     ):
@@ -129,7 +129,7 @@ def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypat
     [
         ("nowhere.ply", "no file nowhere.ply"),
         ("nowhere", "nowhere does not exist or is empty"),
-        ("bottle.ply --recording a", "--recording a picks one of a dataset"),
+        ("bottle.ply --recording a", "--recording a selects from a dataset"),
         ("bottle.ply -o grasps.xlsx", "grasps.xlsx must end in .csv"),
         ("bottle.ply --picture grasps.doc", ".pdf, .png, .svg"),
         ("bottle.ply --count 0", "0 candidates"),

@@ -99,7 +99,7 @@ def test_a_view_without_a_table_is_refused_with_what_was_found() -> None:
 def test_a_grasp_beside_all_things_is_refused_with_the_distance() -> None:
     view = scene()
     grasp = view.grasp.moved(np.eye(3), 0.2 * view.normal)
-    with pytest.raises(TacpipeError, match=r"2 things.*nearest is 1\d\d\.\d mm"):
+    with pytest.raises(TacpipeError, match=r"2 objects.*nearest is 1\d\d\.\d mm"):
         object_rows(view.cloud, grasp, LIMITS)
 
 
@@ -113,5 +113,5 @@ def test_an_object_that_has_grown_together_with_what_is_beside_it_is_refused_wit
 
 def test_an_empty_table_is_told() -> None:
     view = scene()
-    with pytest.raises(TacpipeError, match="Nothing stands on the table"):
+    with pytest.raises(TacpipeError, match="No object is on the table"):
         object_rows(part(view, ~(view.ball | view.box)), view.grasp, LIMITS)

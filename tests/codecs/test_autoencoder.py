@@ -216,8 +216,8 @@ def test_as_many_latents_as_the_data_have_dimensions_lose_no_more_than_principal
     [
         ({"frames": 4}, "frames is 4; an autoencoder reads 1, 2 or 3 frames"),
         ({"frames": 0}, "frames is 0"),
-        ({"search": 13}, "search is 13; it is how many networks to try, 1 to 12"),
-        ({"search": 3, "hidden": "64"}, "Give one of them"),
+        ({"search": 13}, "search is 13; it must be the number of networks to try, 1 to 12"),
+        ({"search": 3, "hidden": "64"}, "Give only one of them"),
         ({"hidden": "64,a"}, "hidden is '64,a'"),
         ({"hidden": "64,,32"}, "Leave it empty"),
         ({"hidden": "64,0"}, "whole numbers above 0"),
@@ -236,8 +236,8 @@ def test_what_makes_no_network_is_refused(options: dict[str, object], reason: st
         ({"a": 60, "b": 60}, 13, "components is 13; 12 channels give 1 to 12"),
         ({"a": 60, "b": 60}, 0, "components is 0"),
         ({"a": 60}, 4, "at least 2 training recordings and there is 1"),
-        ({"a": 1, "b": 1}, 4, "cannot be fitted on 1 rows and stopped by 1"),
-        ({"a": 0, "b": 0}, 4, "cannot be fitted on 0 rows"),
+        ({"a": 1, "b": 1}, 4, "cannot be fitted to 1 rows and stopped by 1"),
+        ({"a": 0, "b": 0}, 4, "cannot be fitted to 0 rows"),
     ],
 )
 def test_what_the_recordings_cannot_give_is_refused(

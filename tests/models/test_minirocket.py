@@ -125,7 +125,7 @@ def test_the_seed_decides_and_tensors_hold_everything(fitted: Rocket) -> None:
 def test_slides_that_cannot_be_transformed_say_why(fitted: Rocket) -> None:
     with pytest.raises(TacpipeError, match="with 9 frames or more"):
         Rocket.fit(slides(3, frames=8))
-    with pytest.raises(TacpipeError, match="83 features do not go round 84 kernels"):
+    with pytest.raises(TacpipeError, match="83 features are too few for 84 kernels"):
         Rocket.fit(slides(3), features=83)
     with pytest.raises(TacpipeError, match=r"\(slide, 41, 3\) was fitted"):
         fitted.transform(slides(2, channels=4))

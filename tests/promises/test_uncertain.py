@@ -179,4 +179,6 @@ def test_a_dataset_that_is_relinked_while_it_is_read_is_read_as_it_was_at_first(
 
 def test_a_fit_of_which_nothing_is_stored_cannot_be_compared(uncertain: Specimen) -> None:
     compared = uncertain.lab.call("fitted data/scaled --split data/split -o data/u --recompute-and-compare")
-    assert compared.code == 2 and "Nothing is stored of fitted.fit" in compared.err and not Path("data/u").exists()
+    assert (
+        compared.code == 2 and "There is no stored result of fitted.fit" in compared.err and not Path("data/u").exists()
+    )

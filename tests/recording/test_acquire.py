@@ -162,10 +162,10 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
         ("-o rec --start bell", "There is no --start bell; it must be one of now, key, contact, tap."),
         ("-o rec --stop bell", "There is no --stop bell; it must be one of duration, key, contact, tap."),
         ("-o rec --trials 0", "--trials and --duration-s must be above 0."),
-        ("-o rec --trials 2", "--trials needs --duration-s or --stop, or the first trial never ends."),
+        ("-o rec --trials 2", "--trials needs --duration-s or --stop, because otherwise the first trial never ends."),
         (
             "-o rec --name ../out",
-            "--name '../out' names no file; take letters, digits, _, - and dots, no dot in front.",
+            "--name '../out' is not a valid file name. Use letters, digits, _, - and dots, without a dot in front.",
         ),
         ("-o rec --label cork", "--label cork should read name=value, as in --label material=foam."),
     ],

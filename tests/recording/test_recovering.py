@@ -229,8 +229,8 @@ def test_a_disk_that_is_full_while_it_records_ends_it_with_a_sentence_and_what_c
 
     assert ran.code == 1 and not (lab.folder / "rec").exists()
     assert without_created_store(ran.err) == (
-        f"tacpipe: The disk takes nothing more of the recording (No space left on device), so it ended. What came until "
-        f"then is in {folder}; free some space, and `tacpipe acquire --recover` seals it.\n"
+        f"tacpipe: The disk accepts no more data of the recording (No space left on device), so it ended. The data so "
+        f"far are in {folder}; free some space, and `tacpipe acquire --recover` seals it.\n"
     )
     assert lab.run("acquire --recover").err.startswith("recovered one: ")
     rows = live.recorded(live.only(lab.folder), "force")

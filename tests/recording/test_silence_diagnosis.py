@@ -85,7 +85,7 @@ def test_a_port_that_another_program_holds_is_told_with_that_program(lab: Lab, s
         (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
         holder.stdin.close()
 
-    about = re.escape(f"Stream force (serial:{silent}): {silent} is held by ")
+    about = re.escape(f"Stream force (serial:{silent}): {silent} is in use by ")
     assert re.fullmatch(rf"{about}.+ \(process {holder.pid}\).*; end it, because two readers share no bytes\.", message)
 
 

@@ -162,7 +162,7 @@ def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypa
 
     mine = spool_folders.user(folder.stat().st_uid)
     for spool in (folder, unfinished):
-        assert f"The spool {spool} belongs to {mine}, who alone can seal it.\n" in ran.err
+        assert f"The spool {spool} belongs to {mine}. Only this user can seal it.\n" in ran.err
         assert (spool / "bytes").exists()
     assert not (lab.folder / "rec").exists()
 
@@ -173,7 +173,7 @@ def test_a_file_of_another_user_in_ones_own_spool_is_refused(lab: Lab, name: str
     folder = spooled(lab)
     os.chown(folder / name, 12345, -1)
 
-    assert f"{folder / name} belongs to another user (12345), who alone can seal it." in refused(lab, folder)
+    assert f"{folder / name} belongs to another user (12345). Only this user can seal it." in refused(lab, folder)
 
 
 def test_others_cannot_open_a_spool(lab: Lab) -> None:

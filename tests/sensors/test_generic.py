@@ -263,7 +263,7 @@ N = {"name": "n", "type": "u8"}
             {"numbers": [{**V, "count": 2}, {"name": "v01", "type": "u8"}]},
             "two channels are named v01; give the numbers other",
         ),
-        ({"numbers": [{**V, "name": "V 1"}]}, "'V 1' cannot name a number; take small letters, digits and _"),
+        ({"numbers": [{**V, "name": "V 1"}]}, "'V 1' cannot name a number; use lower-case letters, digits and _"),
         ({"numbers": [{**V, "count": 0}]}, "the number v has count = 0; it must be between 1 and 4096"),
         ({"numbers": [{**V, "axes": "xx"}]}, 'the number v has axes = "xx"; it must be a letter each, such as "xyz"'),
         ({"numbers": [V, {**N, "equals": 300}]}, "number n can never be 300, .*u8"),

@@ -92,7 +92,7 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
         return
     if not _is_here(address):
         raise UsageError(
-            f"dask://{address} is another computer's scheduler without TLS, and whoever reaches such a one can run "
+            f"dask://{address} is a scheduler without TLS on another computer. Anyone who reaches it can run "
             f"programs as its user. Start it with TLS and give tls://{address}, or give dask://localhost:PORT of an SSH "
             f"tunnel to it."
         )
@@ -191,7 +191,7 @@ class Dask:
         workers: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
         if not workers:
             raise TacpipeError(
-                f"The scheduler at {self._scheduler} has no worker. Start some, as with `dask worker "
+                f"The scheduler at {self._scheduler} has no worker. Start some, for example with `dask worker "
                 f"{self._scheduler} --nthreads 1`."
             )
         return workers
@@ -213,12 +213,13 @@ class Dask:
                 future.release()
         except KilledWorker as error:
             raise TacpipeError(
-                f"{error.allowed_failures + 1} workers died one after another over the same recordings of {stage}, most "
-                f"likely for lack of memory. What was finished is kept: run the same command again on workers with more."
+                f"{error.allowed_failures + 1} workers died one after another on the same recordings of {stage}, most "
+                f"likely for lack of memory. Finished results are kept: run the same command again on workers with "
+                f"more memory."
             ) from error
         except CancelledError as error:
             raise TacpipeError(
-                f"The scheduler at {self._scheduler} is gone. What was finished is kept: run the same command again."
+                f"The scheduler at {self._scheduler} is gone. Finished results are kept: run the same command again."
             ) from error
         except ModuleNotFoundError as error:
             raise TacpipeError(
@@ -356,7 +357,8 @@ def _check(name: str, versions: Mapping[str, Any], task: WorkerTask) -> None:
     differences = unlike(versions, local_versions(task.name))
     if differences:
         raise UsageError(
-            f"Worker {name} would not compute what this computer does: {'; '.join(differences)}. Install the same there."
+            f"Worker {name} would compute other results than this computer: {'; '.join(differences)}. Install the "
+            f"same there."
         )
     store = opened(task.store)
     if store.distant:  # opened by its address, with this worker's own credentials

@@ -204,7 +204,7 @@ def _death_told() -> Iterator[None]:
         yield
     except (EOFError, OSError) as error:
         raise TacpipeError(
-            "A worker process died, most likely for lack of memory. What was finished is kept: run the same command "
+            "A worker process died, most likely for lack of memory. Finished results are kept: run the same command "
             "again, with a smaller --jobs if it happens again."
         ) from error
 

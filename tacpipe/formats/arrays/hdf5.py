@@ -161,7 +161,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
                 yield tree
             return
         if not size:
-            raise TacpipeError(f"{path} is empty. Copy it again, or take it away.") from error
+            raise TacpipeError(f"{path} is empty. Copy it again, or remove it.") from error
         if "already open for write" in str(error):
             raise TacpipeError(
                 f"{path} was not closed by the program that wrote it, or is still being written. Close it there, or run "

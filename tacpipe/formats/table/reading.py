@@ -126,8 +126,8 @@ def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: Strea
         row = int((encoded.indices.to_numpy() == names.index("")).argmax())
         assert stream.long is not None
         raise TacpipeError(
-            f"{place(row)}, column {plain(stream.long.channel)}: the row names no channel. Fill the cell, or take the row "
-            f"away."
+            f"{place(row)}, column {plain(stream.long.channel)}: the row names no channel. Fill the cell, or remove the "
+            f"row."
         )
     channel_codes = [codes.setdefault(name, len(codes)) for name in names]
     numbers: AnyArray = np.array(channel_codes, np.int32)[encoded.indices.to_numpy()]
@@ -265,7 +265,7 @@ def _check_stamps(
         yield [pa.array(t_ns + start_ns if start_ns else t_ns), *arrays]
     if not row_count:
         place = f" of recording {plain(recording)}" if recording else ""
-        raise TacpipeError(f"{file.path} holds no row{place}. Take it away, or record it again.")
+        raise TacpipeError(f"{file.path} holds no row{place}. Remove it, or record it again.")
 
 
 def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:

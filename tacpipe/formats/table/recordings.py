@@ -192,7 +192,7 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
             odd = sorted(names ^ first)
             raise UsageError(
                 f"{files[stream]} and {files[next(iter(names_by_stream))]} hold different recordings: {listed(odd, 3)} is "
-                f"in one of them alone."
+                f"in only one of them."
             )
     return [
         RecordingFiles(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
@@ -220,7 +220,7 @@ def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
         names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
         if None in names or "" in names:
             raise TacpipeError(
-                f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or take the row away."
+                f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or remove the row."
             )
         names_in_file |= set(names)
     return names_in_file

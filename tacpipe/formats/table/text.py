@@ -124,7 +124,7 @@ class TextTable:
                     f"header = false and skip_lines = 1, after which columns are named column1, column2 and so on."
                 )
             return names
-        raise TacpipeError(f"{self.path} has no row. Take it away, or record it again.")
+        raise TacpipeError(f"{self.path} has no row. Remove it, or record it again.")
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns that ``types`` names, block by block. Raises `TacpipeError`, with the line, for a wrong row."""
@@ -307,7 +307,7 @@ class Workbook:
         with self._rows() as rows:
             first = next(rows, None)
             if first is None:
-                raise TacpipeError(f"{self.path} has no row. Take it away, or record it again.")
+                raise TacpipeError(f"{self.path} has no row. Remove it, or record it again.")
             cells = list(first[1])
             while cells and cells[-1] is None:
                 cells.pop()

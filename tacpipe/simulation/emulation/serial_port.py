@@ -95,7 +95,7 @@ class Pty:
         draft = self.link.with_name(f".{self.link.name}")
         for path in (self.link, draft):
             if not path.is_symlink() and path.exists():  # an emulator makes links alone
-                raise UsageError(f"{path} is there already and no emulator made it. Give -o another folder.")
+                raise UsageError(f"{path} already exists, and no emulator made it. Give -o another folder.")
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)

@@ -108,7 +108,7 @@ def _check(classifier: Classifier, training: BySensor, validation: BySensor) -> 
         digest in seen_digests for slides in validation.values() for digest in slides.digests
     ):
         raise UsageError(
-            "The model learned from these validation slides too, so that they state nothing of its errors. Train it with "
+            "The model was trained on these validation slides, so its errors on them are too small. Train it with "
             "--no-use-validation."
         )
 

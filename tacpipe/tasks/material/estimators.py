@@ -131,7 +131,7 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEs
     except Exception as error:  # a damaged file raises errors of many types
         raise TacpipeError(
             f"{name} is not a file of skops that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
-            f"from whoever made it."
+            f"from its source."
         ) from error
 
 

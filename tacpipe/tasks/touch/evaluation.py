@@ -157,7 +157,7 @@ def _evaluated(
     """Return the result of a model on grasps; ``advance`` moves the bar when they are predicted."""
     if not len(grasps):
         raise TacpipeError(
-            "There is no grasp to evaluate the model on. Give a dataset with recordings of the role asked for."
+            "There is no grasp to evaluate the model on. Give a dataset with recordings of the requested role."
         )
     if predictor.baselines is None:
         raise TacpipeError(

@@ -47,7 +47,7 @@ def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[i
     at = predictor.quantiles_of(quantiles)[1] if quantiles else []
     grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
-        raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
+        raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the requested role.")
     predicted = predictor.predict_grasps(grasps)
     bands = {}
     if quantiles and predictor.quantiles is not None:
@@ -119,7 +119,7 @@ def calibrate(
     seen_digests = set(predictor.config["trained_on"].values())
     if predictor.config["counts"]["val"] == 0 and any(digest in seen_digests for digest in validation_grasps.digests):
         raise UsageError(
-            "The model learned from these validation grasps too, so that they state nothing of its errors. Train it with "
+            "The model was trained on these validation grasps, so its errors on them are too small. Train it with "
             "--no-use-validation."
         )
     levels = np.array(request.quantiles) / 100

@@ -155,7 +155,7 @@ def test_four_recordings_can_promise_the_band_and_three_cannot(
     pooled, _ = evaluated(model, TEST)
     assert promised["quantiles"]["method"] == "promised"
     assert promised["quantiles"]["model"]["width"]["mean"] > pooled["quantiles"]["model"]["width"]["mean"]
-    with pytest.raises(TacpipeError, match="3 calibration recordings can promise a band that holds 75 %"):
+    with pytest.raises(TacpipeError, match="3 calibration recordings can guarantee a band with a coverage of 75 %"):
         calibrated(plain, promise=True, count=3)
 
 

@@ -103,5 +103,5 @@ def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched:
 
 def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
     request = CalibrationRequest(PERCENTS, True, 0.05, 0)
-    with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
+    with pytest.raises(TacpipeError, match="3 calibration grasps can guarantee a band with a coverage of 75 %"):
         touch_model.calibrate(plain, request, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))

@@ -101,8 +101,8 @@ def check(digest: str, recordings: Dataset) -> None:
         ran = recording.attributes.get(MODEL, digest)  # nothing states it in what other programs recorded
         if ran != digest:
             raise UsageError(
-                f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}: what was "
-                f"published is that model's. Give the model that the session ran, or leave --live out to evaluate this one "
+                f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}. Its published "
+                f"values are of that model. Give the model that the session ran, or leave --live out to evaluate this one "
                 f"on the same recordings."
             )
 

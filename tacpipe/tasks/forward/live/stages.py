@@ -38,20 +38,20 @@ def causal_stages(steps: Sequence[Step]) -> CausalStages:
         name = step["stage"]
         if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
             raise TacpipeError(
-                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
-                f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
+                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which cannot run live. Train "
+                f"one behind synchronize, segment contacts and, optionally, compress."
             )
         params_by_stage[name] = stage_params(step)
     missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in params_by_stage]
     if missing:
         raise TacpipeError(
-            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so it is unknown how samples "
-            f"become its rows. Train it on recordings that went through that stage."
+            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so the session cannot compute its "
+            f"rows from samples. Train it on recordings that went through that stage."
         )
     if params_by_stage[CONTACTS].rest != "start":
         raise TacpipeError(
-            f"The model was trained with `segment contacts --rest {params_by_stage[CONTACTS].rest}`, which looks for the "
-            f"rest in the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
+            f"The model was trained with `segment contacts --rest {params_by_stage[CONTACTS].rest}`, which searches the "
+            f"complete recording for the rest level. A session takes it from the start. Train it with --rest start."
         )
     return CausalStages(params_by_stage[SYNCHRONIZE], params_by_stage[CONTACTS])
 

@@ -58,7 +58,8 @@ class ForwardSettings(TaskSettings):
             present, absent = ALARM_KEYS[:2] if self.alarms_per_hour else ALARM_KEYS[1::-1]
             missing = absent if present in settings.places else option(absent)
             raise UsageError(
-                f"{settings.name_in_errors(present)} needs {missing} with it: the levels of alarms are set on recordings, "
+                f"{settings.name_in_errors(present)} also needs {missing}, because thresholds of alarms are set on "
+                f"recordings, "
                 f"as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
             )
         if self.split and not self.alarms_on:

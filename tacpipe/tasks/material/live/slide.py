@@ -51,14 +51,15 @@ def slide_params(steps: Sequence[Step]) -> Any:
     if names != [SLIDES]:
         commands = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
         raise TacpipeError(
-            f"The model was trained behind {commands}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
+            f"The model was trained behind {commands}, but a session cuts slides with `tacpipe segment slides` "
+            f"only. Train it "
             f"on recordings that went through that stage."
         )
     params_found = stage_params(steps[0])
     if params_found.trigger == "load" and params_found.rest != "start":
         raise TacpipeError(
-            f"The model was trained with `segment slides --rest {params_found.rest}`, which looks for the rest in the whole "
-            f"recording; samples as they arrive have the rest at their start. Train it with --rest start."
+            f"The model was trained with `segment slides --rest {params_found.rest}`, which searches the complete recording "
+            f"for the rest level. A session takes it from the start. Train it with --rest start."
         )
     return params_found
 
