@@ -152,7 +152,7 @@ def _nanoseconds(text: TextTable, name: str, column: pa.ChunkedArray) -> Int64s:
         index = int(bad.argmax())
         raise TacpipeError(
             f"{text.path}, {text.place(index)}, column {name} holds {chunk[index].as_py():f}; it must be seconds since "
-            f"1970, which end in 2262 in nanoseconds. Put the cell right."
+            f"1970, which end in 2262 in nanoseconds. Correct the cell."
         )
     return t_ns
 

@@ -179,7 +179,7 @@ def _listed_cameras() -> str:
 
 def _refusal(path: str, error: OSError) -> str:
     if error.errno == errno.EBUSY:
-        return f"{path} is held by {ports.describe_holders(ports.holders_of_file(path))}; end it."
+        return f"{path} is in use by {ports.describe_holders(ports.holders_of_file(path))}; end it."
     if error.errno in (errno.ENOTTY, errno.EINVAL):
         return f"{path} is no camera that captures video ({error.strerror}); {_listed_cameras()}."
     return f"{path} does not start: {error.strerror}. Unplug the camera and plug it in again."

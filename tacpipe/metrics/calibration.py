@@ -269,7 +269,8 @@ def promised_quantile(scores: AnyFloats, groups: Ints, level: float, noun: str) 
     if not np.isfinite(bound):
         count = len(np.unique(groups))
         raise TacpipeError(
-            f"{count} calibration {noun} can promise a band that holds {100 * most_promised(count):.0f} % at most, not "
+            f"{count} calibration {noun} can guarantee a band with a coverage of {100 * most_promised(count):.0f} % "
+            f"at most, not "
             f"{100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave "
             f"out --promise."
         )

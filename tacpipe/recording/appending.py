@@ -165,7 +165,7 @@ def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader
     for _ in store.blocks(stored.digest, stored.bytes):
         pass  # read every block back, which compares the digest
     if not _equal_batches(parquet.stored_batches(store.object_path(stored.digest)), batches()):
-        raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
+        raise DamagedError(f"Stream {stream} differs from the data that were written. Do not trust this disk.")
     return {**stored.to_json(), "rows": rows[0]}
 
 
