@@ -6,4 +6,4 @@ from collections.abc import Mapping
 from typing import Any
 
 Scalar = str | int | float | bool  # value of a param or of a setting
-Json = Mapping[str, Any]  # a JSON object of any content; a record whose fields have names has a type of its own
+Json = Mapping[str, Any]  # any JSON object; records with named fields have types of their own

@@ -1,4 +1,4 @@
-"""Decode the columns of a Parquet file in memory a few at a time, so that a long recording is never unpacked as a whole."""
+"""Decode a few columns of an in-memory Parquet file at a time, so that a long recording is never fully decoded."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ import pyarrow as pa
 
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 
-BLOCK_BYTES = 1 << 24  # about as much is decoded at once
-_TEXT_BYTES = 16  # taken for a text, whose length is not known before it is read
+BLOCK_BYTES = 1 << 24  # approximate number of bytes decoded at once
+_TEXT_BYTES = 16  # assumed size of a text, whose length is unknown before it is read
 
 
 class Columns:
-    """The columns of one stream, read as those of a `pyarrow.Table`; what was decoded last is kept.
+    """The columns of one stream, with the interface of a `pyarrow.Table`. The last decoded columns are cached.
 
-    A stream of up to `BLOCK_BYTES` is decoded whole when its first column is asked for, a larger one in blocks of
-    neighbouring columns, and one of bytes, as of images, alone. Raises `DamagedError` as `from_parquet` does.
+    A stream of up to `BLOCK_BYTES` is decoded completely on first access, a larger one in blocks of neighbouring
+    columns; a column of binary values such as images is decoded separately. Raises `DamagedError` as `from_parquet`
+    does.
     """
 
     def __init__(self, content: bytes | Path, block_bytes: int = BLOCK_BYTES) -> None:
@@ -37,23 +38,23 @@ class Columns:
         self._places: dict[str, int] = {}  # position of each decoded column
 
     def select(self, names: Sequence[str]) -> Columns:
-        """Return the columns of these names alone."""
+        """Return only the columns with these names."""
         selected = copy.copy(self)
         selected._set_schema(pa.schema([self.schema.field(name) for name in names]))
         return selected
 
     @property
     def num_rows(self) -> int:
-        """How many rows there are."""
+        """The number of rows."""
         return self._file.num_rows
 
     @property
     def column_names(self) -> list[str]:
-        """The names of the columns, in their order."""
+        """The names of the columns in order."""
         return list(self.schema.names)
 
     def column(self, name: str) -> pa.ChunkedArray:
-        """Return one column. Raises `KeyError` if there is none of this name."""
+        """Return one column. Raises `KeyError` if it does not exist."""
         place = self._places.get(name)
         if place is None:
             block = self._blocks[name]
@@ -64,13 +65,13 @@ class Columns:
         return self._decoded.column(place)
 
     def read(self, columns: Sequence[str]) -> pa.Table:
-        """Return a table of some columns."""
+        """Return a table with these columns."""
         if self._small and self._decoded.num_columns:
             return self._decoded.select(list(columns))
         return self._file.read(columns)
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
-        """Yield tables of up to ``rows`` rows each, in order, decoded as they are asked for; only ``columns``.
+        """Yield tables of up to ``rows`` rows in order, decoded on demand, with only ``columns``.
 
         A stream of up to `BLOCK_BYTES` is decoded once, however often it is read.
         """
@@ -84,21 +85,21 @@ class Columns:
             yield table.slice(first, rows)
 
     def forget(self) -> None:
-        """Let go of what was decoded last, unless it is the whole of a small stream."""
+        """Free the cached columns, unless they are those of a small stream."""
         if self._decoded.num_columns < len(self._blocks):
             self._decoded, self._places = pa.table({}), {}
 
 
 def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -> pa.Table | pa.RecordBatchReader:
-    """Return the rows of a stream as ``change_rows`` makes them of tables and of the number of their first row.
+    """Apply ``change_rows``, a function of a table and the index of its first row, to the rows of a stream.
 
-    The result is a table of up to `SOME_ROWS` rows, or batches that are made as they are asked for.
+    Returns a table if there are at most `SOME_ROWS` rows, otherwise batches that are computed on demand.
     """
     if columns.num_rows <= SOME_ROWS:
         return change_rows(columns.read(columns.column_names), 0)
 
     def changed() -> Iterator[pa.RecordBatch]:
-        release()  # the memory of what was read before
+        release()  # frees the memory of earlier batches
         first = 0
         for table in columns.batches(rows=SOME_ROWS):
             yield from change_rows(table, first).combine_chunks().to_batches()
@@ -108,14 +109,14 @@ def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -
 
 
 def release() -> None:
-    """Give back memory that Arrow and the C library keep of what is gone: as much as a long recording took, once read."""
+    """Return freed memory from Arrow and the C library to the system; after a long recording it is as large as that."""
     pa.default_memory_pool().release_unused()
     with contextlib.suppress(OSError, AttributeError):  # not every C library has malloc_trim
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _blocks(names: Sequence[str], needed_bytes: Sequence[int], block_bytes: int) -> list[Sequence[str]]:
-    """Return the names of neighbouring columns that take up to ``block_bytes`` together, or one column each."""
+    """Return groups of neighbouring columns that need at most ``block_bytes`` together, or one column each."""
     blocks: list[list[str]] = []
     room = 0
     for name, needed in zip(names, needed_bytes, strict=True):
@@ -128,10 +129,10 @@ def _blocks(names: Sequence[str], needed_bytes: Sequence[int], block_bytes: int)
 
 
 def _needed_bytes(kind: pa.DataType, block_bytes: int) -> int:
-    """Return about how many bytes a value takes once decoded; bytes, as of images, take a block each."""
+    """Return the approximate decoded size of a value in bytes; binary values such as images count as one block."""
     if pa.types.is_binary(kind):
         return block_bytes
     try:
         return max(1, int(kind.bit_width) // 8)
-    except ValueError:  # a text
+    except ValueError:  # strings have no bit width
         return _TEXT_BYTES

@@ -1,7 +1,8 @@
-"""Read untrusted YAML, plain values only and of limited size, and write values as TOML.
+"""Read untrusted YAML, restricted to plain values and a limited size, and write values as TOML.
 
-A few lines of YAML can represent any amount of data, by aliases of aliases and merged mappings, and brackets within
-brackets end the parser's stack. So the text's events are counted first, each alias as what it represents.
+A few lines of YAML can expand to any amount of data through aliases of aliases and merged mappings, and deeply nested
+brackets overflow the parser's stack. So the parser's events are counted first, with each alias counted as the value
+that it refers to.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ from typing import Any
 
 from tacpipe.printable import plain
 
-MAX_DEPTH = 50  # levels of lists and mappings within one another
-MAX_VALUES = 100_000  # values, with those that aliases represent
-MAX_CHARACTERS = 10_000_000  # characters
+MAX_DEPTH = 50  # maximum nesting depth of lists and mappings
+MAX_VALUES = 100_000  # maximum number of values, including expanded aliases
+MAX_CHARACTERS = 10_000_000  # maximum length of the text
 
 
 def load_yaml(content: str | bytes) -> Any:
     """Return the value of a YAML document.
 
-    Raises `ValueError`, with a line that states why, for text that is not YAML or is too large.
+    Raises `ValueError` with a one-line reason if the text is not YAML or is too large.
     """
     import yaml
 
@@ -29,7 +30,7 @@ def load_yaml(content: str | bytes) -> Any:
     fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
     class Loader(fast):  # type: ignore[misc]
-        """Refuses a mapping that names a key twice, of which YAML's loaders keep the last."""
+        """Rejects a mapping with a repeated key, of which YAML's loaders use the last."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             keys = set()
@@ -50,16 +51,16 @@ def load_yaml(content: str | bytes) -> Any:
         mark = error.problem_mark
         place = f" in line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""
         raise ValueError(f"{plain(str(error.problem or error.context), 200)}{place}") from None
-    except (yaml.YAMLError, AttributeError, TypeError, RecursionError) as error:  # wrong tags raise the latter
+    except (yaml.YAMLError, AttributeError, TypeError, RecursionError) as error:  # wrong tags raise the other errors
         raise ValueError(plain(" ".join(str(error).split()), 200)) from None
 
 
 def _refuse_large(events: Any) -> None:
-    """Raise `ValueError` if the events of a text represent too much."""
+    """Raise `ValueError` if the events represent too many values or nest too deeply."""
     import yaml
 
-    sizes: dict[str, int] = {}  # number of values of each anchor
-    open_nodes: list[tuple[str | None, int]] = [(None, 0)]  # anchor and size of each list or mapping that is open
+    sizes: dict[str, int] = {}  # number of values by anchor
+    open_nodes: list[tuple[str | None, int]] = [(None, 0)]  # anchor and size of each open list or mapping
     total = 0
     for event in events:
         size, anchor = 0, None
@@ -95,10 +96,10 @@ def toml_value(item: Any) -> str:
     if isinstance(item, list | tuple):
         return "[" + ", ".join(map(toml_value, item)) + "]"
     if isinstance(item, float):
-        return repr(item)  # TOML wants a digit on both sides of the point, which repr gives, and knows inf and nan
+        return repr(item)  # repr writes digits on both sides of the point, as TOML requires, and inf and nan
     return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")  # texts, whole numbers, true and false
 
 
 def toml_key(name: str) -> str:
-    """Return a key, in quotes where it needs them."""
+    """Return a key, quoted if necessary."""
     return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else json.dumps(name)

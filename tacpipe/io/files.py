@@ -1,4 +1,4 @@
-"""Write files atomically by draft, fsync and rename, and turn errors of the file system into sentences."""
+"""Write files atomically by draft, fsync and rename, and convert file system errors to sentences."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EX
 def write_whole(
     path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
 ) -> bool:
-    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` next to it; return False if ``exclusive`` lost.
+    """Write ``content``, as bytes or blocks, to ``path`` through ``draft`` next to it; return False if ``exclusive`` lost.
 
-    Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
-    what the umask takes.
+    A reader of ``path`` sees either the previous content or all of ``content``. Missing folders are created. ``mode``
+    is reduced by the umask.
     """
     try:
         _write_synced(draft, content, mode)
         return move(draft, path, exclusive=exclusive)
     finally:
-        with contextlib.suppress(OSError):  # a draft that stays is swept up later
+        with contextlib.suppress(OSError):  # a remaining draft is removed later
             os.unlink(draft)  # noqa: PTH108
 
 
 def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
-    """Give a draft that is whole its name, in a folder that is made if need be; return False if ``exclusive`` lost."""
+    """Rename a complete draft to ``path``, creating its folder if necessary; return False if ``exclusive`` lost."""
     try:
         return _move(draft, path, exclusive)
     except FileNotFoundError:
@@ -43,14 +43,14 @@ def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
 
 
 def write_all(handle: int, content: bytes | memoryview) -> None:
-    """Write all of ``content``, however little of it the system takes at a time."""
+    """Write all of ``content``, even if the system accepts only a part at a time."""
     view = memoryview(content)
     while view:
         view = view[os.write(handle, view) :]
 
 
 def sync_folder(path: str) -> None:
-    """Make sure that the names in a folder outlast a loss of power."""
+    """Make the names in a folder survive a power loss."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -59,7 +59,7 @@ def sync_folder(path: str) -> None:
 
 
 def sync_folders(path: str, top: str) -> None:
-    """Do as `sync_folder` for a folder and all above it up to ``top``: each may be new."""
+    """Call `sync_folder` for a folder and its parents up to ``top``, because each may be new."""
     while True:
         sync_folder(path)
         if path == top or len(path) <= len(top):
@@ -68,9 +68,9 @@ def sync_folders(path: str, top: str) -> None:
 
 
 def listed(folder: Path, pattern: str = "*") -> list[Path]:
-    """Return what lies in a folder, sorted, or nothing if there is none.
+    """Return the sorted paths in a folder that match ``pattern``; an empty list if the folder does not exist.
 
-    A folder that cannot be listed is an error here. `Path.glob` passes over it, and what it holds would seem to be gone.
+    Raises an error if the folder cannot be listed, unlike `Path.glob`, with which its content would seem to be missing.
     """
     try:
         names = os.listdir(folder)  # noqa: PTH208
@@ -80,9 +80,9 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def present(path: Path | str) -> bool:
-    """Return whether something lies at a path, be it a link to nothing.
+    """Return whether a path exists, including broken links.
 
-    What the system answers otherwise (EIO, EACCES, …) is raised as `OSError`: `os.path.lexists` takes it for an absence.
+    Other errors of the system (EIO, EACCES, …) are raised as `OSError`, unlike `os.path.lexists`, which returns False.
     """
     try:
         os.lstat(path)
@@ -92,11 +92,11 @@ def present(path: Path | str) -> bool:
 
 
 def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield ``source`` and each folder below it with the folders and files in it, sorted, from the top down.
+    """Yield ``source`` and each folder below it, top down, with its sorted subfolders and files.
 
-    Links are followed, circles of them are not; without ``links`` one to a folder counts as a file. Folders that are taken
-    out of the list are passed over, and so are those that are removed meanwhile. Raises `StorageError` for a folder that
-    cannot be listed: `os.walk` passes over it, and what it holds would seem to be gone.
+    Links are followed, except in circles; with ``links=False`` a link to a folder counts as a file. Folders removed
+    from the list, or deleted in the meantime, are skipped. Raises `StorageError` if a folder cannot be listed, unlike
+    `os.walk`, which skips it.
     """
     visited: set[str] = set()
     pending = [os.fspath(source)]
@@ -120,7 +120,7 @@ def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[
 
 
 def _contents(place: str, links: bool) -> tuple[list[str], list[str]]:
-    """Return the names of the folders in a folder, and of all else, sorted."""
+    """Return the sorted names of the subfolders and of all other entries in a folder."""
     folders: list[str] = []
     files: list[str] = []
     with os.scandir(place) as entries:
@@ -130,7 +130,7 @@ def _contents(place: str, links: bool) -> tuple[list[str], list[str]]:
 
 
 def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
-    """Return whether an entry is a folder, or a link to one; a link in a circle is none."""
+    """Return whether an entry is a folder or a link to one; a circular link is not."""
     try:
         return entry.is_dir(follow_symlinks=links)
     except OSError as error:
@@ -141,9 +141,9 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
 
 @contextlib.contextmanager
 def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
-    """Turn what the file system states into a sentence; what is looked for and not there stays what it is.
+    """Convert file system errors in the block to a sentence, except errors about missing files.
 
-    With ``reading`` nothing is written in the block, and the sentence is that of `unread`.
+    With ``reading``, nothing is written in the block, and the sentence is that of `unread`.
     """
     try:
         yield
@@ -154,12 +154,12 @@ def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
 
 
 def may_not_write(error: StorageError) -> bool:
-    """Return whether a store failed because nothing may be written there, and not because its disk is full or broken."""
+    """Return whether a store failed because writing is not permitted, and not because its disk is full or broken."""
     return isinstance(error.__cause__, OSError) and error.__cause__.errno in _READ_ONLY
 
 
 def sentence(root: Path | str, error: OSError) -> StorageError:
-    """Return in words what the file system stated of something under the store ``root``."""
+    """Return a sentence about a file system error below the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StorageError(
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
@@ -177,7 +177,7 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
 
 
 def unread(path: Path | str, error: OSError) -> StorageError:
-    """Return in words that the system fails to read a file, which states nothing of what the file holds."""
+    """Return an error about a file that the system fails to read, which implies nothing about its content."""
     hint = _hint(error, "check the disk and its permissions")
     return StorageError(
         f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
@@ -185,7 +185,7 @@ def unread(path: Path | str, error: OSError) -> StorageError:
 
 
 def _hint(error: OSError, otherwise: str) -> str:
-    """Return what to do about a limit of the system, ``otherwise`` what to do about any other error."""
+    """Return what to do about a system limit, or ``otherwise`` for other errors."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "allow more open files (`ulimit -n`)"
     if error.errno == errno.EFBIG:
@@ -194,7 +194,7 @@ def _hint(error: OSError, otherwise: str) -> str:
 
 
 def describe(error: OSError) -> str:
-    """Return in words what the file system stated of anything else."""
+    """Return a phrase for any other file system error."""
     return (
         f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; fix that, then "
         f"run the same command again."
@@ -242,25 +242,25 @@ class Hashed:
 
     @property
     def digest(self) -> str:
-        """The digest of what was written so far."""
+        """The digest of the content written so far."""
         return self._hash.hexdigest()
 
     def write(self, content: bytes | memoryview) -> int:
-        """Take all of ``content``."""
+        """Hash all of ``content``."""
         self._hash.update(content)
         self.bytes += len(content)
         return len(content)
 
     def tell(self) -> int:
-        """Return how many bytes were written."""
+        """Return the number of bytes written."""
         return self.bytes
 
     def flush(self) -> None:
-        """Do nothing: nothing is held back."""
+        """Do nothing, because nothing is buffered."""
 
 
 class Draft(Hashed):
-    """A new file in a store, which keeps what is written to it."""
+    """A new file in a store that hashes what is written to it."""
 
     def __init__(self, path: str, root: Path | str, mode: int) -> None:
         super().__init__()
@@ -268,7 +268,7 @@ class Draft(Hashed):
         self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
 
     def write(self, content: bytes | memoryview) -> int:
-        """Write all of ``content``. Raises `StorageError` if the disk does not take it."""
+        """Write all of ``content``. Raises `StorageError` if the disk fails or is full."""
         try:
             write_all(self._handle, content)
         except OSError as error:
@@ -276,14 +276,14 @@ class Draft(Hashed):
         return super().write(content)
 
     def sync(self) -> None:
-        """Have the content outlast a loss of power. Raises `StorageError` as `write` does."""
+        """Make the content survive a power loss. Raises `StorageError` as `write` does."""
         try:
             os.fsync(self._handle)
         except OSError as error:
             raise sentence(self._root, error) from error
 
     def release(self) -> None:
-        """Let go of the file. Raises `StorageError` as `write` does."""
+        """Close the file. Raises `StorageError` as `write` does."""
         try:
             os.close(self._handle)
         except OSError as error:
@@ -292,9 +292,9 @@ class Draft(Hashed):
 
 @contextlib.contextmanager
 def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Draft]:
-    """Yield a new file at ``path``, in the store ``root``; after the block it is removed unless it was moved away.
+    """Yield a new file at ``path`` in the store ``root``. It is deleted after the block unless it was moved.
 
-    ``mode`` is less what the umask takes. Raises `StorageError` if the file system does not allow it.
+    ``mode`` is reduced by the umask. Raises `StorageError` if the file system does not allow it.
     """
     try:
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
@@ -307,15 +307,15 @@ def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Dra
         try:
             draft.release()
         finally:
-            with contextlib.suppress(OSError):  # one that stays is swept up later
+            with contextlib.suppress(OSError):  # a remaining draft is removed later
                 os.unlink(path)  # noqa: PTH108
 
 
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:/")  # one slash: Path("s3://bucket/x") keeps no second one
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:/")  # one slash, because Path("s3://bucket/x") keeps only one
 
 
 def local(path: Path | str) -> Path:
-    """Return ``path``. Raises `UsageError` for an address: a folder of that name would be made here instead.
+    """Return ``path``. Raises `UsageError` for an address, which would otherwise be created as a folder.
 
     >>> local("data/recordings")
     PosixPath('data/recordings')

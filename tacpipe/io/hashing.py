@@ -17,25 +17,25 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.printable import excerpt
 
-DIGEST = re.compile(r"[0-9a-f]{64}")  # a digest in hex, a whole text or part of one
-SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
-_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system stated of the file, its digest
+DIGEST = re.compile(r"[0-9a-f]{64}")  # a digest in hex, for matching a whole text or parts of it
+SETTLED_NS = 2_000_000_000  # the coarsest time resolution of file systems; a younger file may change without a new time
+_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # file status and digest by path
 
 
 class Written(ABC):
-    """A mapping that is written as JSON in parts, which memory holds one after another."""
+    """A mapping that is encoded as JSON in parts, only one of which is in memory."""
 
     @abstractmethod
     def written(self) -> Iterator[bytes]:
-        """Yield what `canonical` of the mapping as a plain dict is, in parts."""
+        """Yield the parts of `canonical` of the mapping as a plain dict."""
 
 
 class _WithinError(Exception):
-    """A value holds a `Written`, which `json` does not know."""
+    """A value contains a `Written`, which `json` cannot encode."""
 
 
 def parts(value: Any) -> Iterator[bytes]:
-    """Yield `canonical` of a value in parts: those of a `Written` in it as they come. Raises as that does."""
+    """Yield `canonical` of a value in parts, including those of a `Written` in it. Raises the errors of `canonical`."""
     written_by_name: dict[str, Written] = {}
 
     def placeholder(item: Any) -> str:
@@ -54,9 +54,9 @@ def parts(value: Any) -> Iterator[bytes]:
 
 
 def canonical(value: Any) -> bytes:
-    """Return ``value`` as canonical JSON: the same value gives the same bytes everywhere.
+    """Return ``value`` as canonical JSON: equal values give equal bytes everywhere.
 
-    Raises `TacpipeError` for what JSON cannot hold: a key must never rest on a repr or a pickle.
+    Raises `TacpipeError` for values that JSON cannot represent, because a key must not depend on a repr or a pickle.
 
     >>> canonical({"b": 1, "a": [1.5, None]})
     b'{"a":[1.5,null],"b":1}'
@@ -77,7 +77,7 @@ def _encoder(default: Callable[[Any], str]) -> json.JSONEncoder:
     return json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False, default=default)
 
 
-_PLAIN = _encoder(_refuse)  # made once: a dataset has a digest per recording
+_PLAIN = _encoder(_refuse)  # created once, because a dataset has a digest per recording
 
 
 def _canonical(value: Any, encoder: json.JSONEncoder) -> str:
@@ -119,18 +119,17 @@ def bytes_digest(content: bytes) -> str:
 def file_digest(path: Path | str) -> str:
     """Return the sha256 of a file's content, as ``sha256sum`` prints it.
 
-    Raises `TacpipeError` for a pipe, a device or a folder, which have no content or no end of it.
+    Raises `TacpipeError` for a pipe, a device or a folder, which have no finite content.
     """
     with regular.opened(path) as file, regular.naming(path):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], str] | None = None) -> str:
-    """Return `file_digest`, or what ``digest_of`` returns as such.
+    """Return `file_digest`, or the result of ``digest_of``, from a cache if the file is unchanged.
 
-    A file that this process has read and that did not change since is not read again: of a file that holds hundreds of
-    recordings each asks for the digest. It counts as unchanged while the system gives the same inode, size and times of
-    change; one that was written in the last `SETTLED_NS` is always read.
+    A file with hundreds of recordings is hashed once instead of once per recording. It counts as unchanged if inode,
+    size and times are equal; a file written in the last `SETTLED_NS` is always read.
     """
     name = os.fspath(path)
     before = _traits(name)

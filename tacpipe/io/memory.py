@@ -1,4 +1,4 @@
-"""Measure the memory that is left for this process, to refuse files that declare more before it is allocated."""
+"""Measure the memory available to this process, to reject files that declare more before it is allocated."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from tacpipe.errors import ShortageError, TacpipeError
 MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
 GROUPS = Path("/sys/fs/cgroup")  # memory limits and use of containers
-OWN_GROUPS = Path("/proc/self/cgroup")  # the control groups of this process
-_VERSIONS = {  # version to the files of limit and use, and the entry of reclaimable bytes in memory.stat
+OWN_GROUPS = Path("/proc/self/cgroup")  # control groups of this process
+_VERSIONS = {  # files of limit and use by version, and the entry of reclaimable bytes in memory.stat
     "": ("memory.max", "memory.current", "inactive_file"),
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
-AT_HAND = 1 << 26  # bytes that are not worth asking the system about
-MAX_BLOCK_BYTES = 1 << 28  # bytes that a chunk, a page or a record of a file may unpack to
-KEPT = 0.9  # fraction of what is left that one file may declare
-SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
-LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores
+AT_HAND = 1 << 26  # smaller requests are not checked
+MAX_BLOCK_BYTES = 1 << 28  # maximum unpacked size of a chunk, a page or a record of a file
+KEPT = 0.9  # fraction of the available memory that a file may declare
+SCARCE = 1 << 29  # a request that fails with more memory available than this was larger than a valid file needs
+LIBRARIES = {  # address space needed to load each library with its threads, measured on 2 cores
     "numpy": 140 << 20,
     "pyarrow": 384 << 20,
     "sklearn": 512 << 20,
     "torch": 768 << 20,
     "open3d": 1200 << 20,
 }
-A_CORE = 32 << 20  # bytes that each further core's thread of the linear algebra in numpy takes
+A_CORE = 32 << 20  # bytes for each further core's thread of numpy's linear algebra
 _NO_ROOM = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 _NO_THREAD = ("can't start new thread", "Resource temporarily unavailable")
 
 
 def available() -> int:
-    """Return how many bytes this process can still take: by the computer, its container and its own limit."""
+    """Return how many bytes this process can still allocate, limited by the computer, its container and its own limit."""
     free_bytes = [1 << 62]
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
@@ -53,8 +53,8 @@ def available() -> int:
 
 
 def _left_in_groups() -> Iterator[int]:
-    """Yield how many bytes each control group of this process, of version 1 or 2, and those above it have left."""
-    lines = ["0::/", "0:memory:/"]  # the paths that a container sees
+    """Yield the available bytes of each control group (version 1 or 2) of this process and its parents."""
+    lines = ["0::/", "0:memory:/"]  # the paths visible in a container
     with contextlib.suppress(OSError):
         lines += OWN_GROUPS.read_text().splitlines()
     places: dict[Path, str] = {}
@@ -68,7 +68,7 @@ def _left_in_groups() -> Iterator[int]:
             )
     for place, version in places.items():
         limit_file, used, reclaimable = _VERSIONS[version]
-        with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
+        with contextlib.suppress(OSError, ValueError):  # "max" if there is no limit
             group_bytes = int((place / limit_file).read_text()) - int((place / used).read_text())
             with contextlib.suppress(OSError, ValueError):
                 counts = dict(line.split(maxsplit=1) for line in (place / "memory.stat").read_text().splitlines())
@@ -77,17 +77,17 @@ def _left_in_groups() -> Iterator[int]:
 
 
 def limited() -> bool:
-    """Return whether this process has a limit of address space, as ``ulimit -v`` sets it."""
+    """Return whether this process has an address space limit, as set by ``ulimit -v``."""
     return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
 
 
 def scarce() -> bool:
-    """Return whether so little is left that a request which fails states nothing of what asked for it."""
+    """Return whether so little memory is available that a failed request implies nothing about the file."""
     return available() < SCARCE
 
 
 def shortage(error: BaseException) -> ShortageError | None:
-    """Return in words that memory or threads ran out, where ``error`` or what it came from states it; else None."""
+    """Return an error about exhausted memory or threads if ``error`` or its causes indicate that, else None."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, ShortageError):
@@ -103,7 +103,7 @@ def _is_shortage(error: BaseException) -> bool:
         return True
     if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EAGAIN):
         return True
-    if isinstance(error, OSError) and error.errno is None and scarce():  # Arrow and others name no cause
+    if isinstance(error, OSError) and error.errno is None and scarce():  # Arrow and other libraries report no cause
         return True
     text = str(error)
     if isinstance(error, ImportError) and any(words in text for words in _NO_ROOM):
@@ -126,17 +126,17 @@ def _megabytes(count: int) -> str:
 
 
 def guard() -> None:
-    """Under a limit of address space, have libraries loaded only where there is room for them, and reserve none ahead.
+    """Under an address space limit, load libraries only if there is room for them, and reserve no memory in advance.
 
-    Where there is not, their own threads abort the process. Called once, before any of them is loaded.
+    Otherwise their threads abort the process. Called once, before any of them is loaded.
     """
     if limited():
-        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # others reserve a gigabyte at once
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # the other pools reserve a gigabyte at once
         sys.meta_path.insert(0, _Guard())
 
 
 class _Guard(MetaPathFinder):
-    """Finds no module, and raises `ShortageError` for a library that there is no room for."""
+    """Finds no modules, but raises `ShortageError` for a library that there is no room for."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> None:
         if name in LIBRARIES:
@@ -144,7 +144,7 @@ class _Guard(MetaPathFinder):
 
 
 def require_library(name: str) -> None:
-    """Raise `ShortageError` if loading a library of `LIBRARIES` takes more than is left under a limit."""
+    """Raise `ShortageError` if loading a library of `LIBRARIES` needs more address space than is available under a limit."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     needed = LIBRARIES[name] + A_CORE * max(0, cores - 2)
     if limited() and available() < needed:
@@ -153,7 +153,7 @@ def require_library(name: str) -> None:
 
 @contextlib.contextmanager
 def raising_shortage() -> Iterator[None]:
-    """Raise what states that memory ran out as `ShortageError`."""
+    """Convert errors about exhausted memory to `ShortageError`."""
     try:
         yield
     except Exception as error:
@@ -163,7 +163,7 @@ def raising_shortage() -> Iterator[None]:
 
 
 def require(needed: int, source: str, *, error: type[TacpipeError] = TacpipeError) -> None:
-    """Raise ``error``, a `TacpipeError`, if ``source`` needs more memory than is left."""
+    """Raise ``error``, a `TacpipeError`, if ``source`` needs more memory than is available."""
     if needed <= AT_HAND:
         return
     limit = int(available() * KEPT)
@@ -186,9 +186,9 @@ def require_block(size: int, source: str) -> None:
 
 @contextlib.contextmanager
 def bounded(max_bytes: int, source: str) -> Iterator[None]:
-    """Raise `TacpipeError` if the block takes more than ``max_bytes`` of further memory, on Linux.
+    """Raise `TacpipeError` if the block allocates more than ``max_bytes``, on Linux.
 
-    It is for libraries that unpack what a file holds without a look at how much that is.
+    This is for libraries that unpack files without checking the unpacked size.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     try:
@@ -213,7 +213,7 @@ def bounded(max_bytes: int, source: str) -> Iterator[None]:
 
 
 def readable_size(count: int) -> str:
-    """Return a number of bytes in a unit that is read at a glance.
+    """Return a number of bytes in a readable unit.
 
     >>> readable_size(2_500_000_000), readable_size(10)
     ('2.5 GB', '0.00001 MB')

@@ -1,4 +1,4 @@
-"""Write a table as Parquet and read it: encodings chosen by measurement, units and layout kept as field metadata."""
+"""Write and read tables as Parquet, with encodings chosen by measurement, and units and layout as field metadata."""
 
 from __future__ import annotations
 
@@ -23,33 +23,34 @@ from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
 REPEATED_SHARE = (
-    0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/reference/recordings.md
+    0.25  # fraction of repeated rows above which zstd beats delta packing; see docs/reference/recordings.md
 )
 LARGE_BYTES = 1 << 25  # size in memory
-BATCH_ROWS = 1024  # Arrow's own
-PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 could exceed the 2 GiB of a page
-GROUP_BYTES = 1 << 28  # encoded frames per group of rows
-TRIED_BYTES = 1 << 20  # encoded frames that are compressed on trial
-WORTH = 0.95  # largest ratio of compressed to original size that is worth it
-SOME_ROWS = 1 << 14  # rows decoded at once where a file is read in batches
+BATCH_ROWS = 1024  # Arrow's default
+PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 rows could exceed the 2 GiB limit of a page
+GROUP_BYTES = 1 << 28  # encoded frames per row group
+TRIED_BYTES = 1 << 20  # encoded frames that are compressed as a trial
+WORTH = 0.95  # maximum ratio of compressed to original size for which compression is used
+SOME_ROWS = 1 << 14  # rows decoded at once when a file is read in batches
 ZSTD_LEVEL = 3
-ZSTD_LEVEL_REPEATED = 9  # long runs of equal values are worth the search
+ZSTD_LEVEL_REPEATED = 9  # long runs of equal values justify the slower search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
 _KEY = b"tacpipe"
-BROKEN = (  # errors of pyarrow for broken files, and of Python for their metadata
+BROKEN = (  # errors of pyarrow for damaged files, and of Python for their metadata
     *(pa.ArrowException, OSError, ValueError, RuntimeError, MemoryError, OverflowError),
     *(LookupError, TypeError, AttributeError),
 )
 
 
 def to_parquet(table: pa.Table) -> bytes:
-    """Return ``table`` as the bytes of a Parquet file; the same table gives the same bytes.
+    """Return ``table`` as the bytes of a Parquet file; equal tables give equal bytes.
 
     >>> table = pa.table({"t_ns": pa.array([0, 1], pa.int64())})
     >>> from_parquet(to_parquet(table)).equals(table)
     True
     """
-    # Arrow's own stream is faster, but doubles when it grows and copies in the end: a large table would be there thrice
+    # Arrow's stream is faster, but doubles its buffer when it grows and copies it in the end, which triples a large
+    # table's memory
     sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
     write(table, sink)
     content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
@@ -57,11 +58,11 @@ def to_parquet(table: pa.Table) -> bytes:
 
 
 def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
-    """Write a table, or batches as they come, to the file ``sink`` as Parquet; return how many rows there were.
+    """Write a table, or batches as they arrive, to the file ``sink`` as Parquet; return the number of rows.
 
-    The same rows give the same bytes, as one table and in batches of any sizes: how columns are stored is decided from the
-    first group of rows. Of batches one group of rows is put aside (`tacpipe.io.row_groups`), or is in memory where there
-    are encoded frames among the columns.
+    Equal rows give equal bytes, as one table or in batches of any size, because the first row group determines how
+    columns are stored. One row group of batches is spilled to disk (`tacpipe.io.row_groups`), or kept in memory if
+    there are encoded frames.
     """
     rows = row_groups.rows_in_groups(source, ROW_GROUP_ROWS, GROUP_BYTES)
     head = rows.head()
@@ -91,7 +92,7 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
         column_encoding=encoding,
         compression=compression,
         compression_level={name: level for name, level in compression_level.items() if compression[name] == "zstd"},
-        write_batch_size=max(1, min(BATCH_ROWS, PAGE_BYTES // max(value_bytes, 1))),  # a page has whole batches
+        write_batch_size=max(1, min(BATCH_ROWS, PAGE_BYTES // max(value_bytes, 1))),  # a page contains whole batches
         write_statistics=False,
         write_page_checksum=True,
         store_schema=False,
@@ -105,10 +106,10 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
 
 
 def from_parquet(content: bytes | Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the table of a Parquet file's bytes, or of the file at a path, with field metadata; of ``columns`` if given.
+    """Return the table in a Parquet file, given as bytes or path, with field metadata; only ``columns`` if given.
 
-    Raises `DamagedError` when the bytes are no Parquet file, and where what they declare is not there, and
-    `ShortageError` if it is more than the memory that is left, which a sound file may hold too.
+    Raises `DamagedError` if the bytes are not a Parquet file or do not match their metadata, and `ShortageError` if the
+    table, which may be valid, does not fit in the available memory.
     """
     return ParquetTable(content).read(columns)
 
@@ -121,10 +122,10 @@ def require_claims(
     max_bytes: int | None = None,
     rows: int | None = None,
 ) -> None:
-    """Raise `TacpipeError` if columns of an untrusted file declare more than may be read at once, or than is there.
+    """Raise `TacpipeError` if columns of an untrusted file declare more than may be read at once, or than exists.
 
-    That is ``max_bytes`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
-    `memory.MAX_BLOCK_BYTES` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.
+    The limit is ``max_bytes``, by default the available memory, for the fraction ``share`` that is read at once, or
+    `memory.MAX_BLOCK_BYTES` for ``rows`` rows. Each text counts, also if several share a dictionary entry.
     """
     with regular.failing(path), regular.opened(path) as file:
         try:
@@ -160,7 +161,7 @@ def _require_size(path: Path, size: int, max_bytes: int | None) -> None:
 
 
 def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: int) -> Iterator[int]:
-    """Yield how many bytes the texts of so many rows are: their entries in dictionaries are read once each."""
+    """Yield the size in bytes of the texts in this number of rows; each dictionary entry is read once."""
     leaves = [schema.column(place) for place in range(len(schema))]
     for path in (leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"):
         if columns is None or path in columns or path.partition(".")[0] in columns:
@@ -177,10 +178,10 @@ def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: i
 
 
 class ParquetTable:
-    """The table of a Parquet file, of which columns are decoded when they are asked for; raises as `from_parquet` does.
+    """The table in a Parquet file, whose columns are decoded on demand. Raises the errors of `from_parquet`.
 
-    It takes the bytes of a file, or the path of a file that does not change, of which memory then holds what is decoded.
-    A buffer of Arrow's own is read as it is, bytes of Python's are copied into one.
+    The file is given as bytes or as the path of a file that does not change, of which only decoded parts are in memory.
+    Arrow buffers are read directly, Python bytes are copied.
     """
 
     def __init__(self, content: bytes | pa.Buffer | Path) -> None:
@@ -202,13 +203,13 @@ class ParquetTable:
             raise _read_error(self._size, error) from error
 
     def _opened(self) -> pq.ParquetFile:
-        """Return a reader of the file, which checks the pages of one that memory does not hold."""
+        """Return a reader of the file that verifies page checksums if the file is not in memory."""
         if isinstance(self._content, pa.Buffer):
             return pq.ParquetFile(self._source)
         return pq.ParquetFile(self._source, buffer_size=1 << 16, page_checksum_verification=True)
 
     def _count(self, columns: Sequence[str] | None) -> tuple[int, int, int]:
-        """Return what `Claims.count` does."""
+        """Return the result of `Claims.count`."""
         content = memoryview(self._content).cast("B") if isinstance(self._content, pa.Buffer) else self._content
         try:
             if self._claims is None:
@@ -219,11 +220,11 @@ class ParquetTable:
 
     @property
     def num_rows(self) -> int:
-        """How many rows the file declares."""
+        """The number of rows that the file declares."""
         return int(self._file.metadata.num_rows)
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the table, of ``columns`` alone where they are named, with field metadata."""
+        """Return the table, or only ``columns`` of it, with field metadata."""
         total, largest, _ = self._count(columns)
         memory.require(total + largest, f"A Parquet file of {self._size} bytes", error=ShortageError)
         try:
@@ -232,7 +233,7 @@ class ParquetTable:
             raise _read_error(self._size, error) from error
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
-        """Yield tables of up to ``rows`` rows, decoded as they are asked for, with field metadata."""
+        """Yield tables of up to ``rows`` rows with field metadata, decoded on demand."""
         total, page, count = self._count(columns)
         at_once = total * min(rows, self.num_rows) // max(1, self.num_rows)
         memory.require(at_once + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
@@ -247,7 +248,7 @@ class ParquetTable:
         """Return a table of some columns with their field metadata."""
         if self._fields is None:
             return table
-        if not table.num_columns:  # its rows count all the same
+        if not table.num_columns:  # the number of rows would be lost without columns
             return table.replace_schema_metadata(None)
         schema = self.schema
         if table.column_names != schema.names:
@@ -259,10 +260,10 @@ class ParquetTable:
 
 
 def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
-    """Return the rows of a Parquet file on disk as batches of up to ``rows`` rows, decoded as they are asked for.
+    """Return the rows of a Parquet file on disk as batches of up to ``rows`` rows, decoded on demand.
 
-    It is for files that this program wrote: what they declare is not checked first. Raises `DamagedError` as
-    `from_parquet` does, also while batches are taken.
+    For files that this program wrote, because their metadata are not checked first. Raises `DamagedError` as
+    `from_parquet` does, also while batches are read.
     """
     size = os.stat(path).st_size  # noqa: PTH116
 
@@ -280,10 +281,10 @@ def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
 
 
 def owned(*pieces: bytes | memoryview) -> pa.Buffer:
-    """Return bytes, one after another, in memory of Arrow's own.
+    """Return the concatenated bytes in memory owned by Arrow.
 
-    Arrow's threads may let go of a buffer after the table is read. One of Python's they cannot release while Python ends:
-    then the process aborts, its work done.
+    Arrow's threads may release a buffer after the table was read. They cannot release one owned by Python while Python
+    shuts down, which would abort the process.
     """
     buffer = pa.allocate_buffer(sum(map(len, pieces)))
     with pa.FixedSizeBufferWriter(buffer) as sink:
@@ -293,14 +294,14 @@ def owned(*pieces: bytes | memoryview) -> pa.Buffer:
 
 
 def _read_error(size: int, error: Exception) -> TacpipeError:
-    """Return in words why bytes could not be read: they are damaged, or there is too little memory left to know."""
+    """Return the error for unreadable bytes: they are damaged, or too little memory is available to know."""
     if memory.scarce() and (short := memory.shortage(error)) is not None:
         return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
 
 
 def _combine_chunks(group: pa.Table) -> pa.Table:
-    """Return rows whose texts and bytes lie in one piece: pages of these would end where pieces do."""
+    """Return rows with texts and bytes in single chunks, because pages would otherwise end at chunk boundaries."""
     for position, column in enumerate(group.columns):
         if column.num_chunks > 1 and not pa.types.is_primitive(column.type):
             group = group.set_column(position, group.schema.field(position), column.combine_chunks())
@@ -308,7 +309,7 @@ def _combine_chunks(group: pa.Table) -> pa.Table:
 
 
 def _mean_bytes(column: pa.ChunkedArray) -> int:
-    """Return how many bytes a value takes in memory, however the column is cut."""
+    """Return the mean size of a value in memory in bytes, however the column is chunked."""
     count = len(column)
     offsets = (count + 1) * (8 if pa.types.is_large_binary(column.type) else 4)
     nulls = -(-count // 8) if column.null_count else 0
@@ -316,7 +317,7 @@ def _mean_bytes(column: pa.ChunkedArray) -> int:
 
 
 def _compressed_already(column: pa.ChunkedArray) -> bool:
-    """Return whether bytes are such that zstd saves next to nothing, as of JPEG images."""
+    """Return whether zstd would hardly compress the bytes, as for JPEG images."""
     content = bytearray()
     for value in itertools.chain.from_iterable(column.chunks):
         content += (value.as_py() or b"")[: TRIED_BYTES - len(content)]
@@ -326,9 +327,9 @@ def _compressed_already(column: pa.ChunkedArray) -> bool:
 
 
 def _repeated_share(table: pa.Table, release: Callable[[], None]) -> float:
-    """Return the fraction of rows whose integer channels all equal those of the row before.
+    """Return the fraction of rows whose integer channels all equal those of the previous row.
 
-    What was read of a channel is let go of before the next one.
+    ``release`` frees each channel before the next one is read.
     """
     channels = [
         column
@@ -346,7 +347,7 @@ def _repeated_share(table: pa.Table, release: Callable[[], None]) -> float:
 
 
 def _fields_to_json(schema: pa.Schema) -> bytes:
-    """Return all field metadata as JSON: key to value to the positions of the columns that carry it."""
+    """Return all field metadata as JSON: column positions by value, by key."""
     carriers: dict[tuple[bytes, bytes], list[int]] = {}
     for position, field in enumerate(schema):
         for pair in (field.metadata or {}).items():
@@ -368,7 +369,7 @@ def _with_fields(schema: pa.Schema, names: Sequence[str], stored: dict[str, Any]
 
 
 def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Table:
-    """Return ``table`` with ``metadata`` (column to key to text) added to that of its fields."""
+    """Return ``table`` with ``metadata`` (text by key, by column) added to its field metadata."""
     fields = []
     for field in table.schema:
         existing = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -378,9 +379,9 @@ def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Ta
 
 
 def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
-    """Return the tables of recordings as one, after a first column ``recording`` with their names; without metadata.
+    """Return the concatenated tables of recordings, after a first column ``recording`` with their names, without metadata.
 
-    A table that has such a column keeps its own, as that of a split or of predictions. There must be a table.
+    A table that already has this column, such as a split or predictions, keeps its own. At least one table is required.
     """
     tables_with_names = []
     for name, table in tables.items():

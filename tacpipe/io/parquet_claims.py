@@ -1,9 +1,9 @@
-"""Count what the columns of a Parquet file declare, page by page, before anything is unpacked.
+"""Count the bytes that the columns of a Parquet file declare, page by page, before anything is unpacked.
 
-A file of some hundred bytes can declare any number of rows, and a page any size: pyarrow checks neither, and takes the
-memory. Every page has a header (https://parquet.apache.org/docs/file-format/, Thrift's compact protocol) that states its
-size once unpacked and how many values it holds; these must be the columns' own totals. Values that are stored as
-differences or runs may be as many as one likes, so what they would take is compared with the memory that is left.
+A file of a few hundred bytes can declare any number of rows, and a page any size: pyarrow checks neither and allocates
+the memory. Every page has a header (https://parquet.apache.org/docs/file-format/, Thrift's compact protocol) with its
+unpacked size and number of values, whose sums must match the column's totals. Values stored as differences or runs may
+be arbitrarily many, so their size is compared with the available memory.
 """
 
 from __future__ import annotations
@@ -17,42 +17,49 @@ if TYPE_CHECKING:
     from pyarrow.parquet import ParquetSchema
 
 Bytes = bytes | memoryview | mmap.mmap
-DATA, DICTIONARY = 0, 2  # kinds of pages
-PLAIN, DELTA_LENGTH = 0, 6  # encodings of texts that are as long as what represents them
-INDEXES = (2, 8)  # encodings of texts that stand in a dictionary
-INDEX = 4  # bytes of a place in a dictionary, in memory
-WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}  # bytes of a value in memory
-OFFSET = 8  # bytes that a text takes beside its own
+DATA, DICTIONARY = 0, 2  # page types
+PLAIN, DELTA_LENGTH = 0, 6  # encodings whose texts have their own length
+INDEXES = (2, 8)  # encodings whose texts are in a dictionary
+INDEX = 4  # size of a dictionary index in memory
+WIDTHS = {
+    "BOOLEAN": 1,
+    "INT32": 4,
+    "INT64": 8,
+    "INT96": 12,
+    "FLOAT": 4,
+    "DOUBLE": 8,
+}  # size of a value in memory by type
+OFFSET = 8  # size of a text's offset in memory
 _VARINT = rb"([\x80-\xff]*[\x00-\x7f])"
 _SMALL = rb"[\x00-\x7f]"  # a number of one byte
-_CHUNK, _ELEMENT, _ORDER = b"&\x15\x1c"  # first bytes of a column's chunk, of its element in the schema, of its order
-# A column's chunk: offset 0, type, 2 encodings, name, codec, values, sizes, where pages begin, statistics of pages
+_CHUNK, _ELEMENT, _ORDER = b"&\x15\x1c"  # first bytes of a column chunk, a schema element and a column order
+# column chunk: offset 0, type, 2 encodings, name, codec, values, sizes, page offset, page statistics
 _USUAL_CHUNK = re.compile(
     rb"&\x00\x1c\x15%b\x19\x25%b%b\x19\x18(%b)([ -~]*)\x15%b\x16%b\x16%b\x16%b&%b"
     rb"\x49\x1c\x15%b\x15%b\x15%b\x00\x3c(?:\x16%b)?[\x19)]\x06(?:\x19\x26%b%b)?\x00\x00\x00"
     % (*(_SMALL,) * 5, *(_VARINT,) * 4, *(_SMALL,) * 3, *(_VARINT,) * 3),
 )
 _USUAL_NAME = re.compile(rb"\x15%b\x25%b\x18(%b)" % ((_SMALL,) * 3))  # type, repetition, length of the name
-_USUAL_KIND = re.compile(  # converted type; logical type: none, of text, or of integers
+_USUAL_KIND = re.compile(  # converted type; logical type: none, text, or integer
     rb"(?:\x25%b)?(?:\x4c(?:\x1c\x00|\xac\x13%b[\x11\x12]\x00)\x00)?\x00" % ((_SMALL,) * 2)
 )
-_USUAL = re.compile(  # kind 0, unpacked size, size, maybe a check sum, and of its values the number and the encoding
+_USUAL = re.compile(  # page type 0, unpacked size, size, optional checksum, number of values, encoding
     rb"\x15\x00\x15%b\x15%b(?:\x15%b\x1c|\x2c)\x15%b\x15(%b)\x15%b\x15%b(?:\x1c\x00)?\x00\x00"
     % (*(_VARINT,) * 4, *(_SMALL,) * 3),
 )
-MAX_DEPTH = 8  # structures within one another in a page's header
+MAX_DEPTH = 8  # maximum nesting depth of structures in a page header
 
 
 class _Leaf(NamedTuple):
-    """A column of values, as the schema describes it."""
+    """A column in the schema."""
 
     path: str
     kind: str  # physical type
-    length: int  # bytes of a value of fixed length
+    length: int  # size of a fixed-length value in bytes
 
 
 class PageHeader(NamedTuple):
-    """Fields of a page's header."""
+    """Fields of a page header."""
 
     kind: int
     unpacked: int  # bytes
@@ -62,11 +69,10 @@ class PageHeader(NamedTuple):
 
 
 class Claims:
-    """Count the bytes that the columns of one file declare, each column once.
+    """Counts the bytes that the columns of a file declare, each column once.
 
-    The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
-    Raises `ValueError` if the footer contradicts itself, and where a column that is asked for declares another number
-    of values than its pages hold, or pages that the file does not have.
+    The footer is parsed here, because pyarrow's parser aborts the process if parts of a footer contradict each other.
+    Raises `ValueError` if the footer is inconsistent, or if a requested column does not match its pages.
     """
 
     def __init__(self, schema: ParquetSchema, content: Bytes) -> None:
@@ -75,7 +81,7 @@ class Claims:
         leaves = (schema.column(place) for place in range(len(schema)))
         self._leaves = [_Leaf(leaf.path, leaf.physical_type, leaf.length) for leaf in leaves]
         self._groups: list[list[Any]] = [group.get(1) or [] for group in footer.get(4) or ()]
-        self._counted: dict[tuple[int, bool], tuple[int, int]] = {}  # column and `shared`: its bytes, its largest page
+        self._counted: dict[tuple[int, bool], tuple[int, int]] = {}  # bytes and largest page by column and `shared`
         rows = sum(_expect_number(group.get(3)) for group in footer.get(4) or ())
         if footer.get(3) != rows:
             raise ValueError(f"it declares {footer.get(3)} rows, and its groups of {rows}")
@@ -83,10 +89,9 @@ class Claims:
     def count(
         self, content: Bytes, columns: Collection[str] | None = None, *, shared: bool = False
     ) -> tuple[int, int, int]:
-        """Return how many bytes all values of ``columns`` are, how many the largest page is, and the number of columns.
+        """Return the total size of ``columns`` in memory, the size of the largest page, and the number of columns.
 
-        ``content`` is that of the file. Where ``shared``, texts in a dictionary are as they are in the file: each is there
-        once.
+        ``content`` is the file. If ``shared``, each dictionary entry counts once, as in the file.
         """
         places = [
             place
@@ -102,7 +107,7 @@ class Claims:
         return sum(total for total, _ in counts), max((largest for _, largest in counts), default=0), len(places)
 
     def _count_column(self, content: Bytes, place: int, *, shared: bool) -> tuple[int, int]:
-        """Return the bytes of a column in memory, and those of its largest page."""
+        """Return the size of a column in memory and that of its largest page."""
         leaf, total, largest = self._leaves[place], 0, 0
         for chunks in self._groups:
             if place >= len(chunks):
@@ -110,7 +115,9 @@ class Claims:
             chunk = chunks[place].get(3) or {}
             start, stop = _span(chunk, len(content), leaf.path)
             only = _USUAL.match(content, start, stop)
-            if only is not None and only.end() + _varint(only[2]) == stop and leaf.kind in WIDTHS:  # most have one page
+            if (
+                only is not None and only.end() + _varint(only[2]) == stop and leaf.kind in WIDTHS
+            ):  # most columns have one page
                 values, unpacked = _varint(only[4]), _varint(only[1])
                 if values == chunk.get(5) and values >= 0 and unpacked >= 0:
                     total, largest = total + values * WIDTHS[leaf.kind], max(largest, unpacked)
@@ -126,9 +133,9 @@ class Claims:
 
 
 def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
-    """Return where the pages of a column's chunk begin and end."""
+    """Return start and end of the pages of a column chunk."""
     start = _expect_number(chunk.get(9))
-    words = chunk.get(11)  # position of its dictionary, if it has one
+    words = chunk.get(11)  # offset of its dictionary, if it has one
     start = min(start, words) if isinstance(words, int) and words > 0 else start
     stop = start + _expect_number(chunk.get(7))
     if not 0 <= start <= stop <= end:
@@ -137,7 +144,7 @@ def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
 
 
 def _texts(pages: Collection[PageHeader], *, shared: bool) -> int:
-    """Return how many bytes texts can be: those that share beginnings, or stand in a dictionary, as long as it each."""
+    """Return the maximum size of texts; each text with a shared prefix or dictionary may be as long as the dictionary."""
     words = max((page.unpacked for page in pages if page.kind == DICTIONARY), default=0)
     total = words if shared else 0
     for page in pages:
@@ -180,7 +187,7 @@ def _expect_number(value: Any) -> int:
 
 
 def _varint(text: Bytes) -> int:
-    """Return a number of Thrift's compact protocol: seven bits a byte, the low ones first, in zigzag.
+    """Return a number in Thrift's compact protocol: seven bits per byte, low ones first, in zigzag encoding.
 
     >>> _varint(bytes([0x96, 0x01])), _varint(bytes([1]))
     (75, -1)
@@ -192,7 +199,7 @@ def _varint(text: Bytes) -> int:
 
 
 def _struct(content: Bytes, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
-    """Return the fields of a structure by number, whole numbers and structures alone, and where it ends."""
+    """Return the integer and structure fields of a structure by number, and the structure's end."""
     fields: dict[int, Any] = {}
     number = 0
     while place < stop:
@@ -205,7 +212,7 @@ def _struct(content: Bytes, place: int, stop: int, depth: int) -> tuple[dict[int
             number += head >> 4
         else:
             number, place = _number(content, place, stop)
-        if 3 < kind < 7 and place < stop and content[place] < 128:  # a number of one byte, as most are
+        if 3 < kind < 7 and place < stop and content[place] < 128:  # a one-byte number, which is the most common
             fields[number] = content[place] >> 1 ^ -(content[place] & 1)
             place += 1
         else:
@@ -222,7 +229,7 @@ def _value(content: Bytes, place: int, stop: int, kind: int, depth: int) -> tupl
         return _number(content, place, stop)
     if kind == 7:
         return None, place + 8
-    if kind == 8:  # a text: its length is no zigzag
+    if kind == 8:  # a text, whose length is not in zigzag encoding
         length, place = _number(content, place, stop)
         return None, place + (2 * length if length >= 0 else -2 * length - 1)
     if kind == 9 and depth < MAX_DEPTH:
@@ -253,7 +260,7 @@ def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any],
 
 
 def _usual(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:
-    """Return what is needed of a structure of the footer that has a usual form, and where it ends; None for another."""
+    """Return the needed fields and the end of a footer structure in the common form, or None for other forms."""
     first = content[place] if place < stop else 0
     if first == _CHUNK and (chunk := _USUAL_CHUNK.match(content, place, stop)) and len(chunk[2]) == chunk[1][0]:
         return {3: {5: _varint(chunk[3]), 7: _varint(chunk[5]), 9: _varint(chunk[6])}}, chunk.end()

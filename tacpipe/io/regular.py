@@ -1,12 +1,13 @@
-"""Open regular files only: a pipe, a device or a folder in the place of one is refused, and never waited for.
+"""Open regular files only: a pipe, device or folder in place of a file raises an error and never blocks.
 
-Every file of a store, of a remote store and of an untrusted dataset is opened here. A file of a store is never a symbolic
-link (``follow=False``), and none is read that is larger than what describes it declares (``max_bytes``), or than memory.
+Every file of a store, a remote store or an untrusted dataset is opened here. A file of a store is never a symbolic link
+(``follow=False``), and no file is read that is larger than declared (``max_bytes``) or than the available memory.
 
-What a file of a recording's source names is opened by `inside`: it cannot lead out of its folder, by ``..`` or by a link.
+Files named by a recording's source are opened through `inside`, so they cannot leave its folder through ``..`` or a
+link.
 
-What the system answers when a source file is read is not a property of the recording: `failing` raises it as `StorageError`,
-which ends the command, with ``--skip-bad`` too.
+Errors of the system while reading a source file imply nothing about the recording: `failing` raises them as
+`StorageError`, which ends the command even with ``--skip-bad``.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ KINDS = (
     (stat.S_ISLNK, "a symbolic link"),
 )
 BLOCK_BYTES = 1 << 20
-JSON_BYTES = 1 << 30  # the largest JSON file that is read: a manifest of a million recordings has half of it
-JSON_IN_MEMORY = 24  # bytes that a byte of JSON becomes at most when it is parsed: "[]," is an empty list
-_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
-_LINK = (errno.ELOOP, errno.EMLINK)  # errors of O_NOFOLLOW by system
+JSON_BYTES = 1 << 30  # maximum size of a JSON file; a manifest of a million recordings has half of it
+JSON_IN_MEMORY = 24  # maximum memory per byte of parsed JSON, reached by "[],"
+_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # O_NONBLOCK, because a pipe without writers would block forever
+_LINK = (errno.ELOOP, errno.EMLINK)  # errors of O_NOFOLLOW on different systems
 
 
-FOLLOW_LINKS = "TACPIPE_FOLLOW_LINKS"  # the environment variable that allows links which lead out of a source
+FOLLOW_LINKS = "TACPIPE_FOLLOW_LINKS"  # environment variable that permits links leading out of a source
 
 
 class IrregularError(TacpipeError):
@@ -48,32 +49,32 @@ class IrregularError(TacpipeError):
 
 
 def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
-    """Return a file opened for reading; ``follow`` is whether ``path`` may be a symbolic link.
+    """Open a regular file for reading. ``follow``: whether ``path`` may be a symbolic link.
 
-    Raises `IrregularError` if it is not a regular file, `OSError` as `open` does.
+    Raises `IrregularError` if it is not a regular file, and `OSError` as `open` does.
     """
     handle, _ = _open(path, follow=follow)
     return io.BufferedReader(io.FileIO(handle))
 
 
 def content(path: Path | str, max_bytes: int | None = None, *, follow: bool = True) -> bytes:
-    """Return what a regular file of at most ``max_bytes`` bytes holds, by default of as many as memory takes.
+    """Return the content of a regular file of at most ``max_bytes``, by default as much as fits in memory.
 
-    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` if memory is short, which
-    states nothing of the file.
+    Raises the errors of `opened`, `IrregularError` for a larger file, and `StorageError` if memory is short, which
+    implies nothing about the file.
     """
     handle, size = _open(path, follow=follow)
     try:
         _expect_size(path, size, max_bytes)
         with naming(path):
-            data = os.read(handle, size + 1)  # one byte more: it ends there, as it should
+            data = os.read(handle, size + 1)  # one extra byte detects a larger file
             return data if len(data) == size else _read_remaining(path, handle, data, max_bytes)
     finally:
         os.close(handle)
 
 
 def blocks(path: Path | str, max_bytes: int, *, follow: bool = True) -> Iterator[bytes]:
-    """Yield what a regular file of at most ``max_bytes`` bytes holds, `BLOCK_BYTES` at a time; raises as `content` does."""
+    """Yield a regular file of at most ``max_bytes`` in pieces of `BLOCK_BYTES`. Raises the errors of `content`."""
     handle, size = _open(path, follow=follow)
     try:
         read = 0
@@ -87,9 +88,9 @@ def blocks(path: Path | str, max_bytes: int, *, follow: bool = True) -> Iterator
 
 
 def json_value(path: Path | str, max_bytes: int = JSON_BYTES) -> Any:
-    """Return the JSON value that a file of a store holds.
+    """Return the JSON value in a file of a store.
 
-    Raises as `content` does, and `ValueError` or `RecursionError` if it is not JSON.
+    Raises the errors of `content`, and `ValueError` or `RecursionError` if it is not JSON.
     """
     text = content(path, max_bytes, follow=False)
     expect_parsed(path, len(text))
@@ -97,21 +98,21 @@ def json_value(path: Path | str, max_bytes: int = JSON_BYTES) -> Any:
 
 
 def expect_parsed(path: Path | str, size: int) -> None:
-    """Raise `StorageError` if this computer has too little memory left to parse ``size`` bytes of JSON."""
+    """Raise `StorageError` if too little memory is available to parse ``size`` bytes of JSON."""
     memory.require(size * JSON_IN_MEMORY, f"{path}, parsed,", error=StorageError)
 
 
 def source(path: Path | str) -> bytes:
     """Return the content of a file of a recording's source.
 
-    Raises `TacpipeError` if it is not a regular file, as `failing` does.
+    Raises `TacpipeError` if it is not a regular file, and the errors of `failing`.
     """
     with failing(path):
         return content(path)
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path below ``folder`` that an untrusted file names. Raises `UsageError` for one that leads out of it."""
+    """Return the path below ``folder`` named by an untrusted file. Raises `UsageError` if it is outside."""
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
         raise UsageError(f"{folder} names the file {excerpt(name)}, which leads out of it. Nothing outside is read.")
@@ -120,14 +121,14 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def expect_inside(folder: Path, paths: Iterable[Path]) -> None:
-    """Raise `UsageError` if one of the ``paths`` below a folder lies elsewhere, by a symbolic link.
+    """Raise `UsageError` if one of the ``paths`` below a folder leads out of it through a symbolic link.
 
-    With the environment variable `FOLLOW_LINKS` links are followed.
+    The environment variable `FOLLOW_LINKS` permits such links.
     """
     if os.environ.get(FOLLOW_LINKS):
         return
     top = os.path.realpath(folder)
-    parents: dict[Path, str] = {}  # folder to its real path
+    parents: dict[Path, str] = {}  # real path by folder
     for path in paths:
         if path.parent not in parents:
             parents[path.parent] = os.path.realpath(path.parent)
@@ -141,7 +142,7 @@ def expect_inside(folder: Path, paths: Iterable[Path]) -> None:
 
 @contextlib.contextmanager
 def failing(path: Path | str) -> Iterator[None]:
-    """Raise what the system answers while ``path`` is read (EIO, EMFILE, ESTALE, ENOMEM, …) as `StorageError`."""
+    """Raise system errors while ``path`` is read (EIO, EMFILE, ESTALE, ENOMEM, …) as `StorageError`."""
     try:
         yield
     except OSError as error:
@@ -153,7 +154,7 @@ def failing(path: Path | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Have an `OSError` of the block carry the file's name, which one of a read lacks."""
+    """Add the file's name to an `OSError` in the block; errors of reads lack it."""
     try:
         yield
     except OSError as error:
@@ -162,7 +163,7 @@ def naming(path: Path | str) -> Iterator[None]:
 
 
 def require(path: Path | str, mode: int) -> None:
-    """Raise `IrregularError` if ``mode``, of `os.stat`, is not that of a regular file."""
+    """Raise `IrregularError` if ``mode`` of `os.stat` is not that of a regular file."""
     if not stat.S_ISREG(mode):
         kind = next((name for is_one, name in KINDS if is_one(mode)), "something else")
         raise IrregularError(
@@ -171,7 +172,7 @@ def require(path: Path | str, mode: int) -> None:
 
 
 def _open(path: Path | str, *, follow: bool) -> tuple[int, int]:
-    """Return the handle of a regular file, and its size in bytes."""
+    """Return a handle of a regular file, and its size in bytes."""
     try:
         handle = os.open(path, _FLAGS if follow else _FLAGS | os.O_NOFOLLOW)
     except OSError as error:
@@ -197,7 +198,7 @@ def _expect_size(path: Path | str, size: int, max_bytes: int | None, *, in_memor
 
 
 def _read_remaining(path: Path | str, handle: int, data: bytes, max_bytes: int | None) -> bytes:
-    """Return all of a file that is longer than one read, or that grows or shrinks while it is read."""
+    """Return the content of a file that is longer than one read, or that grows or shrinks while it is read."""
     buffer = io.BytesIO()
     while data:
         buffer.write(data)

@@ -1,4 +1,4 @@
-"""Collect the rows of a Parquet file into the groups in which they are written, column by column."""
+"""Collect the rows of a Parquet file into row groups for writing, column by column."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ import pyarrow.compute as pc
 from tacpipe.arrays import AnyArray, Bools
 from tacpipe.io.files import sentence, write_all
 
-IN_MEMORY = 1 << 25  # bytes of rows, before a file is made of them
-WRITE_BYTES = 1 << 22  # bytes of rows that are then written at once
+IN_MEMORY = 1 << 25  # size of rows kept in memory before they are written to a file
+WRITE_BYTES = 1 << 22  # size of rows written at once
 BYTES_TYPES = (pa.lib.Type_BINARY, pa.lib.Type_LARGE_BINARY)
-FRAME_OVERHEAD = 32  # bytes of an encoded frame in memory besides its content: offsets, validity
+FRAME_OVERHEAD = 32  # size of an encoded frame in memory besides its content: offsets, validity
 
 
 def rows_in_groups(
     source: pa.Table | pa.RecordBatchReader, max_rows: int, group_bytes: int
 ) -> RowsInMemory | SpilledRows:
-    """Return the rows of a table or of batches, to be taken in groups of at most ``max_rows`` rows.
+    """Return the rows of a table or of batches, to be read in groups of at most ``max_rows`` rows.
 
-    A group has about ``group_bytes`` of encoded frames at most, where there are any.
+    A group contains at most about ``group_bytes`` of encoded frames.
     """
     framed = any(holds_bytes(field) for field in source.schema)
     if framed or isinstance(source, pa.Table):
@@ -37,12 +37,12 @@ def rows_in_groups(
 
 
 def holds_bytes(field: pa.Field) -> bool:
-    """Return whether a column holds bytes, as encoded frames."""
+    """Return whether a column contains binary values, such as encoded frames."""
     return field.type.id in BYTES_TYPES
 
 
 class RowsInMemory:
-    """The rows of a table or of batches, taken group by group."""
+    """The rows of a table or of batches, read group by group."""
 
     def __init__(self, source: pa.Table | pa.RecordBatchReader, max_rows: int, group_bytes: int) -> None:
         self._max_rows, self._group_bytes = max_rows, group_bytes
@@ -51,14 +51,14 @@ class RowsInMemory:
         self._following = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
 
     def release(self) -> None:
-        """Do nothing: the rows are in memory."""
+        """Do nothing, because the rows are in memory."""
 
     def releasing(self, sink: Any) -> Any:
         """Return ``sink``."""
         return sink
 
     def head(self) -> pa.Table:
-        """Return the rows by which it is decided how columns are stored; they stay to be taken."""
+        """Return the rows that determine how columns are stored, without consuming them."""
         frames = [field.name for field in self._next.schema if holds_bytes(field)]
         if not frames:
             self._fill(self._max_rows)
@@ -73,7 +73,7 @@ class RowsInMemory:
         return head
 
     def groups(self, rows: int) -> Iterator[pa.Table]:
-        """Yield tables of ``rows`` rows, a last one with the rest; an empty one where there is none at all."""
+        """Yield tables of ``rows`` rows, the last with the remainder; one empty table if there are no rows."""
         self._fill(rows)
         while True:
             yield self._first(rows)
@@ -88,7 +88,7 @@ class RowsInMemory:
         )  # slice() of a table without columns has the requested number of rows
 
     def _fill(self, rows: int) -> bool:
-        """Have ``rows`` rows waiting, or all that are left; return whether there are so many."""
+        """Buffer ``rows`` rows, or all remaining ones; return whether there are enough."""
         waiting, count = [self._next], int(self._next.num_rows)
         for table in self._following if count < rows else ():
             waiting.append(table)
@@ -101,7 +101,7 @@ class RowsInMemory:
 
 
 class SpilledRows:
-    """The rows of batches without encoded frames, taken group by group, each put aside while it is written."""
+    """The rows of batches without encoded frames, read group by group; each group is spilled to disk while it is written."""
 
     def __init__(self, source: pa.RecordBatchReader, max_rows: int) -> None:
         self._max_rows = max_rows
@@ -110,11 +110,11 @@ class SpilledRows:
         self.release = self._groups.release
 
     def head(self) -> pa.Table:
-        """Return the first group of rows, which stays to be taken."""
+        """Return the first group of rows without consuming it."""
         return self._head
 
     def groups(self, rows: int) -> Iterator[pa.Table]:
-        """Yield tables of ``max_rows`` rows, the last with the remainder; an empty one where there is none at all."""
+        """Yield tables of ``max_rows`` rows, the last with the remainder; one empty table if there are no rows."""
         assert rows == self._max_rows
         group, self._head = self._head, None
         while group is not None:
@@ -124,24 +124,24 @@ class SpilledRows:
             group = following if following.num_rows else None
 
     def releasing(self, sink: Any) -> Any:
-        """Return a file that writes to ``sink``, and lets go of what was read for that."""
+        """Return a file that writes to ``sink`` and releases the memory of what was read for it."""
         return _ReleasingSink(sink, self._groups)
 
 
 class SpilledGroups:
-    """The rows of batches in tables of so many rows. There is one table at a time; the next one takes its place.
+    """The rows of batches in tables with a fixed number of rows, of which one exists at a time.
 
-    Rows of numbers lie in a temporary file that is mapped: their pages are let go of with `release`, and come back from
-    the disk's cache where they are read again. Other columns, as of texts, stay in memory.
+    Numeric columns are in a memory-mapped temporary file: `release` frees their pages, which are read again from the
+    disk cache. Other columns, such as texts, stay in memory.
     """
 
     def __init__(self, source: pa.RecordBatchReader, rows: int) -> None:
         self._source, self._rows = iter(source), rows
-        self._remainder: pa.RecordBatch | None = None  # rows of a batch for the next group
+        self._remainder: pa.RecordBatch | None = None  # rows of a batch that belong to the next group
         self._group = _RowGroup(source.schema, rows)
 
     def next(self) -> pa.Table:
-        """Return the next group; one without rows where there is none. Raises `StorageError` if the disk is full."""
+        """Return the next group, or an empty table if there is none. Raises `StorageError` if the disk is full."""
         self._group.clear()
         while self._group.count < self._rows and (batch := self._next_batch()) is not None:
             room = self._rows - self._group.count
@@ -150,7 +150,7 @@ class SpilledGroups:
         return self._group.table()
 
     def release(self) -> None:
-        """Let go of what was read of the group so far, which stays where it is."""
+        """Free the pages of the group that were read; the group stays on disk."""
         self._group.release()
 
     def _next_batch(self) -> pa.RecordBatch | None:
@@ -160,22 +160,22 @@ class SpilledGroups:
 
 @dataclass
 class _SpilledColumn:
-    """One column of a group: where its numbers lie in the file, or its values, and where it has nulls."""
+    """One column of a group: the position of its numbers in the file, or its values, and its nulls."""
 
     field: pa.Field
-    width: int  # bytes of a number; 0: not of numbers
+    width: int  # bytes per number, 0 if it is not numeric
     start: int = 0
     values: list[pa.Array] = field(default_factory=list)
-    valid: list[tuple[int, Bools]] = field(default_factory=list)  # first row, and which rows hold a value
+    valid: list[tuple[int, Bools]] = field(default_factory=list)  # first row, and whether each row has a value
 
 
 class _RowGroup:
-    """Up to so many rows."""
+    """A group with a maximum number of rows."""
 
     def __init__(self, schema: pa.Schema, rows: int) -> None:
-        self.count = self._spilled = 0  # rows, and of them those in the file
+        self.count = self._spilled = 0  # number of rows, and of rows in the file
         self._schema = schema
-        self._waiting: list[pa.RecordBatch] = []  # until they are too large
+        self._waiting: list[pa.RecordBatch] = []  # batches in memory, until they are too large
         self._bytes = 0  # size of the waiting batches
         self._columns = [_SpilledColumn(column_field, _width(column_field.type)) for column_field in schema]
         place = 0
@@ -186,9 +186,9 @@ class _RowGroup:
         self._mapped: mmap.mmap | None = None
 
     def clear(self) -> None:
-        """Discard the rows, so that the next group begins."""
+        """Discard the rows, to start the next group."""
         self.count = self._spilled = self._bytes = 0
-        self._waiting, self._mapped = [], None  # it is unmapped with the last table that reads it
+        self._waiting, self._mapped = [], None  # it is unmapped with the last table that uses it
         for column in self._columns:
             column.values, column.valid = [], []
 
@@ -248,13 +248,13 @@ class _RowGroup:
         return pa.Array.from_buffers(kind, self.count, [valid, numbers])
 
     def release(self) -> None:
-        """Let go of pages that were read."""
+        """Free the pages that were read."""
         if self._mapped is not None:
             self._mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def _width(kind: pa.DataType) -> int:
-    """Return how many bytes a number of this type has, 0 for other types."""
+    """Return the size in bytes of a number of this type, 0 for other types."""
     return kind.bit_width // 8 if pa.types.is_primitive(kind) and not pa.types.is_boolean(kind) else 0
 
 
@@ -269,7 +269,7 @@ def _raw(values: pa.Array, width: int) -> AnyArray:
 
 
 class _ReleasingSink:
-    """A file to write to, after each piece of which what was read for it is let go of."""
+    """A file that frees the memory of its input after each write."""
 
     closed = False
 
@@ -283,10 +283,10 @@ class _ReleasingSink:
         return count
 
     def tell(self) -> int:
-        """Return how many bytes were written."""
+        """Return the number of bytes written."""
         place: int = self._sink.tell()
         return place
 
     def flush(self) -> None:
-        """Hand over what the file holds back."""
+        """Flush the file's buffer."""
         self._sink.flush()

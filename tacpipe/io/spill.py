@@ -1,4 +1,4 @@
-"""Keep tables and arrays that do not fit in memory in temporary files, and read them back in pieces, in order or mapped."""
+"""Keep tables and arrays that do not fit in memory in temporary files, and read them back in pieces, sorted or mapped."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tacpipe.errors import StorageError
 from tacpipe.io.files import sentence
 from tacpipe.io.parquet import owned
 
-IN_MEMORY = 1 << 26  # bytes, before a file is made of them
+IN_MEMORY = 1 << 26  # size of tables kept in memory before they are written to a file
 PIECE_ROWS = 1 << 15  # rows per piece of a sorted run
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A table that was put aside: where it is, and the least value of each column that it may be ordered by."""
+    """A spilled table: its position, and the minimum of each column that it may be sorted by."""
 
     start: int
     size: int
@@ -35,27 +35,27 @@ class Piece:
     minima: Mapping[str, float] = field(default_factory=dict)
 
 
-KEPT = 0.9  # fraction of the free disk that one file may unpack to
+KEPT = 0.9  # fraction of the free disk space that one file may unpack to
 
 
 class Spill:
-    """A temporary file of tables without a name, which is gone with this object or with the process."""
+    """A temporary, unnamed file of tables, which is deleted with this object or the process."""
 
     def __init__(self, in_memory: int | None = None) -> None:
-        """Take how many bytes stay in memory, before a file is made of them; `IN_MEMORY` by default."""
+        """Create a spill that keeps ``in_memory`` bytes in memory before it writes a file; `IN_MEMORY` by default."""
         self._max_memory = IN_MEMORY if in_memory is None else in_memory
         self._file = tempfile.SpooledTemporaryFile(self._max_memory)  # noqa: SIM115  (closed by the line below)
         weakref.finalize(self, self._file.close)
-        self._lock = threading.Lock()  # streams of one file may be read by threads
+        self._lock = threading.Lock()  # several threads may read streams of one file
         self._end = 0
 
     @property
     def in_memory(self) -> bool:
-        """True while all tables are still in memory."""
+        """Whether all tables are still in memory."""
         return self._end <= self._max_memory
 
     def add(self, table: pa.Table, orders: Sequence[str] = ()) -> Piece:
-        """Put a table aside; ``orders`` are columns of numbers without nulls.
+        """Spill a table; ``orders`` are numeric columns without nulls that it may be sorted by.
 
         Raises `StorageError` if the disk is full.
         """
@@ -74,13 +74,13 @@ class Spill:
         return Piece(start, content.size, table.num_rows, minima)
 
     def add_run(self, table: pa.Table, order: str) -> list[Piece]:
-        """Put a table aside in the order of a column, in pieces that follow one another."""
+        """Spill a table sorted by a column, as consecutive pieces."""
         table = sorted_by(table, order)
         cuts = range(0, table.num_rows, PIECE_ROWS)
         return [self.add(table.slice(start, PIECE_ROWS).combine_chunks(), [order]) for start in cuts]
 
     def read(self, piece: Piece) -> pa.Table:
-        """Return a table that was put aside."""
+        """Return a spilled table."""
         with self._lock:
             self._file.seek(piece.start)
             content = self._file.read(piece.size)
@@ -88,9 +88,9 @@ class Spill:
 
 
 def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
-    """Write what the file at ``path`` unpacks to into a temporary file.
+    """Write the unpacked content of the file at ``path`` to a temporary file.
 
-    Raises `StorageError` if that is more than nine tenths of the free disk, before that is full.
+    Raises `StorageError` if it exceeds nine tenths of the free disk space, before the disk is full.
     """
     folder = tempfile.gettempdir()
     free_bytes = room = int(shutil.disk_usage(folder).free * KEPT)
@@ -108,10 +108,10 @@ def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
 
 
 class Gathered:
-    """One table, put together of tables of the same columns that come one after another and are put aside meanwhile."""
+    """One table, concatenated from spilled tables with equal columns."""
 
     def __init__(self, spill: Spill, empty: pa.Table) -> None:
-        """Take where the tables are put aside, and one without rows."""
+        """Collect tables in ``spill``; ``empty`` is a table without rows."""
         self._spill, self._schema = spill, empty.schema
         self._pieces: list[Piece] = []
 
@@ -120,7 +120,7 @@ class Gathered:
         self._pieces.append(self._spill.add(table.combine_chunks()))
 
     def rows(self) -> pa.Table | pa.RecordBatchReader:
-        """Return all rows: as a table while all that is put aside is in memory, else as batches that are read back."""
+        """Return all rows: as a table if the spill is in memory, otherwise as batches read from disk."""
         if self._spill.in_memory:
             return pa.concat_tables([self._schema.empty_table(), *map(self._spill.read, self._pieces)]).combine_chunks()
         batches = (batch for piece in self._pieces for batch in self._spill.read(piece).to_batches())
@@ -128,7 +128,7 @@ class Gathered:
 
 
 def sorted_by(table: pa.Table, order: str) -> pa.Table:
-    """Return the rows in the order of a column of numbers; equal ones stay as they are."""
+    """Return the rows sorted by a numeric column; the sort is stable."""
     values = table.column(order).to_numpy()
     if not (np.diff(values) < 0).any():
         return table
@@ -146,7 +146,7 @@ def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: 
     >>> [one.column("t").to_pylist() for one in in_order(pieces, spill.read, "t")]
     [[1], [3, 4, 9], [12]]
     """
-    waiting: list[tuple[int, pa.Table]] = []  # place of the piece, its rows that were not yielded
+    waiting: list[tuple[int, pa.Table]] = []  # position of the piece, and its remaining rows
     for place, piece in sorted(enumerate(pieces), key=lambda numbers: (numbers[1].minima[order], numbers[0])):
         yield from _rows_below(waiting, order, piece.minima[order])
         waiting.append((place, sorted_by(read(piece), order)))
@@ -154,7 +154,7 @@ def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: 
 
 
 def _rows_below(waiting: list[tuple[int, pa.Table]], order: str, limit: float | None) -> Iterator[pa.Table]:
-    """Yield the rows below ``limit`` as one table, and leave the others waiting."""
+    """Yield the rows below ``limit`` as one table, and keep the others in ``waiting``."""
     ready: list[pa.Table] = []
     later: list[tuple[int, pa.Table]] = []
     for place, table in sorted(waiting, key=lambda entry: entry[0]):
@@ -169,24 +169,24 @@ def _rows_below(waiting: list[tuple[int, pa.Table]], order: str, limit: float | 
         yield sorted_by(pa.concat_tables(ready), order)
 
 
-SEGMENT_BYTES = 1 << 28  # size of a file; few are opened, since each takes a descriptor
-MAX_READ_BYTES = 1 << 26  # bytes read before their pages are released
+SEGMENT_BYTES = 1 << 28  # size of a file; few files are opened, because each needs a descriptor
+MAX_READ_BYTES = 1 << 26  # number of bytes read before their pages are released
 
 
 class MappedArrays:
-    """Arrays that take no memory for long. The first ``in_memory`` bytes of them are ordinary ones.
+    """Memory-mapped arrays in temporary files. The first ``in_memory`` bytes of them are ordinary arrays.
 
-    Files lie where ``TMPDIR`` states, have no name, and are gone with the arrays.
+    The files are in ``TMPDIR``, have no name, and are deleted with the arrays.
     """
 
     def __init__(self, in_memory: int) -> None:
         self._in_memory = in_memory
         self._segments: list[mmap.mmap] = []
-        self._used = 0  # bytes of the last one
-        self._read = 0  # bytes since they were let go of
+        self._used = 0  # used bytes of the last file
+        self._read = 0  # bytes read since pages were released
 
     def kept(self, values: AnyArray) -> AnyArray:
-        """Return the same values. Raises `StorageError` as `empty` does."""
+        """Return a mapped copy of the values. Raises `StorageError` as `empty` does."""
         if values.nbytes <= self._in_memory:
             self._in_memory -= values.nbytes
             return values
@@ -206,11 +206,11 @@ class MappedArrays:
 
     @property
     def in_memory(self) -> bool:
-        """Return whether no array lies in a file."""
+        """Return whether no array is in a file."""
         return not self._segments
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> AnyArray:
-        """Return an array to be filled. Raises `StorageError` if the disk is full."""
+        """Return an uninitialized array. Raises `StorageError` if the disk is full."""
         kind = np.dtype(dtype)
         size = int(np.prod(shape)) * kind.itemsize
         if size <= self._in_memory:
@@ -224,24 +224,24 @@ class MappedArrays:
         return np.frombuffer(self._segments[-1], kind, int(np.prod(shape)), place).reshape(shape)
 
     def read(self, size: int) -> None:
-        """Note that about so many bytes were read; beyond `MAX_READ_BYTES` they are let go of."""
+        """Note that about ``size`` bytes were read; beyond `MAX_READ_BYTES` their pages are released."""
         self._read += size
         if self._read > MAX_READ_BYTES:
             self.release()
 
     def release(self) -> None:
-        """Let go of what was read and written so far."""
+        """Release the pages that were read and written so far."""
         self._read = 0
         for segment in self._segments:
             segment.madvise(mmap.MADV_DONTNEED)
 
 
 def _map_temporary_file(size: int) -> mmap.mmap:
-    """Return a temporary file of this size, mapped; all of it has its place on the disk."""
+    """Return a mapped temporary file of this size, with its disk space allocated."""
     try:
         with tempfile.TemporaryFile() as file:
             if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)  # a hole that a full disk cannot fill kills its writer
+                os.posix_fallocate(file.fileno(), 0, size)  # writing to a hole on a full disk would kill the process
             else:
                 file.truncate(size)
             return mmap.mmap(file.fileno(), size)

@@ -1,9 +1,9 @@
-"""Print results on stdout, notes and progress on stderr, without control characters that files hold.
+"""Print results on stdout, and notes and progress on stderr, without control characters from files.
 
-A label, a name or a header may come from anybody, and a terminal obeys escape sequences. So all that is printed passes
-through here, where a character that is not printable is shown as Python's repr shows it.
+Labels, names and headers may come from anybody, and terminals interpret escape sequences. So all output passes through
+this module, which shows unprintable characters as Python's repr does.
 
-What a command does counts more than what it prints: a standard stream that is closed, full or read by nobody ends none.
+A command's work matters more than its output: a closed, full or unread standard stream does not end it.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from typing import Any, TextIO
 
 from tacpipe import printable
 
-_DELETE = "\x7f"  # the one control character that JSON leaves as it is
+_DELETE = "\x7f"  # the only control character that JSON does not escape
 
 
 def result(text: object) -> None:
-    """Print a command's result on stdout, line by line `shown`."""
+    """Print a command's result on stdout, each line through `shown`."""
     print(printable.lines(str(text).split("\n")), flush=True)
 
 
 def result_json(value: Any) -> None:
-    """Print a command's result on stdout as JSON on one line, in ASCII without a control character."""
+    """Print a command's result on stdout as one line of ASCII JSON without control characters."""
     print(json.dumps(value).replace(_DELETE, "\\u007f"), flush=True)
 
 
 def note(text: object) -> None:
-    """Print on stderr what a user should know next to the result, line by line `shown`."""
+    """Print a note for the user on stderr, each line through `shown`."""
     with contextlib.suppress(OSError, ValueError):  # nobody can read it any more
         print(printable.lines(str(text).split("\n")), file=sys.stderr, flush=True)
 
 
 class _Standard(io.FileIO):
-    """A standard stream that takes what is written to it whatever becomes of it, and keeps why it could not be written."""
+    """A standard stream whose writes never raise; it stores the first error."""
 
     def __init__(self, handle: int) -> None:
         super().__init__(handle, "wb", closefd=False)
@@ -50,7 +50,7 @@ class _Standard(io.FileIO):
 
     def write(self, content: Any) -> int:
         try:
-            while (count := super().write(content)) is None:  # somebody made the terminal non-blocking
+            while (count := super().write(content)) is None:  # the terminal may have been made non-blocking
                 select.select([], [self], [])
         except OSError as error:
             self.failure = error
@@ -62,10 +62,10 @@ class _Standard(io.FileIO):
 
 
 def prepare() -> None:
-    """Have this process's standard streams end no command: called once, before anything is opened.
+    """Prevent errors of the standard streams from ending the command; called once, before anything is opened.
 
-    One that is closed is opened on ``/dev/null``, or the next file that is opened, of the store perhaps, would take its
-    place, and what is printed would be written into it.
+    A closed stream is opened on ``/dev/null``. Otherwise the next opened file, perhaps of the store, would get its
+    descriptor, and output would be written to it.
     """
     for handle in (0, 1, 2):
         try:
@@ -88,7 +88,7 @@ def _stream(handle: int, before: Any) -> io.TextIOWrapper:
 
 
 def unprinted() -> OSError | None:
-    """Return why stdout could not be written, None if it was, or if whoever read it has seen enough."""
+    """Return why stdout could not be written, or None if it was, or if its reader closed it."""
     with contextlib.suppress(ValueError):
         sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
@@ -102,7 +102,7 @@ GAP = "  "
 
 @dataclass(frozen=True)
 class TerminalRow:
-    """The cells of a row and how they are shown on a terminal, as rich names styles."""
+    """The cells of a row and their style, in rich's notation."""
 
     cells: Sequence[str]
     style: str = ""
@@ -123,11 +123,11 @@ class TerminalTable:
     heads: Sequence[str]
     groups: Sequence[RowGroup]
     caption: str = ""
-    spare: Sequence[int] = ()  # columns that may be left out, in this order
-    left: Sequence[int] = field(default=(0,))  # columns of text, aligned to the left
+    spare: Sequence[int] = ()  # columns that may be omitted, in this order
+    left: Sequence[int] = field(default=(0,))  # left-aligned text columns
 
     def lines(self, width: int) -> list[tuple[str, str]]:
-        """Return the lines of the table within ``width`` cells as far as `spare` allows, each with its style."""
+        """Return the lines of the table with their styles, within ``width`` cells as far as `spare` allows."""
         columns = self._fitting_columns(width)
         widths = {at: max(_cells(row[at]) for row in self._all_rows()) for at in columns}
         indent = GAP if any(group.heading for group in self.groups) else ""
@@ -168,7 +168,7 @@ class TerminalTable:
 
 
 def width_of(stream: TextIO) -> int:
-    """Return how many cells a line of a stream has: those of its terminal, else ``COLUMNS``, else 120."""
+    """Return the line width of a stream: that of its terminal, else ``COLUMNS``, else 120."""
     with suppress(OSError, ValueError, AttributeError):
         return os.get_terminal_size(stream.fileno()).columns
     with suppress(KeyError, ValueError):
@@ -177,7 +177,7 @@ def width_of(stream: TextIO) -> int:
 
 
 def show(table: TerminalTable, *, on_stdout: bool) -> None:
-    """Print a table on stdout or stderr, in colours on a terminal; a command's result goes to stdout."""
+    """Print a table on stdout (for results) or stderr, in colour on a terminal."""
     stream = sys.stdout if on_stdout else sys.stderr
     lines = table.lines(width_of(stream))
     if not stream.isatty():
@@ -192,7 +192,7 @@ def show(table: TerminalTable, *, on_stdout: bool) -> None:
 
 
 def _cells(text: str) -> int:
-    """Return how many cells text takes: some letters take two, and some none.
+    """Return the number of terminal cells of a text; some characters need two, some none.
 
     >>> _cells("木"), _cells("−0.1")
     (2, 4)
@@ -205,14 +205,14 @@ _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Show no bar from now on, even on a terminal, or show them again."""
+    """Turn progress bars off or on, also on a terminal."""
     global _quiet
     _quiet = quiet
 
 
 @contextmanager
 def showing_progress(visible: bool) -> Iterator[None]:
-    """Show bars and sentences within the block, or neither, whatever was set before."""
+    """Show or hide progress bars and messages within the block, whatever was set before."""
     before = _quiet
     set_quiet(not visible)
     try:
@@ -222,24 +222,24 @@ def showing_progress(visible: bool) -> Iterator[None]:
 
 
 def is_quiet() -> bool:
-    """Return whether nothing is to be shown but errors and results."""
+    """Return whether only errors and results are shown."""
     return _quiet
 
 
 def is_visible() -> bool:
-    """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
+    """Return whether progress is visible: stderr is a terminal and quiet is off."""
     return sys.stderr.isatty() and not _quiet
 
 
 def report_progress(sentence: str) -> None:
-    """Report on stderr what a user should know while it happens, unless quiet was asked for."""
+    """Report progress on stderr in a sentence, unless quiet is on."""
     if not _quiet:
         note(f"tacpipe: {sentence}")
 
 
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Callable[..., None]]:
-    """Yield ``advance(steps=1, note="")``, which moves a bar of ``total`` steps and shows ``note`` behind it."""
+    """Yield ``advance(steps=1, note="")``, which advances a bar of ``total`` steps and shows ``note`` after it."""
     if not is_visible():
         yield lambda steps=1, note="": None
         return

@@ -1,10 +1,11 @@
-"""End a command within a second of Ctrl-C, SIGTERM or SIGHUP, whatever it is doing, with one sentence.
+"""End a command with one sentence, within a second of Ctrl-C, SIGTERM or SIGHUP, whatever it is doing.
 
-Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
-the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.
+Python handles a signal between two of its own instructions, and a long call in C has none. So a thread is notified too,
+and ends the process if `KeyboardInterrupt` has not. That is safe at any point, because nothing in a store is ever half
+written.
 
-SIGHUP comes when a terminal or an ssh connection closes: from the kernel, and often again from the shell or from systemd. It
-never counts as a second request. What was connected to standard output and error may be gone, so writing there may fail.
+SIGHUP is sent when a terminal or an ssh connection closes: by the kernel, and often again by the shell or systemd. It
+never counts as a second request. Standard output and error may be disconnected, so writing to them may fail.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ from tacpipe import printable
 from tacpipe.errors import INTERRUPTED
 from tacpipe.io import terminal
 
-GRACE_S = 0.7  # time to end in good order
-TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a request is the same one
+GRACE_S = 0.7  # time for an orderly end
+TWICE_S = 0.25  # `timeout` signals a process and then its group: a signal this soon after a request is the same request
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _Requests:
-    """Distinguishes requests apart from their echoes."""
+    """Distinguishes requests from repeated signals for the same request."""
 
     def __init__(self) -> None:
         self._last_s = -TWICE_S
 
     def is_new_request(self) -> bool:
-        """Return whether the signal that has just come is a request of its own."""
+        """Return whether the latest signal is a new request."""
         now_s = time.monotonic()
         if now_s - self._last_s <= TWICE_S:
             return False
@@ -47,22 +48,22 @@ class _Requests:
 
 
 class _Program:
-    """The state of termination requests of this process; one instance exists."""
+    """The state of this process's termination requests; there is one instance."""
 
     def __init__(self) -> None:
         self.by_main_thread = _Requests()
         self.by_listener = _Requests()
         self.ending = False
-        self.installed = False  # it is a command's own process
-        self.deferred = False  # `KeyboardInterrupt` waits
-        self.own_way = False  # the next request is the command's own business
+        self.installed = False  # whether this is the process of a command
+        self.deferred = False  # whether `KeyboardInterrupt` is postponed
+        self.own_way = False  # whether the command itself handles the next request
         self.sentence = SENTENCE
         self.reported = False
-        self.code: int | None = None  # exit code of a command that is done
+        self.code: int | None = None  # exit code of a finished command
         self.restore: Callable[[], None] = lambda: None  # resets the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt` for the first request, end at once for the second: the handler of all signals."""
+        """Raise `KeyboardInterrupt` for the first request and end immediately for the second; the handler of all signals."""
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
@@ -75,7 +76,7 @@ class _Program:
             raise KeyboardInterrupt
 
     def listen(self, wakeups: int) -> None:
-        """See to it that the process ends soon after a request: run by a thread that hears of signals from C."""
+        """End the process soon after a request; run by a thread that is woken by signals from C."""
         expected = requested_before = False
         while True:
             (number,) = os.read(wakeups, 1)
@@ -99,7 +100,7 @@ class _Program:
         self.end()
 
     def end(self) -> NoReturn:
-        """End the process without another step of what it was doing."""
+        """End the process immediately."""
         self.restore()
         if self.code is None and not self.reported and self.sentence:
             self.reported = True
@@ -112,9 +113,9 @@ _program = _Program()
 
 
 def install_handlers() -> None:
-    """Handle termination requests from now on: `KeyboardInterrupt` first, the end of the process soon after.
+    """Handle termination requests from now on: first `KeyboardInterrupt`, then the end of the process.
 
-    A signal that this process was started to ignore, as by ``nohup``, is ignored further.
+    A signal that was ignored when this process started, for example by ``nohup``, stays ignored.
     """
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -125,29 +126,29 @@ def install_handlers() -> None:
     threading.Thread(target=_program.listen, args=(wakeups,), daemon=True).start()
     _program.installed = True
     _program.restore = _terminal_restorer()
-    unraisable = sys.unraisablehook  # the listener ends the process if an interrupt meets code that cannot raise
+    unraisable = sys.unraisablehook  # the listener ends the process if an interrupt occurs in code that cannot raise
     sys.unraisablehook = lambda reported: None if reported.exc_type is KeyboardInterrupt else unraisable(reported)
 
 
 def requested() -> bool:
-    """Return whether the process is about to end because somebody requested it: errors then state nothing of the command."""
+    """Return whether the process is ending on request; errors then imply nothing about the command."""
     return _program.installed and _program.ending
 
 
 def report() -> None:
-    """Report that the command was interrupted, and what is kept."""
+    """Report that the command was interrupted, and what was kept."""
     sentence, _program.sentence, _program.reported = _program.sentence, SENTENCE, True
     if sentence:
         terminal.note(sentence)
 
 
 def finish(code: int) -> int:
-    """Return the exit code of a command that is done: whoever requests it to end from now on gets this code.
+    """Return the exit code of a finished command; termination requests from now on end it with this code.
 
-    An interrupted process ends here: taking down torch and the like would need another second.
+    An interrupted process ends here, because unloading torch and other libraries would take another second.
     """
     if code == INTERRUPTED:
-        with contextlib.suppress(OSError, ValueError):  # nobody reads what was printed
+        with contextlib.suppress(OSError, ValueError):  # nobody reads the output
             sys.stdout.flush()
         _program.end()
     _program.code = code
@@ -156,12 +157,12 @@ def finish(code: int) -> int:
 
 @contextlib.contextmanager
 def reporting(sentence: str) -> Iterator[None]:
-    """Have an interrupt in the block stated in this sentence, which knows what is kept."""
+    """Report an interrupt in the block with this sentence, which states what was kept."""
     before, _program.sentence = _program.sentence, sentence
     try:
         yield
     except KeyboardInterrupt:
-        raise  # it is reported further out
+        raise  # an outer block reports it
     except BaseException:
         _program.sentence = before
         raise
@@ -170,7 +171,7 @@ def reporting(sentence: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """Have `KeyboardInterrupt` wait for the end of the block, which is short and must not be left half done."""
+    """Postpone `KeyboardInterrupt` until the end of the block, which is short and must not be left half done."""
     before, _program.deferred = _program.ending, True
     try:
         yield
@@ -181,9 +182,9 @@ def deferred() -> Iterator[None]:
 
 
 class EndRequest:
-    """A request to end: the first lets the running work finish in its own way and keeps it, the second interrupts.
+    """A request to end: the first lets the running work finish and keeps it, the second interrupts.
 
-    ``number`` is the signal that asked, None before.
+    ``number`` is the signal of the request, or None before it.
     """
 
     def __init__(self) -> None:
@@ -202,16 +203,16 @@ class EndRequest:
     def __exit__(self, *_: object) -> None:
         _program.own_way = False
         if self.number == signal.SIGHUP:
-            drop_closed_streams()  # those at the other end of a pipe may have ended after this process heard of it
+            drop_closed_streams()  # processes at the other end of a pipe may have ended since
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def __call__(self) -> bool:
-        """Return whether somebody did."""
+        """Return whether the end was requested."""
         return self._requested.is_set()
 
     def wait(self, timeout_s: float | None) -> None:
-        """Wait until somebody does, or for so long."""
+        """Wait until the end is requested, or for ``timeout_s``."""
         self._requested.wait(timeout_s)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -227,9 +228,9 @@ class EndRequest:
 
 
 def drop_closed_streams() -> None:
-    """Connect standard output and error to /dev/null where their terminal or the other end of their pipe is closed.
+    """Redirect standard output and error to /dev/null if their terminal or pipe is closed.
 
-    Every write there would raise, and end what is still to be finished.
+    Otherwise every write would raise and end the remaining work.
     """
     for handle in (1, 2):
         with contextlib.suppress(OSError):
@@ -242,7 +243,7 @@ def drop_closed_streams() -> None:
 
 
 def _terminal_restorer() -> Callable[[], None]:
-    """Return what makes the terminal as it is now: a process that ends at once cannot show the cursor or echo again."""
+    """Return a function that restores the terminal's present state, which a killed process cannot do."""
     settings: list[tuple[int, Any]] = []
     with contextlib.suppress(ImportError, OSError):
         import termios
@@ -253,7 +254,9 @@ def _terminal_restorer() -> Callable[[], None]:
     def restore() -> None:
         with contextlib.suppress(Exception):
             for handle, state in settings:
-                if os.tcgetpgrp(handle) == os.getpgrp():  # another one would be stopped for it
+                if (
+                    os.tcgetpgrp(handle) == os.getpgrp()
+                ):  # a background process would be stopped for changing the terminal
                     termios.tcsetattr(handle, termios.TCSANOW, state)
             os.write(2, show_cursor)
 
@@ -261,9 +264,9 @@ def _terminal_restorer() -> Callable[[], None]:
 
 
 def end_with(pipe: int) -> None:
-    """Have this process end as soon as the other end of a pipe is closed, which is when the process there ends.
+    """End this process as soon as the other end of a pipe is closed, which happens when the process there ends.
 
-    The kernel reports it by a signal, which ends this process in the middle of a long call in C as well.
+    The kernel reports it by a signal, which also ends a long call in C.
     """
     signal.signal(signal.SIGIO, signal.SIG_DFL)
     fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())

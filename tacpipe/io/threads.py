@@ -12,9 +12,10 @@ Result = TypeVar("Result")
 
 
 def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item], at_once: int) -> Iterator[Result]:
-    """Yield what ``work`` gives for each of ``items``, in their order, made ``at_once`` at a time by as many threads.
+    """Yield the result of ``work`` for each of ``items`` in order, computed by ``at_once`` threads.
 
-    With one at a time no thread is started. What ``work`` raises is raised here, and what has not begun is left out.
+    No thread is started for one at a time. Errors of ``work`` are raised here, and items that have not started are
+    dropped.
 
     >>> list(map_in_threads(len, ["a", "bb", "ccc"], 2))
     [1, 2, 3]
@@ -27,7 +28,7 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item], at_onc
     try:
         for item in items:
             waiting.append(pool.submit(work, item))
-            if len(waiting) > 4 * at_once:  # a slow one does not hold up those behind it
+            if len(waiting) > 4 * at_once:  # a slow item does not delay those after it
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

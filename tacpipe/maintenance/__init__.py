@@ -1,1 +1,1 @@
-"""Manage a store beyond one command: collection, repair, transfer to other stores, checkout."""
+"""Maintain a store beyond single commands: garbage collection, repair, transfer to other stores, checkout."""

@@ -1,4 +1,4 @@
-"""Maintain a store in a bucket, its folder in front, and the roots of datasets whose directories are gone here."""
+"""Maintain a store in a bucket, its local cache, and the roots of datasets whose directories were deleted here."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from tacpipe.store.store import Store
 
 
 def behind(store: Store) -> AnyStore:
-    """Return the store in the bucket behind a folder, or the folder where there is none."""
+    """Return the bucket of a cached store, or the store itself if it is a folder."""
     return store.bucket if isinstance(store, CachedStore) else store
 
 
 def distant(store: Store) -> CachedStore:
-    """Return a store that is kept in a bucket, as `Store.distant` states of it."""
+    """Return a store in a bucket, for which `Store.distant` is true, with its type."""
     assert isinstance(store, CachedStore)
     return store
 
 
 class CacheSize(TypedDict):
-    """The path of the folder in front of a bucket, and what lies in it."""
+    """The path of a bucket's local cache, and the size of its content."""
 
     path: str
     objects: FolderSize
@@ -51,7 +51,7 @@ class BucketStatus(StoreStatus):
 
 
 def status(store: CachedStore) -> BucketStatus:
-    """Return the status of the bucket as `repair.status` does, and the path and sizes of the folder in front."""
+    """Return the status of the bucket, as `repair.status` does, and the path and sizes of its local cache."""
     bucket = store.bucket
     all_roots = bucket.roots.all()
     folder = repair.status(store)
@@ -78,20 +78,20 @@ def _measured(entries: Iterable[Entry]) -> FolderSize:
 
 
 def verify(store: CachedStore) -> Soundness:
-    """Return the soundness of what the bucket holds, having moved what is damaged in the folder in front to quarantine.
+    """Return the soundness of the bucket, after moving damaged files of the local cache to quarantine.
 
-    A damaged object in that folder is copied there again when it is read, so it is not counted.
+    A damaged object in the cache is fetched again when it is read, so it is not counted.
     """
     repair.verify(store)
     return remote_upkeep.verify(store.bucket)
 
 
 def repair_damaged(store: CachedStore) -> Soundness:
-    """Return the soundness of the bucket after what is damaged or missing there was sent again.
+    """Return the soundness of the bucket after replacing damaged and missing objects.
 
-    A damaged object is moved to quarantine there. It comes from the folder in front, from a dataset's directory, or is
-    recomputed; what this computer cannot have again is lost as far as it is concerned. A damaged record stays until
-    a command computes its key.
+    A damaged object is moved to quarantine in the bucket. It is restored from the local cache, from a dataset's
+    directory, or by recomputing it; objects that this computer cannot restore are reported as lost. A damaged record
+    stays until a command computes its key.
     """
     if not store.bucket.check():
         return Soundness(there=False)
@@ -132,9 +132,10 @@ def _local_objects(store: CachedStore) -> tuple[dict[str, str], list[str]]:
 
 
 def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    """Remove what nothing needs from the bucket, as `remote_upkeep.collect` does.
+    """Remove unneeded content from the bucket, as `remote_upkeep.collect` does.
 
-    A dataset that a command of this computer wrote, and whose directory is gone for the whole grace, is forgotten first.
+    First, datasets that commands of this computer wrote are forgotten if their directories have been missing for the
+    whole grace period.
     """
     for root in [] if dry_run else _expired_roots(store, grace_days):
         folder, name = projects.place(Path(root["path"]))
@@ -156,9 +157,9 @@ def _expired_roots(store: CachedStore, grace_days: float) -> list[Root]:
 
 
 def clear(store: CachedStore, *, dry_run: bool) -> Collected:
-    """Remove from the folder in front what the bucket has as well; a run at work here keeps what it uses.
+    """Remove from the local cache what the bucket also has, except for objects that a running process uses.
 
-    A command that reads a removed object copies it here again.
+    A command that reads a removed object fetches it again.
     """
     collected = Collected()
     if not store.check():
@@ -183,7 +184,7 @@ def clear(store: CachedStore, *, dry_run: bool) -> Collected:
 
 
 def status_text(value: BucketStatus) -> str:
-    """Return the status in words."""
+    """Return the status as text."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [_line("objects", value["objects"]), _line("records", value["records"]), _line("tmp", value["tmp"])]
     lines += [f"  root  {root['manifest'][:12]}  {root['path']}" for root in value["roots"]]

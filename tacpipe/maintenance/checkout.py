@@ -1,4 +1,4 @@
-"""List the datasets that the store still has, whatever their directories hold now, and bring one back."""
+"""List the datasets that the store still has, whatever their directories contain now, and restore one."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from tacpipe.store.store import MissingError
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"
-MIN_DIGITS = 6  # hex digits by which a manifest may be named
+MIN_DIGITS = 6  # minimum number of hex digits that identify a manifest
 _HEX = re.compile(rf"[0-9a-f]{{{MIN_DIGITS},64}}")
 
 
 @dataclass(frozen=True)
 class Known:
-    """A manifest that the store holds, and the path at which it was last written."""
+    """A manifest in the store, and the path at which it was last written."""
 
     manifest: str  # digest of the manifest
     dataset: str  # digest of the dataset
     stage: str
-    written_s: int  # seconds of UTC since 1970
+    written_s: int  # Unix time in seconds
     recordings: int
-    labelled: int  # recordings with labels that were set by hand
+    labelled: int  # number of recordings with hand-set labels
     path: str
     state: str
-    project: str = ""  # name of the project that pushed it, or digits of its id; PROJECT:PATH names the dataset
+    project: str = ""  # name of the project that pushed it, or digits of its id, as used in PROJECT:PATH
 
 
 def known(store: AnyStore) -> list[Known]:
-    """Return the manifests that roots of the store name or named before, newest first."""
+    """Return the present and past manifests of the store's roots, newest first."""
     by_label: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
     for root in roots:
@@ -60,7 +60,7 @@ def known(store: AnyStore) -> list[Known]:
             except StorageError:
                 raise
             except TacpipeError:
-                continue  # collected, or damaged
+                continue  # collected or damaged
             earlier = EARLIER if root["kind"] == PUSHED else REPLACED
             state = _state(root, name) if entry is root else earlier
             by_label[name, root_label] = Known(
@@ -74,12 +74,12 @@ def known(store: AnyStore) -> list[Known]:
                 state,
                 root_label.removesuffix(f":{path}") if root["kind"] == PUSHED else "",
             )
-    # the order is stable: ties keep that of a path's history
+    # the sort is stable, so ties keep the order of a path's history
     return sorted(by_label.values(), key=lambda listing: (-listing.written_s, listing.path))
 
 
 def _state(root: Root, name: str) -> str:
-    """Return what became of the manifest that was written last at the path of ``root``."""
+    """Return what happened to the last manifest written at the path of ``root``."""
     if root["kind"] == PUSHED:
         return IN_STORE
     path = Path(root["path"])
@@ -95,7 +95,7 @@ def _state(root: Root, name: str) -> str:
 
 
 def to_text(listed: list[Known]) -> str:
-    """Return one line per manifest; times are those of this computer's zone."""
+    """Return one line per manifest, with times in this computer's time zone."""
     lines = [f"{'manifest':<12}  {'written':<16}  {'stage':<20}  {'recordings':>10}  {'labelled':>8}  path"]
     for entry in listed:
         date = time.strftime("%Y-%m-%d %H:%M", time.localtime(entry.written_s))
@@ -108,18 +108,18 @@ def to_text(listed: list[Known]) -> str:
 
 
 def _place(entry: Known) -> str:
-    """Return the path of a manifest, behind its project where it was pushed."""
+    """Return the path of a manifest, preceded by its project if it was pushed."""
     return f"{entry.project}:{entry.path}" if entry.state in (IN_STORE, EARLIER) else entry.path
 
 
 def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore | None = None) -> Manifest:
-    """Write the dataset ``name`` to ``output``, with its labels; from the store ``source`` if it is given.
+    """Write the dataset ``name`` to ``output`` with its labels, from the store ``source`` if given.
 
-    ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written, or
-    the name under which it was pushed. What comes from another store is copied into this one.
+    ``name`` is the digest of its manifest or of the dataset, a prefix of either, the path at which it was last written,
+    or the name under which it was pushed. Content of another store is copied into this one.
 
-    Raises `UsageError` if none or several have it, and if ``output`` holds a dataset that would be replaced without
-    ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
+    Raises `UsageError` if none or several datasets match, and if ``output`` contains a dataset that would be replaced
+    without ``replace``; `DamagedError` if part of it is damaged and cannot be recomputed.
     """
     store = locate()
     if source is None and store.distant:
@@ -142,12 +142,12 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
                 if not first:
                     raise
                 for path, digest in manifest.objects():
-                    read(digest, path)  # computes what was collected or damaged, where that is possible
+                    read(digest, path)  # recomputes collected or damaged objects if possible
     raise AssertionError
 
 
 def _is_manifest(store: AnyStore, name: str) -> bool:
-    """Return whether ``name`` is the whole digest of a manifest in the store."""
+    """Return whether ``name`` is the full digest of a manifest in the store."""
     if not DIGEST.fullmatch(name) or not store.has(name):
         return False
     try:
@@ -160,7 +160,7 @@ def _is_manifest(store: AnyStore, name: str) -> bool:
 
 
 def _manifest_digest(store: AnyStore, name: str) -> str:
-    """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
+    """Return the digest of the manifest with this digest, or last written at this path."""
     root = store.roots.get(Path(name).absolute())
     if root is not None:
         return str(root["manifest"])
@@ -178,7 +178,7 @@ def _manifest_digest(store: AnyStore, name: str) -> str:
     }
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.place} begin with {name}; give more of its hex digits.")
-    if not matching and _is_manifest(store, name):  # a manifest that no root names any more
+    if not matching and _is_manifest(store, name):  # a manifest without a root
         return name
     if not matching:
         raise UsageError(f"{store.place} knows no manifest {name}; `tacpipe store list` names those that it knows.")

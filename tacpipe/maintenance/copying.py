@@ -21,31 +21,33 @@ from tacpipe.store.store import MissingError
 
 @dataclass
 class Transferred:
-    """Counts of objects that were copied, and of those that the other store had already."""
+    """Number of copied objects, and of objects that the other store already had."""
 
     objects: int = 0
     bytes: int = 0
     there: int = 0
-    replaced: int = 0  # copied objects that were damaged in the other store
-    datasets: list[str] = field(default_factory=list)  # labels in the other store
+    replaced: int = 0  # number of copied objects that replaced damaged ones
+    datasets: list[str] = field(default_factory=list)  # names in the other store
 
 
 @dataclass
 class _Plan:
-    """Manifests and objects that are to be copied."""
+    """The manifests and objects to copy."""
 
     manifests: dict[str, bytes] = field(default_factory=dict)  # content by digest
-    objects: dict[str, tuple[str, int]] = field(default_factory=dict)  # path within the dataset and bytes, by digest
+    objects: dict[str, tuple[str, int]] = field(
+        default_factory=dict
+    )  # path in the dataset and size in bytes, by digest
 
     def sizes(self) -> dict[str, int]:
-        """Return the bytes of all of it."""
+        """Return the sizes of all manifests and objects in bytes."""
         return {name: size for name, (_, size) in self.objects.items()} | {
             name: len(content) for name, content in self.manifests.items()
         }
 
 
 def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, ancestors: bool) -> _Plan:
-    """Return what a dataset needs: its manifest and objects, the manifests it descends from, perhaps their objects too."""
+    """Return what a dataset needs: its manifest and objects, its ancestors' manifests, and optionally their objects."""
     plan = _Plan()
     todo, visited = [dataset.digest], set()
     while todo:
@@ -68,7 +70,7 @@ def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, 
 
 
 def _expect_formed(manifest: Manifest, name: str) -> None:
-    """Raise `DamagedError` if a page of a manifest holds what none can: it may be untrusted."""
+    """Raise `DamagedError` if a page of a manifest, which may be untrusted, is invalid."""
     try:
         manifest_of.check_pages(manifest)
     except (ValueError, TypeError, KeyError) as error:
@@ -86,13 +88,13 @@ def copy(
     verify: bool,
     before: str = "",
 ) -> None:
-    """Copy objects, then manifests, then records: what names something comes after it.
+    """Copy objects, then manifests, then records, so that references always follow their targets.
 
-    ``before`` is a manifest of the target that has much in common with what is copied, as the last one of that name.
+    ``before`` is a manifest in the target with much in common, such as the last one of that name.
     """
     plan = _planned(source, target, found, ancestors=ancestors)
     sizes = plan.sizes()
-    target.announce(sizes)  # announced before the sizes are read, so that no collection removes one
+    target.announce(sizes)  # announced before the sizes are read, so that no collection removes an object in between
     present_sizes = target.sizes(sizes)
     absent = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
     _expect_room(target, sum(sizes[name] for name in absent))
@@ -115,7 +117,7 @@ def copy(
 
 
 def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
-    """Return those objects whose bytes are not what their names state, none unless they are to be verified."""
+    """Return the objects whose content does not match their digest; an empty list unless ``verify`` is set."""
 
     def is_sound(name: str) -> bool:
         try:
@@ -134,7 +136,7 @@ def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *
 
 
 def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], directories: tuple[str, ...]) -> None:
-    """Copy objects, several at once where another computer is asked. Raises `DamagedError` for what is nowhere sound."""
+    """Copy objects, concurrently to or from another computer. Raises `DamagedError` if an object has no intact copy."""
     sizes = plan.sizes()
 
     def send(name: str) -> tuple[str, MissingError | None]:
@@ -153,7 +155,7 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
             failed += [] if error is None else [(name, error)]
             sent_bytes += sizes[name]
             advance(note=f"{sent_bytes / 1e6:,.1f} of {total / 1e6:,.1f} MB")
-    for name, error in failed:  # a copy next to the manifest or the stage that made it may bring it back
+    for name, error in failed:  # a copy in the dataset's directory or the stage that computed it may restore it
         path, size = plan.objects[name]
         if isinstance(source, RemoteStore):
             raise DamagedError(f"{path}: {error}") from error
@@ -163,7 +165,7 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
 def _copy_records(
     source: AnyStore, target: AnyStore, dataset: manifest_of.Found, moved: Collection[str], before: str
 ) -> None:
-    """Copy the records of what was copied, and note in ``target`` which those are."""
+    """Copy the records of a dataset, and note in ``target`` which they are."""
     noted_keys = target.noted(dataset.digest) | (target.noted(before) if before else set())
 
     def commit(keyed_record: tuple[str, Record]) -> str:
@@ -191,7 +193,7 @@ def _manifest(source: AnyStore, target: AnyStore, name: str) -> Manifest:
 
 
 class _Counted:
-    """The blocks of an object, as often as they are asked for; raises as `_counted` does."""
+    """The blocks of an object, which can be iterated repeatedly. Raises the errors of `_counted`."""
 
     def __init__(self, source: AnyStore, name: str, size: int, path: str) -> None:
         self._source, self._name, self._size, self._path = source, name, size, path
@@ -201,7 +203,7 @@ class _Counted:
 
 
 def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
-    """Yield blocks. Raises `DamagedError` after the last where they are not as many bytes as their manifest declares."""
+    """Yield blocks. Raises `DamagedError` after the last if their size is not the one declared by the manifest."""
     count = 0
     for block in blocks:
         count += len(block)
@@ -214,7 +216,7 @@ def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
 
 
 def _expect_room(target: AnyStore, needed: int) -> None:
-    """Raise `StorageError` if the disk of a store has less room than what is to be copied there takes."""
+    """Raise `StorageError` if the disk of a store has less free space than needed."""
     room = target.room()
     if room is not None and needed > room:
         raise StorageError(
@@ -224,7 +226,7 @@ def _expect_room(target: AnyStore, needed: int) -> None:
 
 
 def _named_digests(record: Record) -> set[str]:
-    """Return the digests of what a record names; none if it has not the form of a record: a store may hold anything."""
+    """Return the digests in a record; an empty set if it is malformed, because a store may contain anything."""
     identity, provenance = record["identity"], record["provenance"]
     try:
         formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)

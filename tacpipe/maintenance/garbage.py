@@ -1,7 +1,7 @@
-"""Find what in a store is still needed, and remove the rest.
+"""Find what is still needed in a store, and remove everything else.
 
-No clock decides what is needed. A process announces an object before it looks whether the object exists, and a collection
-moves objects aside before it reads the announcements. So one of the two sees the other.
+Needed content is not determined by a clock. A process announces an object before it checks that the object exists, and
+a collection moves objects aside before it reads the announcements. So at least one of the two notices the other.
 """
 
 from __future__ import annotations
@@ -27,48 +27,51 @@ from tacpipe.store.records import Record, digests
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
-GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
-_DRAFT_S = 3600.0  # a draft older than this belongs to nobody
-_YOUNG_S = 60.0  # a younger file is left alone
+GRACE_DAYS = 14.0  # how long a root with an unreachable path is kept, and how long files stay in quarantine
+_DRAFT_S = 3600.0  # older drafts are abandoned
+_YOUNG_S = 60.0  # younger files are not touched
 
 
 @dataclass
 class Collected:
-    """Counts of what `collect` removed, or would remove."""
+    """Number of items that `collect` removed, or would remove."""
 
     objects: int = 0
     bytes: int = 0
     records: int = 0
     drafts: int = 0
     checkpoints: int = 0
-    kept_recordings: int = 0  # ingested or acquired ones that nothing names any more
+    kept_recordings: int = 0  # ingested or acquired recordings that nothing refers to
 
 
 @dataclass
 class LiveObjects:
-    """Everything that is needed by roots, by what lies at their paths, by running processes, or as an ancestor of these."""
+    """Everything that is needed by roots, by datasets at their paths, by running processes, or as an ancestor of these."""
 
-    objects: set[str] = field(default_factory=set)  # digests, of manifests too
-    lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
-    replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
-    pages: set[str] = field(default_factory=set)  # digests of the pages of manifests, among all these
-    manifests: list[Manifest] = field(default_factory=list)  # manifests of recordings, among all these
-    doubtful: set[Path] = field(default_factory=set)  # files in quarantine that name what may be recordings
-    runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
+    objects: set[str] = field(default_factory=set)  # digests, including those of manifests
+    lasting: set[str] = field(default_factory=set)  # digests of replaced content that cannot be recomputed
+    replaced: set[str] = field(default_factory=set)  # digests of the manifests with this content
+    pages: set[str] = field(default_factory=set)  # digests of manifest pages among all these
+    manifests: list[Manifest] = field(default_factory=list)  # manifests of recordings among all these
+    doubtful: set[Path] = field(default_factory=set)  # quarantined files that name objects which may be recordings
+    runs: set[str] = field(
+        default_factory=set
+    )  # names of running processes' leases, which are prefixes of their drafts
 
 
 def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
-    """Return what is needed, with ``lasting`` also what was replaced and cannot be computed again.
+    """Return what is needed; with ``lasting``, also replaced content that cannot be recomputed.
 
-    Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
+    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because the content that it named is then
+    unknown.
     """
     needed, pending, replaced = LiveObjects(), [], []
-    for run in store.leases.runs():  # runs are read before roots: one that ends meanwhile has written its root
+    for run in store.leases.runs():  # runs are read before roots: a run that ends in between has written its root
         needed.runs.add(run.path.stem)
         needed.objects |= run.objects
         pending += run.manifests
-    datasets: dict[str, manifest_of.Found] = {}  # manifests that directories show, by digest
-    walked: dict[str, set[str]] = {}  # digests of all that a page names, by its digest
+    datasets: dict[str, manifest_of.Found] = {}  # manifests in directories, by digest
+    walked: dict[str, set[str]] = {}  # digests in a page, by the page's digest
     for root in store.roots.all():
         path = Path(root["path"])
         manifest_bytes, reached = None, root["kind"] == PUSHED
@@ -81,7 +84,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if manifest_bytes is None and not expired:
             pending.append(root["manifest"])
-        if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
+        if root["kind"] == PUSHED:  # each push is a snapshot that is kept until it is forgotten
             pending += [entry["manifest"] for entry in root.get("history", [])]
         elif lasting:
             replaced += [entry["manifest"] for entry in root.get("history", []) if entry["lasting"]]
@@ -104,7 +107,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
 
 
 def _lasting(store: Store, name: str) -> bool:
-    """Return whether a manifest whose directory is gone holds recordings or labels that cannot be computed again."""
+    """Return whether a manifest without a directory contains recordings or labels that cannot be recomputed."""
     try:
         manifest = manifest_of.stored(store, name)
     except MissingError:
@@ -113,9 +116,9 @@ def _lasting(store: Store, name: str) -> bool:
 
 
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
-    """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
+    """Remove unneeded content, records before their objects; with ``dry_run``, only count it.
 
-    Only what has the form of a store's own names is looked at, and no symbolic link is followed. Raises `LockedError` if
+    Only names of the store's own form are considered, and symbolic links are not followed. Raises `LockedError` if
     another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
     """
     if not store.check():
@@ -127,7 +130,7 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    # records are read before `live`: a damaged one goes to quarantine, which `live` reads
+    # records are read before `live`, because damaged ones go to quarantine, which `live` reads
     records = [*map(_brief, store.records())]
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
@@ -159,20 +162,22 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
                 moved_names.append(name)
     if moved_names:
         root_manifests = {root["manifest"] for root in store.roots.all()}
-        moved_names.sort(key=lambda name: name not in root_manifests)  # manifests of roots go before what they name
+        moved_names.sort(
+            key=lambda name: name not in root_manifests
+        )  # manifests of roots are moved before their objects
         _remove(store, moved_names, live(store, grace_days).objects, collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
 
 
 def _brief(keyed_record: tuple[str, Record]) -> tuple[str, str, bool]:
-    """Return the key of a record, the digests that it names, and whether it marks a recording: memory holds all records."""
+    """Return a record's key, its digests, and whether it marks a recording; compact, because all records stay in memory."""
     key, record = keyed_record
     return key, " ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable"))
 
 
 def _remove(store: Store, moved_names: list[str], needed: set[str], collected: Collected) -> None:
-    """Remove the objects that were moved aside, but for those that somebody needed in the meantime."""
+    """Remove the objects that were moved aside, except those that are needed again."""
     for name in moved_names:
         if name in needed:
             store.has(name)  # this puts it back
@@ -183,7 +188,7 @@ def _remove(store: Store, moved_names: list[str], needed: set[str], collected: C
 
 
 def _put_back(store: Store) -> None:
-    """Put back what a collection that was killed had moved aside."""
+    """Put back the objects that a killed collection moved aside."""
     for path in layout.entries(store.root, "tmp"):
         if path.name.startswith(layout.ASIDE) and store.has(path.name.removeprefix(layout.ASIDE)):
             path.unlink(missing_ok=True)
@@ -196,7 +201,7 @@ def _count(collected: Collected, path: str) -> None:
 
 
 def _young(path: str) -> bool:
-    """Return whether a file was written just now, by a clock that may have been set since."""
+    """Return whether a file was just written, even if the clock has been set since."""
     with contextlib.suppress(FileNotFoundError):
         return abs(time.time() - os.stat(path).st_mtime) < _YOUNG_S  # noqa: PTH116
     return True
@@ -217,10 +222,11 @@ def _closure(
     walked: dict[str, set[str]],
     recording_manifests: list[Manifest],
 ) -> set[str]:
-    """Return the digests of manifests, of those they descend from, and of all objects that these name.
+    """Return the digests of manifests, of their ancestors, and of all their objects.
 
-    Manifests of recordings are added to ``recording_manifests``. A page that was ``walked`` is not read again. Raises
-    `DamagedError` if something damaged is needed to know that, as a page of a manifest that a directory shows.
+    Adds manifests of recordings to ``recording_manifests``. Pages in ``walked`` are not read again. Raises
+    `DamagedError` if something that is needed to determine this is damaged, such as a page of a manifest in a
+    directory.
     """
     objects: set[str] = set()
     manifests: set[str] = set()
@@ -232,25 +238,25 @@ def _closure(
         try:
             manifest = datasets[name].manifest if name in datasets else manifest_of.stored(store, name)
             objects |= manifest.reached(walked)
-        except StorageError:  # the disk failed, or memory is short: what the manifest names is not known
+        except StorageError:  # the disk failed or memory is short, so the manifest's content is unknown
             raise
         except TacpipeError as error:
-            if name in datasets or store.quarantined(name) or store.has(name):  # it came here once
+            if name in datasets or store.quarantined(name) or store.has(name):  # it existed here once
                 raise DamagedError(
                     f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
                     "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
                     "continue without it, remove it from objects/ and quarantine/."
                 ) from error
-            continue  # it never came here: of a dataset that was copied or pulled without what it descends from
+            continue  # it never existed here: a dataset was copied or pulled without its ancestors
         pending += ancestors(manifest)
         recording_manifests += [manifest] if manifest.recorded else []
     return objects | manifests
 
 
 def _doubtful(store: Store) -> dict[Path, set[str]]:
-    """Return the digests in damaged records and manifests: nobody knows any more whether they were those of recordings.
+    """Return the digests in damaged records and manifests, which may be those of recordings.
 
-    Those that were recomputed, or brought back, are in doubt no longer.
+    Digests that were recomputed or restored are not included.
     """
     names_by_path = {}
     for path in layout.entries(store.root, "quarantine"):
@@ -265,27 +271,27 @@ def _doubtful(store: Store) -> dict[Path, set[str]]:
 
 
 def ancestors(manifest: manifest_of.Manifest) -> list[str]:
-    """Return the digests of the manifests that this one was made from."""
+    """Return the digests of the manifests that this one was computed from."""
     return [reference["manifest"] for references in manifest.inputs.values() for reference in references]
 
 
 def content(path: Path) -> tuple[bytes | None, bool]:
-    """Return the manifest that lies at a root's path, None if there is none; and whether the path is there.
+    """Return the manifest at a root's path, or None if there is none, and whether the path exists.
 
-    A path of which the system states no more than that it failed counts as there: an error is not an absence.
+    A path that the system fails to read counts as existing, because an error is not an absence.
     """
     try:
         return regular.content(path / manifest_of.NAME, regular.JSON_BYTES), True
     except (FileNotFoundError, NotADirectoryError):
         with contextlib.suppress(OSError):
-            return None, path.is_file()  # a report: its manifest lies in the store alone
+            return None, path.is_file()  # a report, whose manifest is only in the store
     except (OSError, regular.IrregularError):
         pass
     return None, True
 
 
 def _sound(content: bytes, path: Path) -> manifest_of.Found:
-    """Return the manifest that lies at a path. Raises `DamagedError` if it is not sound."""
+    """Return the manifest at a path. Raises `DamagedError` if it is invalid."""
     dataset = manifest_of.Found(path, content)
     try:
         dataset.manifest  # noqa: B018  (is it sound?)
@@ -299,12 +305,12 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
 
 
 def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
-    """Return whether a root's path has been out of reach for the whole grace.
+    """Return whether a root's path has been unreachable for the whole grace period.
 
-    The first look that does not reach it starts the clock, and one that reaches it stops the clock.
+    The first failed access starts the period, and a successful one resets it.
     """
     now_s = int(time.time())
-    since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # a clock may have been set back
+    since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # the clock may have been set back
     if since_s != root.get("missing_since_s") and not dry_run:
         marked: Root = {**root}
         if since_s is None:
@@ -321,20 +327,20 @@ def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, d
 def _sweep(
     store: Store, needed: LiveObjects, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
 ) -> None:
-    """Remove drafts, leases and checkpoints of runs that are over, and what was long in quarantine.
+    """Remove drafts, leases and checkpoints of ended runs, and files that have long been in quarantine.
 
-    What names objects that may be recordings stays there, unless ``doubtful`` asks for it.
+    Quarantined files that name possible recordings are kept, unless ``doubtful`` is set.
     """
     now_s = time.time()
     for path in layout.entries(store.root, "tmp"):
         if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
-        dead = path.name.startswith("run-")  # its run is over; without a run, an old draft is swept up
+        dead = path.name.startswith("run-")  # its run has ended; a draft without a run is removed when it is old
         with contextlib.suppress(FileNotFoundError):
             old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
             collected.drafts += old and _drop(path, dry_run=dry_run)
     for path in layout.entries(store.root, "quarantine"):
-        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400  # since it was moved there
+        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400  # since it was quarantined
         if old and (doubtful or path not in needed.doubtful):
             _drop(path, dry_run=dry_run)
     if not dry_run:

@@ -1,7 +1,7 @@
-"""Name the datasets that projects pushed, find one by its name, and refuse a push that would replace a newer one.
+"""Name the datasets that projects pushed, find a dataset by its name, and reject a push that would replace a newer one.
 
-A name belongs to a project: ``exp:data/rec`` is ``data/rec`` of the project ``exp``. Each push is a snapshot. The newest one
-is what a pull takes, and those before it are the history of the name.
+A name belongs to a project: ``exp:data/rec`` is ``data/rec`` of the project ``exp``. Each push is a snapshot. A pull
+reads the newest one; earlier ones are the history of the name.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from tacpipe.store.roots import PUSHED, Root, WrittenManifest, project_id
 from tacpipe.store.store import Store
 
 AnyStore = Store | RemoteStore
-MIN_DIGITS = 6  # digits by which a project or a manifest may be named
-_SHOWN_DIGITS = 8  # digits of a project's id, shown where another project has its name too
-_SHOWN = 20  # datasets listed before the rest is counted
+MIN_DIGITS = 6  # minimum number of digits that identify a project or a manifest
+_SHOWN_DIGITS = 8  # digits of a project's id, shown if several projects have its name
+_SHOWN = 20  # number of datasets listed before the others are counted
 
 
 def roots(store: AnyStore) -> list[Root]:
-    """Return the roots of what was pushed to a store, by name."""
+    """Return the roots of pushed datasets in a store, by name."""
     pushed_roots = [root for root in store.roots.all() if root["kind"] == PUSHED]
     return sorted(pushed_roots, key=lambda root: (str(root["path"]), project_id(root)))
 

@@ -46,9 +46,9 @@ class _Needed:
 
 
 def verify(store: RemoteStore) -> Soundness:
-    """Return the soundness of every object, record and root; nothing is changed.
+    """Return the soundness of every object, record and root. Changes nothing.
 
-    What vanishes between listing and reading was removed by a collection, and is not counted.
+    Objects that disappear between listing and reading were removed by a collection and are not counted.
     """
     if not store.check():
         return Soundness(there=False)
@@ -74,9 +74,9 @@ def verify(store: RemoteStore) -> Soundness:
 
 
 def missing(store: RemoteStore) -> set[str]:
-    """Return the digests of what the newest pushed manifests name and the place has not, as far as these can be read."""
+    """Return the digests that the newest pushed manifests name but the backend lacks, as far as these can be read."""
     absent: set[str] = set()
-    for _ in range(2):  # a second time: a root may have changed meanwhile
+    for _ in range(2):  # twice, because a root may change in between
         named_digests = _named_by_roots(store)
         absent = named_digests - set(store.sizes(named_digests))
         if not absent:
@@ -90,7 +90,7 @@ def _is_object(name: str) -> bool:
 
 
 def _read_error(store: RemoteStore, name: str) -> type[MissingError] | None:
-    """Return the error by which an object cannot be read, None for a sound one."""
+    """Return the error type with which reading an object fails, or None if it is intact."""
     try:
         for _ in store.blocks(name):
             pass
@@ -102,7 +102,7 @@ def _read_error(store: RemoteStore, name: str) -> type[MissingError] | None:
 
 
 def _named_by_roots(store: RemoteStore) -> set[str]:
-    """Return the digests of the newest manifests that were pushed, and of all that these name."""
+    """Return the digests of the newest pushed manifests, and of everything that they name."""
     named_digests: set[str] = set()
     for root in store.roots.all():
         named_digests.add(root["manifest"])
@@ -116,9 +116,10 @@ def _named_by_roots(store: RemoteStore) -> set[str]:
 def collect(
     store: RemoteStore, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS
 ) -> Collected:
-    """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
+    """Remove unneeded content, records before their objects; with ``dry_run``, only count it.
 
-    Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
+    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because the content that it named is then
+    unknown.
     """
     collected = Collected()
     if not store.check():
@@ -130,7 +131,7 @@ def collect(
     entries = {Path(entry.name).name: entry for entry in store.files.list("objects") if _is_object(entry.name)}
     needed = _needed(store)
     retained = set(needed.objects)
-    unneeded: dict[str, set[str]] = {}  # keys of records, and what they name
+    unneeded: dict[str, set[str]] = {}  # digests by record key
     for key, record in store.records():
         names = set(digests(record["result"]))
         if names <= needed.objects:
@@ -152,7 +153,7 @@ def collect(
 
 
 def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str]], collected: Collected) -> None:
-    """Move objects aside, read again what is needed, and remove what still nobody needs, records first."""
+    """Move objects aside, determine again what is needed, and remove what is still unneeded, records first."""
     mine = uuid.uuid4().hex
     asides = {entry.name: f"tmp/{layout.ASIDE}{Path(entry.name).name}-{mine}" for entry in surplus}
     moves = threads.map_in_threads(
@@ -178,7 +179,7 @@ def _run_all(work: Callable[[Item], object], items: Iterable[Item]) -> None:
 
 
 def _put_back(store: RemoteStore, entry: Entry) -> None:
-    """Put an object that this collection moved aside back into its place, unless it was copied there again."""
+    """Put an object that this collection moved aside back in place, unless it has been copied there again."""
     place = layout.object_name(_digest_of_aside(entry))
     if store.files.stat(place) is None:
         store.files.move(entry.name, place)
@@ -187,9 +188,10 @@ def _put_back(store: RemoteStore, entry: Entry) -> None:
 
 
 def _restore(store: RemoteStore, entry: Entry, *, dead: bool) -> None:
-    """Bring back what another collection moved aside, which was killed or is at work.
+    """Restore an object that another collection, running or killed, moved aside.
 
-    One at work deletes the object after it was copied, so its copy stays; one of a collection that is ``dead`` does not.
+    A running one deletes the moved object after it was copied, so its copy is kept; that of a ``dead`` collection is
+    not.
     """
     name = _digest_of_aside(entry)
     if not DIGEST.fullmatch(name):
@@ -206,7 +208,7 @@ def _digest_of_aside(entry: Entry) -> str:
 
 
 def _forget_dead(store: RemoteStore, grace_days: float) -> float:
-    """Remove announcements that are too old to be of a process that lives; return the time by the clock of the place."""
+    """Remove announcements too old for a living process; return the time by the backend's clock."""
     name = f"leases/run-{uuid.uuid4().hex}.lock"
     store.files.create(name, b"{}")
     entry = store.files.stat(name)
@@ -222,7 +224,7 @@ def _forget_dead(store: RemoteStore, grace_days: float) -> float:
 def _needed(store: RemoteStore) -> _Needed:
     """Return what announcements and roots need.
 
-    Announcements are read first: a run that ends meanwhile has written its root by then.
+    Announcements are read first: a run that ends in between has already written its root.
     """
     needed = _Needed()
     pending: list[str] = []
@@ -253,7 +255,7 @@ def _needed(store: RemoteStore) -> _Needed:
 
 
 def _manifest(store: RemoteStore, name: str) -> Manifest | None:
-    """Return a manifest, None for one that never came here. Raises `DamagedError` for one that is damaged."""
+    """Return a manifest, or None if it was never stored here. Raises `DamagedError` if it is damaged."""
     try:
         return manifest_of.stored(store, name)
     except AbsentError:
@@ -268,9 +270,9 @@ def _manifest(store: RemoteStore, name: str) -> Manifest | None:
 
 
 def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Manifest]) -> set[str]:
-    """Return the digests of manifests that hold the only copy of recordings or labels, though nothing names them.
+    """Return the digests of manifests that have no root but contain the only copy of recordings or labels.
 
-    The digests of all that these manifests name are among them.
+    The digests of everything in these manifests are included.
     """
     covered = {possession for manifest in recorded for possession, _ in replacing.possessions(manifest)}
     retained: set[str] = set()
@@ -279,7 +281,7 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
     ):
         if manifest is None:
             continue
-        with contextlib.suppress(pages.MissingPageError):  # a manifest without all of its pages may have held anything
+        with contextlib.suppress(pages.MissingPageError):  # a manifest with missing pages may have contained anything
             if all(possession in covered for possession, _ in replacing.possessions(manifest)):
                 continue
         retained |= {name, *manifest.reached({}, lenient=True)}
@@ -287,7 +289,7 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
 
 
 def _manifest_or_none(store: RemoteStore, name: str) -> Manifest | None:
-    """Return the manifest that an object is, or None if it is not one."""
+    """Return the manifest in an object, or None if it is not a manifest."""
     try:
         if store.begins(name, pages.BEGINS):
             return unnamed.from_page(store.read(name))

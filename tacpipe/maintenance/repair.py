@@ -1,4 +1,4 @@
-"""Show what is in a store, verify that it is sound, and repair it."""
+"""Show the content of a store, verify it, and repair it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import AbsentError, MissingError, Store
 
-_SHOWN = 10  # foreign files listed before the rest is counted
+_SHOWN = 10  # number of foreign files listed before the others are counted
 _Measured = Literal["objects", "records", "quarantine", "tmp", "checkpoints"]
 _MEASURED: tuple[_Measured, ...] = (
     "objects",
@@ -34,11 +34,11 @@ _MEASURED: tuple[_Measured, ...] = (
     "quarantine",
     "tmp",
     "checkpoints",
-)  # as the status lists them
+)  # in the order of the status
 
 
 class FolderSize(TypedDict):
-    """What lies beneath a folder of a store."""
+    """The number and size of files in a folder of a store."""
 
     files: int
     bytes: int
@@ -51,7 +51,7 @@ class RootStatus(Root):
 
 
 class StoreStatus(TypedDict):
-    """Where a store is, and what lies in it."""
+    """The location and content of a store."""
 
     store: str
     there: bool
@@ -59,7 +59,7 @@ class StoreStatus(TypedDict):
     records: FolderSize
     tmp: FolderSize
     roots: list[RootStatus]
-    running: list[Holder]  # runs at work
+    running: list[Holder]  # active runs
 
 
 class FolderStatus(StoreStatus):
@@ -73,25 +73,25 @@ class FolderStatus(StoreStatus):
 class Soundness:
     """Counts of objects and records that were read, the faults among them, and the repairs."""
 
-    there: bool = True  # False if there is no store yet
+    there: bool = True  # False if the store does not exist yet
     objects: int = 0
     records: int = 0
     foreign: list[str] = field(
         default_factory=list
-    )  # paths in the store that are not of its form; they stay as they are
-    damaged: list[str] = field(default_factory=list)  # digests and keys, now in quarantine
-    missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
+    )  # paths in the store that do not belong to it; they are not changed
+    damaged: list[str] = field(default_factory=list)  # digests and keys that are now in quarantine
+    missing: list[str] = field(default_factory=list)  # missing objects of roots' manifests
     repaired: list[str] = field(default_factory=list)
-    lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be recomputed
-    unread: dict[str, str] = field(default_factory=dict)  # digest or key to why the system failed to read it
+    lost: dict[str, str] = field(default_factory=dict)  # reason why it cannot be recomputed, by digest
+    unread: dict[str, str] = field(default_factory=dict)  # reason why the system failed to read it, by digest or key
 
     @property
     def clean(self) -> bool:
-        """Return whether all was read, nothing was damaged and nothing is missing."""
+        """Whether everything was read, and nothing is damaged or missing."""
         return not (self.damaged or self.missing or self.lost or self.unread)
 
     def to_text(self, *, changed: bool = True) -> str:
-        """Return the findings in words; ``changed`` is whether damaged files were moved to quarantine."""
+        """Return the findings as text. ``changed``: whether damaged files were moved to quarantine."""
         if not self.there:
             return "there is no store yet, so there is nothing to read"
         lines = [f"{self.objects} objects and {self.records} records read"]
@@ -114,10 +114,10 @@ class Soundness:
 
 
 def verify(store: Store) -> Soundness:
-    """Return the soundness of every object and record; damaged ones are moved to quarantine.
+    """Return the soundness of every object and record, moving damaged ones to quarantine.
 
-    What vanishes between listing and reading was removed by a collection, and is not counted. Raises `UsageError` for a
-    folder that is not a store.
+    Objects that disappear between listing and reading were removed by a collection and are not counted. Raises
+    `UsageError` for a folder that is not a store.
     """
     if not store.check():
         return Soundness(there=False)
@@ -129,13 +129,13 @@ def verify(store: Store) -> Soundness:
     store.roots.all()
     soundness.damaged += [f"root {name}" for name in store.roots.damaged()]
     missing = set(_absent_objects(store, soundness)) - set(soundness.damaged)
-    # a root may have changed meanwhile, so absent objects are looked for twice
+    # checked twice, because a root may change in between
     soundness.missing = sorted(missing & set(_absent_objects(store, soundness))) if missing else []
     return soundness
 
 
 def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> bool:
-    """Return whether something was there to read; note its name where it was damaged, or where the disk failed."""
+    """Return whether there was something to read; note its name if it was damaged or the disk failed."""
     try:
         read(name)
     except AbsentError:
@@ -148,7 +148,7 @@ def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> boo
 
 
 def repair(store: Store) -> Soundness:
-    """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
+    """Return the soundness after recomputing missing objects of roots, or adopting them from dataset directories."""
     if not store.check():
         return Soundness(there=False)
     with store.at_work():
@@ -176,7 +176,7 @@ def repair(store: Store) -> Soundness:
 
 
 def _rewrite_roots(store: Store) -> list[str]:
-    """Write damaged roots again whose datasets lie next to the store; return their names."""
+    """Rewrite damaged roots whose datasets are next to the store; return their names."""
     names, rewritten = store.roots.damaged(), []
     for place, folders, files in walk(store.root.parent, links=False) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]
@@ -193,9 +193,9 @@ def _rewrite_roots(store: Store) -> list[str]:
 
 
 def _rewrite_manifest(store: Store, root: Root) -> list[str]:
-    """Write the manifest at a root's path again where it is damaged; return its digest. What lay there goes to quarantine.
+    """Rewrite a damaged manifest at a root's path and return its digest. The damaged one goes to quarantine.
 
-    Only at paths that this user's own roots name: another user's could name any file that is called so.
+    Only for paths in this user's own roots, because another user's root could name any file.
     """
     path = Path(root["path"]) / manifest_of.NAME
     if root["kind"] == PUSHED or not path.is_file() or not store.roots.is_own(root):
@@ -203,7 +203,7 @@ def _rewrite_manifest(store: Store, root: Root) -> list[str]:
     try:
         manifest_of.find(path).manifest  # noqa: B018  (is it sound?)
         return []
-    except StorageError:  # it may be
+    except StorageError:  # it may be intact
         return []
     except TacpipeError:
         pass
@@ -218,7 +218,7 @@ def _rewrite_manifest(store: Store, root: Root) -> list[str]:
 
 
 def link(path: Path) -> int:
-    """Link the shards of the dataset at ``path`` again where they do not match its manifest; return how many."""
+    """Link the shards of the dataset at ``path`` again if they do not match its manifest; return their number."""
     dataset = manifest_of.find(path)
     manifest, directory = dataset.manifest, dataset.directory
     store = locate(directory)
@@ -234,7 +234,7 @@ def link(path: Path) -> int:
                 and file_digest(shard_path) == digest
             )
             if not (matches and store.has(digest)):
-                read(digest, name)  # heals the store first
+                read(digest, name)  # repairs the store first
             if not matches:
                 stale.append((name, digest))
         directory_of.refuse_links(directory, [name for name, _ in stale])
@@ -249,7 +249,7 @@ def link(path: Path) -> int:
 
 
 def status(store: Store) -> FolderStatus:
-    """Return where the store is, counts and bytes of what lies in it, its roots and the runs at work."""
+    """Return the location of the store, number and size of its files, its roots and active runs."""
     return {
         "store": str(store.root),
         "there": store.check(),
@@ -264,7 +264,7 @@ def status(store: Store) -> FolderStatus:
 
 
 def _measured(store: Store, name: _Measured) -> FolderSize:
-    """Return how many files lie beneath a folder of the store, and their bytes; what vanishes meanwhile is not counted."""
+    """Return number and size of the files in a folder of the store; files that disappear meanwhile are not counted."""
     sizes = []
 
     with readable_errors(store.root):
@@ -278,12 +278,12 @@ def _measured(store: Store, name: _Measured) -> FolderSize:
 def _reachable(root: Root) -> bool:
     try:
         return root["kind"] == PUSHED or Path(root["path"]).exists()
-    except OSError:  # a folder above it may not be entered
+    except OSError:  # a parent folder may not be accessible
         return False
 
 
 def status_text(value: FolderStatus) -> str:
-    """Return the status in words."""
+    """Return the status as text."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [
         f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _MEASURED
@@ -297,7 +297,7 @@ def status_text(value: FolderStatus) -> str:
 
 
 def _find(root: Root) -> manifest_of.Found | None:
-    """Return the manifest at a root's path, None if there is none that is sound and can be read."""
+    """Return the manifest at a root's path, or None if there is no valid, readable one."""
     return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
 
 
@@ -311,9 +311,9 @@ def _sound(directory: Path) -> manifest_of.Found | None:
 
 
 def _absent_objects(store: Store, soundness: Soundness) -> dict[str, str]:
-    """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name.
+    """Return the paths of missing objects that roots need, by digest: manifests, and everything in those at the paths.
 
-    What the system fails to read, or to look for, is noted in ``soundness``.
+    Objects that the system fails to read or to find are noted in ``soundness``.
     """
     paths_by_digest = {}
     for root in store.roots.all():

@@ -1,4 +1,4 @@
-"""Copy datasets to and from another store, a folder or a bucket, so that CI evaluates what a rig recorded."""
+"""Copy datasets to and from another store, in a folder or a bucket, so that CI can evaluate what a rig recorded."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import Root, RootProject, project_id
 from tacpipe.store.store import Store
 
-_LOOKS = 100  # pushes of one name that may come first
+_LOOKS = 100  # attempts if other pushes of the same name come first
 
 
 def named_store(remote: Path | str) -> AnyStore:
-    """Return the store at a path or an address, whether or not there is one. Raises `UsageError` for another address."""
+    """Return the store at a path or an address, whether or not it exists. Raises `UsageError` for an invalid address."""
     address = addresses.parsed(str(remote))
     if isinstance(address, Path):
         return Store(files.local(address).absolute())
@@ -37,7 +37,7 @@ def named_store(remote: Path | str) -> AnyStore:
 
 
 def remote_store(remote: Path | str) -> AnyStore:
-    """Return the store at a path or an address, which is only read. Raises `UsageError` if none is."""
+    """Return the existing store at a path or an address, for reading. Raises `UsageError` if there is none."""
     store = named_store(remote)
     if isinstance(store, RemoteStore):
         if not store.check():
@@ -55,7 +55,7 @@ def remote_store(remote: Path | str) -> AnyStore:
         ) from None
     except regular.IrregularError as error:
         raise UsageError(f"{remote} is not a store: {error}") from None
-    store.prepare()  # refuses one of another format
+    store.prepare()  # raises for another format
     return store
 
 
@@ -68,14 +68,14 @@ def push(
     replace: bool = False,
     project: str = "",
 ) -> Transferred:
-    """Copy datasets to the store at ``remote``: shards, files, records, and the manifests they descend from.
+    """Copy datasets to the store at ``remote``: shards, files, records, and the manifests of their ancestors.
 
-    With ``ancestors`` the shards of those go too. What lies in ``remote`` already is compared by size, with ``verify`` by
-    its bytes, and replaced where it is damaged. A name there belongs to this project, which with ``project`` becomes the one
-    that is called so there. What was pushed before stays as a snapshot.
+    With ``ancestors``, the ancestors' shards are copied too. Existing objects in ``remote`` are compared by size, or
+    with ``verify`` by content, and replaced if they are damaged. A name there belongs to this project; with
+    ``project``, this project becomes the one with that name. Earlier pushes are kept as snapshots.
 
-    Raises `UsageError` if another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
-    a shard that is damaged here and cannot be recomputed.
+    Raises `UsageError` if another dataset was pushed under the name in between, unless ``replace`` is set, and
+    `DamagedError` for a shard that is damaged here and cannot be recomputed.
     """
     target, transferred = named_store(remote), Transferred()
     for path in paths:
@@ -113,15 +113,15 @@ def push(
 
 
 def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, replace: bool = False) -> Transferred:
-    """Copy datasets from the store at ``remote``: those whose manifest lies at the path, else what was pushed from there.
+    """Copy datasets from the store at ``remote``: those with a manifest at the path, or else those pushed from there.
 
-    ``PROJECT:PATH`` is what another project pushed, and is written to that path of this one.
+    ``PROJECT:PATH`` is a dataset that another project pushed; it is written to that path in this project.
     """
     source, transferred = remote_store(remote), Transferred()
     for path in paths:
         dataset, name = _find_dataset(path, source)
         local_store = locate(dataset.directory)
-        manifest = dataset.manifest  # one edited by hand is refused before anything moves
+        manifest = dataset.manifest  # raises if the manifest was edited by hand, before anything is copied
         directory_of.check_output(local_store, dataset.directory)
         occupant = replacing.occupant(local_store, dataset.directory)
         if occupant is not None and occupant.content != manifest.content and not replace:
@@ -140,15 +140,15 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
 def bring(
     there: AnyStore, here: Store, found: manifest_of.Found, done: Transferred, *, ancestors: bool = False
 ) -> None:
-    """Copy what a dataset of another store needs into this one, which is at work on it. Raises as `push` does."""
+    """Copy what a dataset of another store needs into this one, within a run of this store. Raises the errors of `push`."""
     copying.copy(there, here, found, done, beside=(), ancestors=ancestors, verify=False)
 
 
 @contextlib.contextmanager
 def _announced(store: Store, manifest: str) -> Iterator[bool]:
-    """Hold off `gc` in a store that is read and yield True, or False if it may not be written, which a push does not need.
+    """Block `gc` in a store that is being read. Yields False if the store is read-only; a push does not need it.
 
-    Then a collection at the same time is not held off: what it removes before it was copied ends the push.
+    A concurrent collection is then not blocked: if it removes something before it is copied, the push fails.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -179,7 +179,7 @@ def _publish_name(
     *,
     replace: bool,
 ) -> None:
-    """Have ``name`` mean what was copied. Raises as `push` does where another push came first."""
+    """Make ``name`` refer to the copied dataset. Raises the errors of `push` if another push came first."""
     project: RootProject = {"id": owner.id, "name": owner.name}
     for _ in range(_LOOKS):
         lasting = before is not None and pushed.lasting(target, before["manifest"])
@@ -196,7 +196,7 @@ def _publish_name(
 def _predecessor(
     target: AnyStore, local_store: Store, dataset: manifest_of.Found, owner: Project, name: str, *, replace: bool
 ) -> Root | None:
-    """Return the root that a push succeeds, None if there is none. Raises `UsageError` as `push` does."""
+    """Return the root that a push replaces, or None if there is none. Raises `UsageError` as `push` does."""
     before = target.roots.pushed(name, owner.id)
     if before is None or replace:
         return before
@@ -210,9 +210,9 @@ def _predecessor(
 
 
 def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> None:
-    """Raise `TacpipeError` if a push of the same name wrote its root over this one's at the same time.
+    """Raise `TacpipeError` if a concurrent push of the same name overwrote this one's root.
 
-    The lease excludes that, but for file systems without locks; in a bucket it takes three pushes during one of them.
+    The lease prevents that, except on file systems without locks; in a bucket it would take three pushes during one.
     """
     root = target.roots.pushed(name, owner.id)
     if root is None or manifest not in pushed.manifests(root):
@@ -227,7 +227,7 @@ def _is_root_of(root: Root, owner: Project, name: str) -> bool:
 
 
 def _find_dataset(path: Path, source: AnyStore) -> tuple[manifest_of.Found, str]:
-    """Return the manifest at a path, else that which was pushed from there or by the project that is named, and its name."""
+    """Return the manifest at a path, or else the one pushed from there or by the named project, and its name."""
     directory = path.parent if path.name == manifest_of.NAME else path
     if (directory / manifest_of.NAME).exists():
         return manifest_of.Found(directory, manifest_of.find(directory).content, source), str(directory)

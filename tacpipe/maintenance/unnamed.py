@@ -1,8 +1,8 @@
-"""Find manifests in a store that no root names any more, and that hold what cannot be computed again.
+"""Find manifests in a store that have no root but contain irreplaceable content.
 
-A recording is marked as one by its record, by the manifests that name it, and by the roots that name these. Each of the
-three is enough: a manifest states by itself what it holds, so it is found among the objects where its root was lost. So is a
-page of a manifest: a recording with its raw files, and a label that was set by hand, is kept for the page alone.
+A recording is marked by its record, by the manifests that contain it, and by their roots. Each of the three is
+sufficient: a manifest describes its own content, so it is found among the objects if its root was lost. The same holds
+for a page of a manifest: recordings with raw files, and hand-set labels, are kept because of the page alone.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.store.store import Store
 
-_BEGINS = b"{\n"  # every manifest begins with it, and no Parquet file
-_SHARD = b"PAR1"  # a Parquet file begins and ends with it
+_BEGINS = b"{\n"  # prefix of every manifest, but of no Parquet file
+_SHARD = b"PAR1"  # prefix and suffix of a Parquet file
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A manifest or a page that no root names: its digest, what it holds that cannot be computed again, what it names."""
+    """A manifest or page without a root: its digest, its irreplaceable content, and the digests in it."""
 
     name: str
     holds: set[tuple[object, ...]]
@@ -36,14 +36,14 @@ class _Candidate:
 
 
 def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dict[str, set[str]]:
-    """Return the digests of those manifests and pages among ``objects`` that must be kept, with those of all that they name.
+    """Return the digests of manifests and pages among ``objects`` that must be kept, with all digests in them.
 
-    Those are the ones with recordings or labels that are neither in a ``known`` manifest nor in another one that is kept. An
-    object that may be a manifest or a page and is damaged is kept with whatever it names: nobody knows what it held.
+    These contain recordings or labels that are neither in a ``known`` manifest nor in another kept one. A damaged
+    object that may be a manifest or a page is kept with everything it names, because its content is unknown.
     """
     covered = {possession for manifest in known for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
-    candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # keyed by whether the candidate is a page
+    candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether the candidate is a page
     for name, content in _beginning(store, objects, (_BEGINS, pages.BEGINS)):
         if bytes_digest(content) != name:
             names[name] = digests(content)
@@ -66,7 +66,7 @@ def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dic
             if unlike:
                 object_digests = {digest for _, digest in manifest.objects()}
                 candidates[is_page].append(_Candidate(name, unlike, object_digests))
-        except MissingPageError:  # it may have held anything
+        except MissingPageError:  # it may have contained anything
             names[name] = manifest.reached({}, lenient=True)
     retained: set[tuple[object, ...]] = set()
     for is_page in (False, True):  # manifests come before pages
@@ -78,31 +78,31 @@ def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dic
 
 
 def from_page(content: bytes) -> Manifest:
-    """Return a manifest of what a page holds. Raises `TacpipeError` for what is not a page."""
+    """Return a manifest with the content of a page. Raises `TacpipeError` if it is not a page."""
     try:
         page = PageContent.from_bytes(content)
         page.check()
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise TacpipeError("It is not a page of a manifest.") from None
     manifest = Manifest("", 0, recordings=page.recordings, labels=page.labels, sources=page.sources)
-    manifest.__dict__["pages"] = None  # it is one
+    manifest.__dict__["pages"] = None  # the manifest contains the recordings itself
     return manifest
 
 
 def digests(content: bytes) -> set[str]:
-    """Return all digests in a text, however damaged it is; none of what looks like a shard."""
+    """Return all digests in a text, however damaged it is; an empty set for a shard."""
     if content.startswith(_SHARD) or content.endswith(_SHARD):
         return set()
     return set(DIGEST.findall(content.decode("latin-1")))
 
 
 def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
-    """Return the digests in those objects of these names that are pages of a manifest."""
+    """Return the digests in the objects with these names that are pages of a manifest."""
     return {digest for _, content in _beginning(store, names, (pages.BEGINS,)) for digest in digests(content)}
 
 
 def _beginning(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of the objects of these names that begin with a mark."""
+    """Yield name and content of the objects with these names that start with a mark."""
     for name in names:
         path = store.object_path(name)
         with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(Path(path), reading=True):
