@@ -14,7 +14,6 @@ import numpy as np
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
 from tacpipe.datasets.selection import PUBLISHED
-from tacpipe.io import Json
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts
@@ -25,7 +24,9 @@ from tacpipe.training.following import Line, read_history
 if TYPE_CHECKING:
     from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.datasets.manifest import ManifestJson
     from tacpipe.report.charts import Spec
+    from tacpipe.store.records import Step
     from tacpipe.tasks.task import ModelConfig
 
 
@@ -112,7 +113,7 @@ def _is_calibrated(result: Dataset) -> bool:
 def _result_key(result: Dataset) -> str:
     """Return what is the same of a model and its calibrated copy, and what they were evaluated on."""
     config = {key: value for key, value in read_json(result, "config.json").items() if key not in (*CALIBRATION, GROWS)}
-    inputs = {name: value for name, value in result.manifest.get("inputs", {}).items() if name != "model"}
+    inputs = {name: value for name, value in result.manifest["inputs"].items() if name != "model"}
     return json.dumps([config, inputs], sort_keys=True)
 
 
@@ -134,25 +135,23 @@ def is_published(result: Dataset, sets: Collection[str]) -> bool:
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
 
 
-def _params_of_step(step: Json) -> Settings:
-    """Return the params of a step of a chain by today's names."""
-    return params_of.with_current_names(str(step.get("stage")), step.get("params") or {})
-
-
-def provenance_blocks(manifest: Json) -> list[Block]:
+def provenance_blocks(manifest: ManifestJson) -> list[Block]:
     """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
-    steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
+    last: Step = {
+        "stage": manifest["stage"],
+        "version": manifest["version"],
+        "params": manifest["params"],
+        "fitted": None,
+    }
     rows = []
-    for step in steps:
-        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in _params_of_step(step).items())
-        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
-        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
-    dataset_digests = [("this result", str(manifest.get("digest", "")))]
-    for argument, inputs in manifest.get("inputs", {}).items():
-        datasets = inputs if isinstance(inputs, list) else [inputs]
-        dataset_digests += [
-            (argument, dataset["dataset"] if isinstance(dataset, dict) else str(dataset)) for dataset in datasets
-        ]
+    for step in (*manifest["chain"], last):
+        current_params = params_of.with_current_names(step["stage"], step["params"])
+        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in current_params.items())
+        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step["fitted"] or {}).items())
+        rows.append([step["stage"], str(step["version"]), params, fitted])
+    dataset_digests = [("this result", manifest["digest"])]
+    for argument, datasets in manifest["inputs"].items():
+        dataset_digests += [(argument, dataset["dataset"]) for dataset in datasets]
     digests = [[name, digest] for name, digest in dataset_digests if digest]
     return [
         table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows, words=True),

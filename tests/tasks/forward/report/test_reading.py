@@ -149,7 +149,7 @@ def test_results_without_errors_by_recording_or_all_trained_on_are_left_out() ->
     trained_on = errors({"model": dict.fromkeys(WINDOWS, 0.5)}, seen_recordings=tuple(WINDOWS))
     files = {name: content for name, content in plain.files.items() if name != "errors.parquet"}
     datasets = [
-        FakeDataset(plain.recordings, dataset_files)
+        FakeDataset(plain.recordings, dataset_files, plain.manifest)
         for dataset_files in (files, {**files, "errors.parquet": trained_on})
     ]
     assert methods.read_runs(datasets) == []  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from tacpipe.report.blocks import Section, SmallPrint
 from tacpipe.tasks.forward.report import events, methods, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
-from tests.tasks.forward.report.result_fakes import codec, errors, result
+from tests.tasks.forward.report.result_fakes import MANIFEST, codec, errors, result
 from tests.tasks.forward.report.test_reading import RATIO
 
 
@@ -233,7 +233,7 @@ def test_the_paper_figures_are_of_its_latents() -> None:
 def test_a_result_without_errors_by_recording_is_still_reported_next_to_others() -> None:
     plain: Any = FakeDataset(
         files={"metrics.json": b'{"counts": {"recordings": 0}}', "config.json": b'{"task": "forward"}'},
-        manifest={"stage": "evaluate"},
+        manifest=MANIFEST,
     )
     for results in ([plain], [result(), plain]):
         assert parts.cells(parts.tables(forward(*results)), "counts, recordings") == ["0"]
