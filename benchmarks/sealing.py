@@ -18,6 +18,7 @@ import timing
 from tacpipe.datasets.manifest import find
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.spool import Spool
+from tacpipe.recording.spool_folders import RecordingHeader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.store.store import Store
@@ -32,7 +33,7 @@ def write_spool(folder: Path, seconds: int) -> Path:
     sensor = rig_of.parse(RIG).streams["robot"].sensor
     store = Store(folder / ".tacpipe")
     store.prepare()
-    header = {"output": str(folder / "rec"), "recording": "long", "attributes": {}, "rig": RIG}
+    header: RecordingHeader = {"output": str(folder / "rec"), "recording": "long", "attributes": {}, "rig": RIG}
     spool = Spool(store.root, header, ["robot"])
     noise, total = np.random.default_rng(0), 0
     for second in range(seconds):

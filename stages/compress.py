@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, StoredAs
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Presets, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -58,7 +58,7 @@ class AutoencoderParams:
         "Model": ("frames", "components", "hidden", "representation", "search"),
         "Training": ("epochs", "batch", "learning_rate", "weight_decay", "patience", "seed"),
     }
-    PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
+    PRESETS: ClassVar[Presets] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
         """Refuse hidden layers next to a search, which chooses its own widths."""

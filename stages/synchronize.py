@@ -10,14 +10,14 @@ Example: tacpipe synchronize data/recordings -o data/synced
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
-from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Values, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Params(StreamSelection):
         return self.grid if self.rate_hz is None else "uniform"
 
     @staticmethod
-    def upgrade(stored: Mapping[str, Any]) -> dict[str, Any]:
+    def upgrade(stored: Values) -> Values:
         """Return stored params of any version by the names of this one: before version 3 values were interpolated."""
         if "values" in stored:
             return dict(stored)

@@ -111,7 +111,7 @@ def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_t
 
 def test_stored_values_are_read_without_the_checks_of_new_ones() -> None:
     stage = registry.load("segment.contacts")
-    stored = params_of.to_json(build_params("segment.contacts")) | {"on_count": 1.0, "min_s": -1.0}
+    stored = {**params_of.to_json(build_params("segment.contacts")), "on_count": 1.0, "min_s": -1.0}
     params = params_of.from_json(stage, stored)
     assert (params.on_count, params.min_s) == (1.0, -1.0)
 

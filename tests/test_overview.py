@@ -79,16 +79,19 @@ def test_a_result_is_shown_by_its_headline_its_baselines_and_what_it_rests_on(la
 def test_a_result_of_before_headlines_says_so() -> None:
     from tacpipe.cli import model_overview
 
-    value: dict[str, Any] = {
+    value: model_overview.ResultOverview = {
         "headline": None,
         "task": "t",
         "architecture": "a",
         "evaluated_on": {"n": 3},
         "by_part": {},
         "role": None,
+        "fold": None,
         "params": {},
+        "baselines": [],
+        "trained_on": {"roles": {}, "recordings": None},
+        "inputs": {},
     }
-    value |= {"baselines": [], "trained_on": {"roles": {}, "recordings": None}, "inputs": {}}
     assert "run `tacpipe evaluate` again" in model_overview.result_text(value)[0]
 
 

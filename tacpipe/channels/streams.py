@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed, plain
@@ -255,7 +255,7 @@ def describe_gaps(*tables: pa.Table | Columns) -> list[str]:
     ]
 
 
-def apart(attributes: Mapping[str, Any]) -> float:
+def apart(attributes: Mapping[str, str | float | bool | None]) -> float:
     """Return how many times the median step two rows of a recording may be apart with no row missing between."""
     return _APART.get(str(attributes.get(GRID, "uniform")), _UNIFORM)
 

@@ -15,6 +15,7 @@ import typer
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.plugins import registry
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -279,25 +280,29 @@ def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_j
 
     current, changes = labels.planned(dataset, labels_for)
     unmatched = sorted(set(current) - set(table[-1].by_recording(current)))
-    value: dict[str, Any] = {"schema_version": 1, "output": str(dataset), "key": table[-1].key, "without": unmatched}
+    value = {"schema_version": 1, "output": str(dataset), "key": table[-1].key, "without": unmatched}
     if dry_run:
-        value |= {"recordings": sorted(changes), "labels": changes}
-        terminal.result_json(value) if as_json else terminal.result(
-            _described(current, changes, len(current), unmatched)
-        )
+        if as_json:
+            terminal.result_json({**value, "recordings": sorted(changes), "labels": changes})
+        else:
+            terminal.result(_described(current, changes, len(current), unmatched))
         return
     changed = labels.change_each(dataset, labels_for) if changes else None
-    value |= {"recordings": [] if changed is None else changed.recordings, "labels": changes}
     if unmatched:
         terminal.note(f"tacpipe: {path} has no row for {len(unmatched)} recordings: {listed(unmatched)}.")
     if as_json:
-        terminal.result_json(value)
+        terminal.result_json({**value, "recordings": [] if changed is None else changed.recordings, "labels": changes})
         return
     terminal.note(f"{len(changes)} of {len(current)} recordings changed")
     terminal.result(dataset if changed is None else changed.directory)
 
 
-def _described(current: Mapping[str, Any], changes: Mapping[str, Any], count: int, unmatched: Sequence[str]) -> str:
+def _described(
+    current: Mapping[str, Mapping[str, Attribute]],
+    changes: Mapping[str, Mapping[str, Attribute]],
+    count: int,
+    unmatched: Sequence[str],
+) -> str:
     """Return one line per recording whose labels would change, then their number."""
     lines = [
         f"{plain(name)}: "

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe import printable
 from tacpipe.comparison import engine
@@ -17,6 +17,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics import headline
+from tacpipe.plugins.stage import Attribute
 from tacpipe.store.location import locate
 
 if TYPE_CHECKING:
@@ -26,6 +27,46 @@ if TYPE_CHECKING:
 METRICS = "metrics.json"
 _LISTED = 3  # Largest number of values that a cell lists
 _DIGITS = 9  # Significant digits, the same as in stored headlines
+
+
+class RowJson(TypedDict):
+    """A method in a comparison; numbers that are undefined are None."""
+
+    name: str
+    kind: str
+    settings: dict[str, Attribute]  # values in which the methods differ
+    errors: dict[str, float | None]
+    baseline: str | None
+    gain: float | None
+    low: float | None
+    high: float | None
+    p: float | None
+    n: int
+    recordings: int
+    runs: int
+    seeds: int
+    results: list[str]  # paths
+
+
+class ComparisonJson(TypedDict):
+    """The methods of one question."""
+
+    task: str
+    part: str
+    target: str
+    columns: list[str]
+    unit: str
+    ranked_by: str
+    measure: str
+    cluster: str
+    rows: list[RowJson]
+
+
+class ComparisonsJson(TypedDict):
+    """All comparisons, as ``tacpipe compare --json`` prints them."""
+
+    schema_version: int
+    comparisons: list[ComparisonJson]
 
 
 @dataclass(frozen=True)
@@ -62,11 +103,11 @@ class Compared:
         datasets = result.source.inputs.get("datasets", ())
         return " ".join(self.places.get(dataset["manifest"], dataset["dataset"][:8]) for dataset in datasets)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> ComparisonsJson:
         """Return all comparisons as plain values, undefined numbers as null."""
         return {"schema_version": 1, "comparisons": [self._json(comparison) for comparison in self.comparisons]}
 
-    def _json(self, comparison: Comparison) -> dict[str, Any]:
+    def _json(self, comparison: Comparison) -> ComparisonJson:
         return {
             "task": comparison.task,
             "part": comparison.question.part,
@@ -79,7 +120,7 @@ class Compared:
             "rows": [self._row(comparison, row) for row in comparison.rows],
         }
 
-    def _row(self, comparison: Comparison, row: engine.ComparisonRow) -> dict[str, Any]:
+    def _row(self, comparison: Comparison, row: engine.ComparisonRow) -> RowJson:
         model = row.kind in ("model", "variant", "control") and row.predictor.startswith("model")
         return {
             "name": row.name,
@@ -102,7 +143,10 @@ class Compared:
         """Return one line per predictor and question; each setting and each error has its column."""
         flat = [
             {
-                **{name: comparison[name] for name in ("task", "part", "target", "measure")},
+                "task": comparison["task"],
+                "part": comparison["part"],
+                "target": comparison["target"],
+                "measure": comparison["measure"],
                 **{name: value for name, value in row.items() if name not in ("settings", "errors", "results")},
                 **row["settings"],
                 **row["errors"],

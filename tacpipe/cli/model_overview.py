@@ -6,18 +6,20 @@ import json
 import math
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypedDict
 
 from tacpipe.cli import headline_table
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.lineage import identities_of_manifests
-from tacpipe.datasets.manifest import Found
+from tacpipe.datasets.manifest import Found, InputDataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.stage import Values
 from tacpipe.store.store import Store
+from tacpipe.training.following import Line
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
@@ -37,7 +39,60 @@ def is_result(opened: Dataset) -> bool:
     return METRICS in opened.files
 
 
-def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
+class ModelOrigin(TypedDict):
+    """The task and today's name of the architecture that a configuration names."""
+
+    task: str | None
+    architecture: str | None
+
+
+class TrainingCounts(TypedDict):
+    """The recordings that a model was trained on."""
+
+    recordings: int | None  # of training and validation
+    roles: Values  # numbers by role, or by role and sensor
+
+
+class ModelDescription(ModelOrigin):
+    """A configuration: what was trained on what, and other short entries as text."""
+
+    trained_on: TrainingCounts
+    about: dict[str, str]
+
+
+class BestEpoch(TypedDict):
+    """The epoch of least validation loss."""
+
+    epoch: int
+    loss: float
+
+
+class ModelOverview(ModelDescription):
+    """A model: task, architecture, training data, params and validation."""
+
+    parameters: int | None
+    epochs: int | None
+    validation: Values | BestEpoch | None
+    params: Values
+    inputs: dict[str, list[str]]  # paths and digests by name of the argument
+    chain: list[str]
+
+
+class ResultOverview(ModelOrigin):
+    """A result: the model against its baselines, the evaluated data and their role."""
+
+    headline: list[Values] | None
+    baselines: list[str]
+    evaluated_on: Values
+    by_part: dict[str, Values]
+    fold: int | None
+    role: str | None
+    trained_on: TrainingCounts
+    params: Values
+    inputs: dict[str, list[str]]  # paths and digests by name of the argument
+
+
+def of_model(opened: Dataset, store: Store) -> ModelOverview:
     """Return the overview of a model: task, architecture, training data, params and validation."""
     config, history = _tree(opened, CONFIG), _history(opened)
     return {
@@ -51,7 +106,7 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
     }
 
 
-def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
+def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
     """Return the overview of a result: the model against its baselines, the evaluated data and their role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
@@ -72,7 +127,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     }
 
 
-def model_text(value: Mapping[str, Any]) -> list[str]:
+def model_text(value: ModelOverview) -> list[str]:
     """Return the overview of `of_model` as lines: kind and validation, params, then inputs."""
     described = [
         ("task", value["task"]),
@@ -89,7 +144,7 @@ def model_text(value: Mapping[str, Any]) -> list[str]:
     return [_summary(value), "", *_aligned(described)]
 
 
-def _summary(value: Mapping[str, Any]) -> str:
+def _summary(value: ModelOverview) -> str:
     """Return architecture, task, epochs and the best epoch on one line."""
     parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
     if value["epochs"]:
@@ -99,7 +154,7 @@ def _summary(value: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
-def result_text(value: Mapping[str, Any]) -> list[str]:
+def result_text(value: ResultOverview) -> list[str]:
     """Return the overview of `of_result` as lines, the headline table first."""
     if value["headline"] is None:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
@@ -146,13 +201,13 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
         yield name, str(value)
 
 
-def _architecture(config: Mapping[str, Any]) -> dict[str, Any]:
+def _architecture(config: Values) -> ModelOrigin:
     """Return the task and today's name of the architecture that a configuration names, or None if it names none."""
     task, stored = config.get("task"), config.get("architecture")
     return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
 
 
-def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
+def _learned(config: Values) -> ModelDescription:
     """Return the task, architecture, training data and other short entries of a configuration."""
     trained = config.get("trained_on")
     return {
@@ -186,7 +241,7 @@ def _short(value: Any) -> str | None:
     return flat(value) if value not in (None, "") else None
 
 
-def _trained(trained: Mapping[str, Any]) -> list[str]:
+def _trained(trained: TrainingCounts) -> list[str]:
     lines = [
         f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
         for role, counts in trained["roles"].items()
@@ -195,7 +250,7 @@ def _trained(trained: Mapping[str, Any]) -> list[str]:
     return [*lines, *([headline.counted(count, "recordings") + " of training and validation"] if count else [])]
 
 
-def _input_rows(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _input_rows(inputs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
     return [
         (name if not at else "", described)
         for name, descriptions in inputs.items()
@@ -203,7 +258,7 @@ def _input_rows(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
+def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:
     """Return the path of each input, if the store knows it, and its digest."""
     places = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
     return {
@@ -214,7 +269,7 @@ def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
     }
 
 
-def _tree(opened: Dataset, name: str) -> dict[str, Any]:
+def _tree(opened: Dataset, name: str) -> Values:
     if name not in opened.files:
         return {}
     try:
@@ -224,16 +279,16 @@ def _tree(opened: Dataset, name: str) -> dict[str, Any]:
     return tree if isinstance(tree, dict) else {}
 
 
-def _history(opened: Dataset) -> list[dict[str, Any]]:
+def _history(opened: Dataset) -> list[Line]:
     lines = opened.files[HISTORY].splitlines() if HISTORY in opened.files else []
     return [json.loads(line) for line in lines if line.strip()]
 
 
-def _best(history: list[dict[str, Any]]) -> dict[str, Any] | None:
+def _best(history: list[Line]) -> BestEpoch | None:
     """Return the epoch of least validation loss, or None if the history has none."""
     validated = [line for line in history if isinstance(line.get("val_loss"), int | float)]
     best = min(validated, key=lambda line: line["val_loss"], default=None)
-    return {"epoch": best.get("epoch"), "loss": best["val_loss"]} if best else None
+    return {"epoch": best["epoch"], "loss": best["val_loss"]} if best else None
 
 
 def _parameters(opened: Dataset) -> int | None:

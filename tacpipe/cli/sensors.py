@@ -7,13 +7,14 @@ import sys
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
 from tacpipe.errors import DEVICE, TacpipeError
 from tacpipe.io import config_text, terminal
 from tacpipe.plugins import registry
+from tacpipe.sensors.sensor import Options
 
 if TYPE_CHECKING:
     from tacpipe.links.link import Address
@@ -41,13 +42,15 @@ def list_(as_json: AsJson = False) -> None:
 
     Example: tacpipe sensors list
     """
-    rows = [_row(name) for name in registry.sensors()]
+    rows = [_sensor_row(name) for name in registry.sensors()]
     if as_json:
         terminal.result_json({"schema_version": SCHEMA_VERSION, "sensors": rows})
         return
-    head = {"name": "sensor", "links": "links", "rate_hz": "rate", "baud": "baud", "summary": "what it is"}
-    table = [[head[key] for key in head], *([_cell(key, row[key]) for key in head] for row in rows)]
-    widths = [max(len(line[column]) for line in table) for column in range(len(head))]
+    table = [["sensor", "links", "rate", "baud", "what it is"]]
+    for row in rows:
+        values = {"links": row["links"], "rate_hz": row["rate_hz"], "baud": row["baud"], "summary": row["summary"]}
+        table.append([row["name"], *(_cell(key, value) for key, value in values.items())])
+    widths = [max(len(line[column]) for line in table) for column in range(len(table[0]))]
     for line in table:
         terminal.result("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
@@ -83,7 +86,18 @@ def probe(
         raise typer.Exit(DEVICE)
 
 
-def _row(name: str) -> dict[str, Any]:
+class SensorRow(TypedDict):
+    """A sensor in the list of all."""
+
+    name: str
+    links: list[str]
+    rate_hz: float | None
+    baud: int | None
+    summary: str
+    exclusive: str
+
+
+def _sensor_row(name: str) -> SensorRow:
     try:
         kind = registry.load_sensor(name)
     except TacpipeError as error:  # An error of one plug-in must not hide the other sensors.
@@ -162,7 +176,7 @@ def _stanza(report: Report) -> list[str]:
     ]
 
 
-def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str]:
+def _described(options: Options, notes: Mapping[str, str]) -> list[str]:
     """Return options as a TOML table, one per line, lists of tables over several lines, each with its note."""
     lines = ["", "[stream.options]"]
     for name, value in options.items():
@@ -174,7 +188,30 @@ def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str
     return lines
 
 
-def _json(report: Report) -> dict[str, Any]:
+class FindingJson(TypedDict):
+    """A sensor that may have sent the bytes, as ``--json`` prints it."""
+
+    sensor: str
+    options: Options
+    frames: int
+    rate_hz: float
+    explained: float
+    chance: float
+
+
+class PortJson(TypedDict):
+    """What was read at an address, as ``--json`` prints it."""
+
+    address: str
+    baud: int | None
+    asked: bool
+    bytes: int
+    error: str | None
+    certain: bool
+    findings: list[FindingJson]
+
+
+def _json(report: Report) -> PortJson:
     return {
         "address": report.address,
         "baud": report.baud,

@@ -6,9 +6,9 @@ The contents of the dataset decide what is shown, not the stage that made it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 from tacpipe import printable
 from tacpipe.channels import streams
@@ -20,7 +20,7 @@ from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ROLES
+from tacpipe.plugins.stage import ROLES, Attribute, Values
 from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
@@ -30,7 +30,56 @@ _TRUTH = "gt_"  # Prefix of a simulator's ground-truth labels
 _SPLIT = ("recording", "fold", "role")  # Columns of a split
 
 
-def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
+class DatasetOverview(TypedDict):
+    """The entries that every dataset has: stage, files and sizes."""
+
+    stage: str
+    digest: str
+    skipped: dict[str, str]  # reasons by recording
+    files: dict[str, int]  # bytes
+    bytes: int
+    rows: int
+
+
+class ShownModel(DatasetOverview, model_overview.ModelOverview):
+    """A model."""
+
+    kind: Literal["model"]
+
+
+class ShownResult(DatasetOverview, model_overview.ResultOverview):
+    """The result of an evaluation."""
+
+    kind: Literal["result"]
+
+
+class ShownExport(DatasetOverview):
+    """Files for other tools."""
+
+    kind: Literal["export"]
+
+
+class ShownSplit(DatasetOverview):
+    """A split of recordings."""
+
+    kind: Literal["split"]
+    params: Values
+    folds: dict[str, dict[str, int]]  # number of recordings by fold and role
+
+
+class ShownRecordings(DatasetOverview):
+    """Recordings, their figures and labels."""
+
+    kind: Literal["recordings"]
+    recordings: dict[str, dict[str, StreamFigures]]  # by recording and stream
+    attributes: Mapping[str, Mapping[str, Attribute]]
+    excluded: dict[str, str]  # reasons
+
+
+Shown = ShownModel | ShownResult | ShownExport | ShownSplit | ShownRecordings
+
+
+def of(path: Path, *, most: int | None = None) -> Shown:
     """Return the contents of the dataset at ``path``: its ``kind``, files, and further entries by kind.
 
     The kind is recordings, split, model, result or export. Of recordings, labels, and numbers a stream of the first ``most``
@@ -66,8 +115,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     }
 
 
-def _about(opened: Dataset) -> dict[str, Any]:
-    """Return the entries that every dataset has: stage, files and sizes."""
+def _about(opened: Dataset) -> DatasetOverview:
     manifest = opened.source
     return {
         "stage": manifest.stage,
@@ -114,22 +162,22 @@ def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> d
     return figures
 
 
-def to_text(value: dict[str, Any], *, full: bool = False) -> str:
+def to_text(value: Shown, *, full: bool = False) -> str:
     """Return the overview as lines: one per stream of each recording, then labels, files and totals."""
-    texts: dict[str, Callable[[dict[str, Any]], list[str]]] = {
-        "model": model_overview.model_text,
-        "result": model_overview.result_text,
-        "split": _split_text,
-        "export": lambda _: [],
-    }
-    if value["kind"] in texts:
-        origin = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        files = model_overview.files_text(value["files"], full=full)
-        return printable.lines([*texts[value["kind"]](value), *files, origin])
-    return printable.lines(_recordings_text(value, full))
+    if value["kind"] == "recordings":
+        return printable.lines(_recordings_text(value, full))
+    lines: list[str] = []
+    if value["kind"] == "model":
+        lines = model_overview.model_text(value)
+    elif value["kind"] == "result":
+        lines = model_overview.result_text(value)
+    elif value["kind"] == "split":
+        lines = _split_text(value)
+    origin = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
+    return printable.lines([*lines, *model_overview.files_text(value["files"], full=full), origin])
 
 
-def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
+def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
     listed_names, count = sorted(value["recordings"]), len(value["attributes"])
     lines = [
         f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
@@ -163,7 +211,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     return lines
 
 
-def _split_text(value: dict[str, Any]) -> list[str]:
+def _split_text(value: ShownSplit) -> list[str]:
     """Return how many recordings have each role, one line per fold."""
     roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
     widths = {role: max(8, len(role) + 2) for role in roles}
@@ -202,7 +250,7 @@ class _Values:
         return ", ".join(f"{value} ({count})" for value, count in sorted(self._counts.items()))
 
 
-def _labels(attributes: Mapping[str, Mapping[str, Any]], full: bool) -> list[str]:
+def _labels(attributes: Mapping[str, Mapping[str, Attribute]], full: bool) -> list[str]:
     """Return one line per label with its values, and one line for all labels of a simulator's ground truth."""
     lines = []
     values_by_label: dict[str, _Values] = {}

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.errors import UsageError
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
 
 if TYPE_CHECKING:
@@ -100,9 +101,9 @@ class RecordingOverview:
     gaps: Sequence[ShownInterval]
     label_spans: Sequence[ShownInterval]
     events: Sequence[RecordedEvent]
-    attributes: Mapping[str, Any]
+    attributes: Mapping[str, Attribute]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the overview as plain values."""
         return {"kind": "recording", **dataclasses.asdict(self)}
 
@@ -258,7 +259,7 @@ def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[flo
     import numpy as np
 
     rows, repeated_rows, saturated = 0, 0, 0
-    last: dict[str, Any] = {}
+    last: dict[str, int] = {}
     for batch in columns.batches(names):
         repeated = np.ones(batch.num_rows, dtype=bool)  # (time,)
         for name in names:
@@ -267,7 +268,7 @@ def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[flo
             saturated += int(((values == limits.max) | (values == limits.min)).sum())
             repeated[1:] &= values[1:] == values[:-1]
             repeated[:1] &= name in last and bool(values[0] == last[name])
-            last[name] = values[-1]
+            last[name] = int(values[-1])
         repeated_rows += int(repeated.sum())
         rows += batch.num_rows
         if rows >= SAMPLED_ROWS:
@@ -385,7 +386,7 @@ def _first(places: Sequence[str], full: bool) -> str:
     )
 
 
-def _attributes_text(attributes: Mapping[str, Any], full: bool) -> str:
+def _attributes_text(attributes: Mapping[str, Attribute], full: bool) -> str:
     names = sorted(attributes)
     listed_names = names if full else [name for name in names if not name.startswith(streams.TRUTH)][:_LABELS]
     lines = [f"  {shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]

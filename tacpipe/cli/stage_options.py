@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -15,6 +15,7 @@ from tacpipe.io import terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.fields import Annotation
 from tacpipe.plugins.stage import AnyStage, Requirements
 from tacpipe.training.devices import Device
 
@@ -22,7 +23,7 @@ PRINT_PARAMS = "--print-params"
 EXAMPLE = "Example: "  # Start of the last paragraph of a stage's docstring
 
 
-def of(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
     """Return the parameters of a stage's command; ``fields`` are those of its params, by name."""
     return [*_arguments(stage), *_shared(stage), *_options(stage, fields), *_looks(stage)]
 
@@ -88,7 +89,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     return parameters
 
 
-def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     panels = params_of.panels(stage)
     choice = _shown_choice(stage)

@@ -125,7 +125,6 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
 
 def _request(name: str, stage: AnyStage, params: Any, options: Mapping[str, Any]) -> Request:
     """Return what the options of a command request."""
-    paths: dict[str, Any] = {key: options.get(key) for key in PATHS}
     return Request(
         name,
         params,
@@ -141,8 +140,7 @@ def _request(name: str, stage: AnyStage, params: Any, options: Mapping[str, Any]
         rerun=options["rerun"],
         replace=options["replace"],
         track=tuple(options.get("track") or ()),
-        **paths,
-    )
+    ).with_paths({key: options.get(key) for key in PATHS})
 
 
 def _report_answers(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
@@ -188,15 +186,16 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         terminal.note(f"tacpipe: left out {line}")
     if not quiet:
         terminal.note(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s")
-    extra: dict[str, Any] = {}
+    headlines_json = None
     if headline is not None and (as_json or not quiet):
         from tacpipe.cli import headline_table
 
         headlines = headline_table.of_output(outcome.output, headline)
-        extra["headline"] = [entry.to_json() for entry in headlines or ()]
+        headlines_json = [entry.to_json() for entry in headlines or ()]
         if not quiet and headlines is not None:  # Tasks of other packages may have no headline.
             headline_table.show(headlines)
     if as_json:
+        extra = {} if headlines_json is None else {"headline": headlines_json}
         terminal.result_json({"schema_version": 1, **outcome.to_json(), **extra})
     else:
         terminal.result(outcome.output)

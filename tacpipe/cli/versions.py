@@ -5,12 +5,22 @@ from __future__ import annotations
 import platform
 import re
 from importlib import metadata
-from typing import Any
+from typing import TypedDict
 
 SCHEMA_VERSION = 1
 
 
-def of_parts() -> dict[str, Any]:
+class Versions(TypedDict):
+    """Versions of tacpipe, of Python and of the dependencies by extra; None for one that is not installed."""
+
+    schema_version: int
+    tacpipe: str
+    python: str
+    platform: str
+    parts: dict[str, dict[str, str | None]]
+
+
+def of_parts() -> Versions:
     """Return the version of tacpipe and of Python, and that of each dependency; None for one that is not installed.
 
     The dependencies are listed by extra; ``core`` is what every installation needs. ``all`` and ``dev`` are left out.
@@ -32,10 +42,10 @@ def of_parts() -> dict[str, Any]:
     }
 
 
-def to_text(found: dict[str, Any]) -> str:
+def to_text(versions: Versions) -> str:
     """Return the versions as lines: tacpipe, Python, and one line per extra."""
-    lines = [f"tacpipe {found['tacpipe']}", f"Python {found['python']} on {found['platform']}"]
-    for extra, libraries in found["parts"].items():
+    lines = [f"tacpipe {versions['tacpipe']}", f"Python {versions['python']} on {versions['platform']}"]
+    for extra, libraries in versions["parts"].items():
         shown = ", ".join(f"{name} {version or 'not installed'}" for name, version in libraries.items())
         lines.append(f"{extra}: {shown}")
     return "\n".join(lines)

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import pipeline
@@ -15,7 +14,7 @@ from tacpipe.engine.request import OPTIONS, Request
 from tacpipe.errors import ResultWarning, UsageError
 from tacpipe.io import terminal
 from tacpipe.plugins import fields, given_params, registry
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Values
 from tacpipe.training.devices import AUTO, Device
 
 Given = str | PathLike[str] | Dataset
@@ -46,7 +45,7 @@ def call(
     datasets: Sequence[Given],
     output: str | PathLike[str],
     arguments: Mapping[str, Given],
-    params: Mapping[str, Any],
+    params: Values,
     options: How,
 ) -> Dataset | Path:
     """Run stage ``name`` and return its output; see `tacpipe.run` for the arguments."""
@@ -54,7 +53,7 @@ def call(
     for flag, kind in OPTIONS.items():
         fields.check(getattr(options, flag), kind, flag)
     _refuse_unread(name, stage, datasets, arguments, options)
-    paths: dict[str, Any] = {key: _path(dataset) for key, dataset in arguments.items()}
+    paths = {key: _path(dataset) for key, dataset in arguments.items()}
     read = [_path(dataset) for dataset in datasets]
     request = Request(
         name,
@@ -78,8 +77,7 @@ def call(
         rerun=options.rerun,
         replace=options.replace,
         track=tuple(options.track),
-        **paths,
-    )
+    ).with_paths(paths)
     with terminal.showing_progress(options.progress):
         outcome = pipeline.run(request)
     for note in outcome.notes:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from tacpipe.engine import pipeline, provenance
 from tacpipe.engine.executors.local import Local
@@ -60,9 +59,9 @@ def _fold_request(request: Request, number: int) -> Request:
     def path(pattern: Path) -> Path:
         return Path(str(pattern).replace(PLACE, str(number)))
 
-    paths: Mapping[str, Any] = {name: path(pattern) for name, pattern in request.named_paths.items()}
+    paths = {name: path(pattern) for name, pattern in request.named_paths.items()}
     datasets = [path(pattern) for pattern in request.datasets]
-    return replace(request, fold=number, output=path(request.output), datasets=datasets, **paths)
+    return replace(request, fold=number, output=path(request.output), datasets=datasets).with_paths(paths)
 
 
 def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:

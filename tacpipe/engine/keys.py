@@ -154,11 +154,11 @@ def source_tasks(
     assert argument is not None
 
     def task(recording: str, source: Source) -> WorkerTask:
-        inputs: dict[str, object] = {argument: {file: digests[recording][file] for file in source.files}}
-        if values is not None:
-            inputs[values] = dict(source.values)
-        if called is not None:
-            inputs[called] = recording
+        inputs = {
+            argument: {file: digests[recording][file] for file in source.files},
+            **({} if values is None else {values: dict(source.values)}),
+            **({} if called is None else {called: recording}),
+        }
         task_identity = identity(name, stage.version, params, inputs)
         return WorkerTask(
             store.place, name, task_identity, recording, files={file: str(path) for file, path in source.files.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypedDict
 
 from tacpipe.engine import execution, provenance
 from tacpipe.errors import TacpipeError
@@ -13,12 +14,20 @@ from tacpipe.printable import listed
 from tacpipe.store.records import ComputedResult, Summary
 
 _NAMED = 5  # maximum number of recordings that a note names
-_FROM_RECORDS = (
-    "recordings_by_note",
-    "code",
-    "packages",
-    "unlike",
-)  # fields that `describe_results` turns into sentences
+
+
+class OutcomeJson(TypedDict):
+    """The outcome as a command prints it; the fields are those of `Outcome`."""
+
+    output: str
+    key: str
+    ran: int
+    reused: int
+    rows: int
+    seconds: float
+    bad: dict[str, str]
+    differs: list[str]
+    notes: list[str]
 
 
 @dataclass
@@ -97,10 +106,19 @@ class Outcome:
         described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
         return [*lines, *stages.values(), *(line for name, line in packages.items() if name not in described)]
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> OutcomeJson:
         """Return the outcome as JSON for the command's output."""
-        value = {name: value for name, value in vars(self).items() if name not in _FROM_RECORDS}
-        return {**value, "output": str(self.output)}
+        return {
+            "output": str(self.output),
+            "key": self.key,
+            "ran": self.ran,
+            "reused": self.reused,
+            "rows": self.rows,
+            "seconds": self.seconds,
+            "bad": self.bad,
+            "differs": self.differs,
+            "notes": self.notes,
+        }
 
 
 def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[str, int]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -73,6 +73,11 @@ class Request:
     def named_paths(self) -> dict[str, Path]:
         """Paths to read by argument name, without the datasets."""
         return {name: path for name in PATHS if (path := getattr(self, name)) is not None}
+
+    def with_paths(self, paths: Mapping[str, Path | None]) -> Request:
+        """Return the request with these paths to read, by argument name."""
+        fields: Any = paths
+        return replace(self, **fields)
 
     @property
     def locations(self) -> list[Path]:

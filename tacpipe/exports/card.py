@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.exports import contents
 from tacpipe.exports.contents import Column, Contents, Loss, stream_label
@@ -37,7 +37,7 @@ _TERMS = (  # terms of Croissant's own vocabulary
     *("includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
     *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
 )
-CONTEXT: Mapping[str, Any] = {
+CONTEXT: Mapping[str, str | dict[str, str]] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     **{term: f"cr:{term}" for term in _TERMS},
@@ -88,7 +88,7 @@ def croissant_json(about: About, described: Contents, patterns: Mapping[str, str
     )
 
 
-def _file_set(stream: str, pattern: str) -> dict[str, Any]:
+def _file_set(stream: str, pattern: str) -> dict[str, str]:
     return {
         "@type": "cr:FileSet",
         "@id": f"{stream}-files",
@@ -98,7 +98,10 @@ def _file_set(stream: str, pattern: str) -> dict[str, Any]:
     }
 
 
-def _record_set(stream: str, columns: Sequence[Column]) -> dict[str, Any]:
+CroissantField = dict[str, str | dict[str, dict[str, str]]]
+
+
+def _record_set(stream: str, columns: Sequence[Column]) -> dict[str, str | list[CroissantField]]:
     recording = Column("recording", "string", {"quantity": "name of the recording"})
     described_columns = [
         recording,
@@ -130,7 +133,7 @@ def column_ids(names: Sequence[str]) -> dict[str, str]:
     return ids
 
 
-def _field(stream: str, column: Column, identifier: str) -> dict[str, Any]:
+def _field(stream: str, column: Column, identifier: str) -> CroissantField:
     return {
         "@type": "cr:Field",
         "@id": f"{stream}/{identifier}",

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.channels import streams
 from tacpipe.printable import plain
@@ -175,6 +175,26 @@ def _sentence(stream: str | None, columns: Collection[str], reason: str) -> str:
     return f"column{'s' * (len(names) > 1)} {', '.join(names)} of {place}: {reason}" if names else f"{place}: {reason}"
 
 
+class StreamRow(TypedDict):
+    """A row of the table `STREAMS`: a stream of one recording."""
+
+    stream: str
+    rows: int
+    nan: bool
+    rate_hz: float | None
+    first_ns: int | None
+    last_ns: int | None
+
+
+class ColumnRow(TypedDict):
+    """A row of the table `COLUMNS`: a column of a stream."""
+
+    stream: str
+    column: str
+    type: str
+    about: str  # metadata as JSON
+
+
 @dataclass
 class _StreamTotals:
     """What the parts read so far hold of one stream."""
@@ -188,7 +208,7 @@ class _StreamTotals:
     differing: list[str] = field(default_factory=list)
     nan: bool = False
 
-    def add(self, recording: str, row: Mapping[str, Any], columns: tuple[Column, ...]) -> None:
+    def add(self, recording: str, row: StreamRow, columns: tuple[Column, ...]) -> None:
         """Add the stream of a recording: its row of the table `STREAMS` and its columns."""
         self.recordings.append(recording)
         self.rows += row["rows"]
@@ -244,7 +264,7 @@ def _describe_columns(schema: pa.Schema) -> list[Column]:
     return [Column(field.name, str(field.type), field_metadata(field)) for field in schema]
 
 
-def _columns_by_stream(rows: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:
+def _columns_by_stream(rows: Iterable[ColumnRow]) -> dict[str, tuple[Column, ...]]:
     columns_by_name: dict[str, list[Column]] = {}
     for row in rows:
         columns_by_name.setdefault(row["stream"], []).append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class Channel:
         )
 
 
-def synchronize_stage(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
+def synchronize_stage(rate_hz: float | None, master: str) -> dict[str, dict[str, str | float]]:
     """Return the stage that gives recordings one rate, with its params; none without a rate."""
     if rate_hz is None:
         return {}

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, files
@@ -81,7 +81,7 @@ class Params:
             )
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
+def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
@@ -194,7 +194,16 @@ def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream:
         yield Loss("missing values are written as NaN, 0 or empty text", stream, field.name)
 
 
-def _storage(values: AnyArray) -> dict[str, Any]:
+class Storage(TypedDict, total=False):
+    """How h5py stores an array."""
+
+    chunks: tuple[int, ...]
+    compression: str
+    compression_opts: int
+    shuffle: bool
+
+
+def _storage(values: AnyArray) -> Storage:
     """Return how an array is stored: in compressed chunks, but for one without rows, which has none."""
     if not len(values):
         return {}

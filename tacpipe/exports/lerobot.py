@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.channels.streams import GRID
 from tacpipe.errors import UsageError
@@ -35,7 +35,7 @@ from tacpipe.exports.lerobot_features import (
     features_of_frames,
     index_statistics,
 )
-from tacpipe.plugins.stage import RecordingOutput, Result, stage
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Result, stage
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ quantity of each column.
 """
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
+def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
@@ -202,7 +202,7 @@ def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:
     return tasks
 
 
-def _fill_task(task: str, labels: Mapping[str, Any]) -> str:
+def _fill_task(task: str, labels: Mapping[str, Attribute]) -> str:
     """Return the text of a task with the values of its labels."""
     return _PLACE.sub(lambda match: str(labels[match[1]]), task)
 
@@ -311,7 +311,11 @@ def _episodes(
     rows = []
     for episode, recording in enumerate(recordings):
         chunk, file = places[recording.name]
-        row: dict[str, Any] = {
+        stats = episode_statistics(frame_features, parts[recording.name], lengths[recording.name])
+        stats |= index_statistics(
+            lengths[recording.name], episode, starts[recording.name], order[tasks[recording.name]], fps
+        )
+        row = {
             "episode_index": episode,
             "tasks": [tasks[recording.name]],
             "length": lengths[recording.name],
@@ -323,16 +327,38 @@ def _episodes(
             "meta/episodes/file_index": 0,
             RECORDING: recording.name,
             ATTRIBUTES: json.dumps(dict(originals[recording.name].attributes), sort_keys=True),
+            **{f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()},
         }
-        stats = episode_statistics(frame_features, parts[recording.name], lengths[recording.name])
-        stats |= index_statistics(
-            lengths[recording.name], episode, starts[recording.name], order[tasks[recording.name]], fps
-        )
-        row |= {f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()}
         rows.append(row)
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
     return bytes(sink.getvalue().to_pybytes())
+
+
+class FeatureJson(TypedDict):
+    """A feature of the frames, as LeRobot describes it."""
+
+    dtype: str
+    shape: list[int]
+    names: list[str] | None
+
+
+class InfoJson(TypedDict):
+    """The description of a dataset, as LeRobot reads it."""
+
+    codebase_version: str
+    robot_type: str | None
+    total_episodes: int
+    total_frames: int
+    total_tasks: int
+    chunks_size: int
+    data_files_size_in_mb: int
+    video_files_size_in_mb: int
+    fps: float
+    splits: dict[str, str]
+    data_path: str
+    video_path: None
+    features: dict[str, FeatureJson]
 
 
 def _info(
@@ -341,8 +367,8 @@ def _info(
     lengths: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
-) -> dict[str, Any]:
-    described: dict[str, Any] = {
+) -> InfoJson:
+    described: dict[str, FeatureJson] = {
         feature.name: {
             "dtype": feature.dtype,
             "shape": feature.shape,
@@ -370,7 +396,14 @@ def _info(
     }
 
 
-def _feature_metadata(frame_features: Sequence[FrameFeature], described: contents.Contents) -> dict[str, Any]:
+class FeatureMetadata(TypedDict):
+    """What LeRobot has no place for."""
+
+    features: dict[str, dict[str, list[str]]]  # columns, units and quantities of each feature
+    columns: dict[str, dict[str, str]]  # type and metadata of each column of the synchronized table
+
+
+def _feature_metadata(frame_features: Sequence[FrameFeature], described: contents.Contents) -> FeatureMetadata:
     """Return units and quantities of each feature, and the columns of the synchronized table."""
     return {
         "features": {

@@ -16,7 +16,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -177,6 +177,24 @@ _DEFINITIONS = {
 }
 
 
+class TopicColumn(TypedDict):
+    """The column of a stream that a field of a message holds."""
+
+    field: str
+    name: str
+    type: str
+    about: dict[str, str]  # metadata
+
+
+class TopicMetadata(TypedDict, total=False):
+    """Where the messages of a topic come from."""
+
+    stream: str
+    columns: list[TopicColumn]
+    time: dict[str, str]  # metadata of the times
+    derived_from: str  # topic of the stream
+
+
 @dataclass(frozen=True)
 class Topic:
     """One topic of a recording: the type of its messages, their stamps (message,) and their parts."""
@@ -186,7 +204,7 @@ class Topic:
     definition: str
     t_ns: Int64s
     parts: Sequence[Part]
-    metadata: Mapping[str, Any] = field(default_factory=dict)  # JSON values
+    metadata: TopicMetadata = field(default_factory=TopicMetadata)
 
 
 def stream_topic(stream: str, table: pa.Table) -> Topic:
@@ -202,7 +220,7 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
     fields = field_names(names)
     parts: list[Part] = list(header_parts(t_ns, stream_label(stream)))
     lines = []
-    columns = []
+    columns: list[TopicColumn] = []
     for name in names:
         column, kind = table.column(name), table.schema.field(name).type
         lines.append(f"{TYPES[str(kind)]} {fields[name]}\n")
@@ -216,7 +234,7 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
             parts.append(Values(column_numbers(column)))
     message = f"{PACKAGE}/{_camel(stream_label(stream))}"
     definitions = {**_DEFINITIONS, message: _HEADER + "".join(lines)}
-    metadata = {"stream": stream, "columns": columns, "time": field_metadata(table.schema.field(TIME))}
+    metadata: TopicMetadata = {"stream": stream, "columns": columns, "time": field_metadata(table.schema.field(TIME))}
     name = f"/{topic_part(stream_label(stream))}"
     return Topic(name, _full_type(message), _definition(message, definitions), t_ns, parts, metadata)
 
@@ -232,7 +250,7 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
 
     def add(name: str, kind: str, stamps_ns: Int64s, parts: Sequence[Part]) -> None:
         values = [*header_parts(stamps_ns, stream_label(stream)), *parts]
-        metadata = {"derived_from": top}
+        metadata: TopicMetadata = {"derived_from": top}
         topics.append(
             Topic(f"{top}/{name}", _full_type(kind), _definition(kind, _DEFINITIONS), stamps_ns, values, metadata)
         )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,8 @@ from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
+    from zarr.abc.buffer import Buffer
+
     from tacpipe.arrays import AnyArray, ArrayType
     from tacpipe.datasets.dataset import Dataset, Recording
 
@@ -54,7 +56,7 @@ class Params:
     common: bool = False  # leave out columns that not all recordings have
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
+def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
@@ -128,7 +130,12 @@ class _ArrayWriter:
     """Takes the rows of an array in order and puts its chunks, compressed as zarr's own, into a temporary file."""
 
     def __init__(
-        self, path: str, shape: tuple[int, ...], kind: ArrayType, attributes: Mapping[str, Any], scratch: Scratch
+        self,
+        path: str,
+        shape: tuple[int, ...],
+        kind: ArrayType,
+        attributes: Mapping[str, Sequence[str]],
+        scratch: Scratch,
     ) -> None:
         import zarr
         from zarr.storage import MemoryStore
@@ -139,7 +146,7 @@ class _ArrayWriter:
         self._chunk_rows = max(1, min(shape[0], CHUNK_BYTES // row_bytes))
         self._waiting: list[AnyArray] = []
         self._rows = self._first_row = 0  # rows that wait, and the number of the first of them
-        self._encoded: dict[str, Any] = {}  # metadata, and the chunks of the last write
+        self._encoded: dict[str, Buffer] = {}  # metadata, and the chunks of the last write
         self._array = zarr.create_array(
             MemoryStore(self._encoded),
             shape=shape,
@@ -172,7 +179,8 @@ class _ArrayWriter:
             self._write(np.concatenate(self._waiting))
         self._scratch.check()
         chunks = {name: functools.partial(self._scratch.piece, *place) for name, place in self._places.items()}
-        return {f"{self._path}/{name}": content for name, content in {**self._metadata, **chunks}.items()}
+        files: dict[str, Content] = {**self._metadata, **chunks}
+        return {f"{self._path}/{name}": content for name, content in files.items()}
 
     def _write(self, values: AnyArray) -> None:
         self._array[self._first_row : self._first_row + len(values)] = values

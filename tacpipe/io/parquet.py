@@ -197,7 +197,7 @@ class ParquetTable:
         try:
             self._file = self._opened()
             stored = (self._file.metadata.metadata or {}).get(_KEY)
-            self._fields = None if stored is None else json.loads(stored)
+            self._fields = None if stored is None else json.loads(stored)["fields"]
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
             raise _read_error(self._size, error) from error
@@ -359,9 +359,9 @@ def _fields_to_json(schema: pa.Schema) -> bytes:
     return json.dumps({"fields": fields}, sort_keys=True, separators=(",", ":")).encode()
 
 
-def _with_fields(schema: pa.Schema, names: Sequence[str], stored: dict[str, Any]) -> pa.Schema:
+def _with_fields(schema: pa.Schema, names: Sequence[str], fields: dict[str, dict[str, list[int]]]) -> pa.Schema:
     metadata: dict[str, dict[str, str]] = {}
-    for key, values in stored["fields"].items():
+    for key, values in fields.items():
         for value, positions in values.items():
             for position in positions:
                 metadata.setdefault(names[position], {})[key] = value

@@ -11,6 +11,7 @@ from urllib.parse import parse_qsl
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import ports
 from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.ports import HidInterface
 from tacpipe.sensors.sensor import Sensor
 
 LONGEST_WAIT_S = 0.03  # the kernel keeps 63 reports, 63 ms of the fastest device, and then drops the newest
@@ -37,7 +38,7 @@ def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
     return HidLink(name, device)
 
 
-def choose_interface(place: str, interfaces: list[dict[str, Any]], usage_page: int | None, name: str) -> dict[str, Any]:
+def choose_interface(place: str, interfaces: list[HidInterface], usage_page: int | None, name: str) -> HidInterface:
     """Return the one of hidapi's ``interfaces`` that an address names.
 
     Raises `UsageError` for an invalid address, and `DeviceError` where no device or more than one matches.
@@ -64,7 +65,7 @@ def choose_interface(place: str, interfaces: list[dict[str, Any]], usage_page: i
     return ours[0]
 
 
-def _matches(info: dict[str, Any], device: str, options: dict[str, str]) -> bool:
+def _matches(info: HidInterface, device: str, options: dict[str, str]) -> bool:
     if info["path"].decode() != device and f"{info['vendor_id']:04x}:{info['product_id']:04x}" != device.lower():
         return False
     return (
@@ -74,7 +75,7 @@ def _matches(info: dict[str, Any], device: str, options: dict[str, str]) -> bool
     )
 
 
-def _open_error(path: str, info: dict[str, Any], name: str) -> DeviceError:
+def _open_error(path: str, info: HidInterface, name: str) -> DeviceError:
     if os.access(path, os.R_OK | os.W_OK):
         return DeviceError(f"{name}: {path} cannot be opened; unplug the device and plug it in again.")
     rule = (

@@ -7,12 +7,12 @@ import os
 import select
 import threading
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.printable import excerpt
+from tacpipe.sensors.sensor import LocalAddress
 
 SCHEMES = {
     "serial": "serial:/dev/ttyACM0",
@@ -66,7 +66,7 @@ class Link(Protocol):
         """Close the link. A second call does nothing."""
 
     @property
-    def local(self) -> Mapping[str, Any]:
+    def local(self) -> LocalAddress:
         """Values that a sensor may need to open its stream, such as the ``port`` on which this computer listens."""
 
     @property
@@ -138,7 +138,7 @@ class Opened:
             self._release()
 
     @property
-    def local(self) -> Mapping[str, Any]:
+    def local(self) -> LocalAddress:
         """Values that a sensor may need to open its stream; empty here."""
         return {}
 

@@ -8,14 +8,13 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Mapping
 from typing import Any
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import ports
 from tacpipe.links.link import SCHEMES, Arrivals, Arrived, Descriptor, LinkLostError
 from tacpipe.printable import plain
-from tacpipe.sensors.sensor import Sensor
+from tacpipe.sensors.sensor import LocalAddress, Sensor
 
 CONNECT_S = 5.0
 IDLE_S, EVERY_S, TIMES = (
@@ -181,7 +180,7 @@ class UdpLink(Descriptor):
         self._failed: LinkLostError | None = None  # loss of the link that is not reported yet
 
     @property
-    def local(self) -> Mapping[str, Any]:
+    def local(self) -> LocalAddress:
         """The local ``host`` and ``port``."""
         host, port = self.socket.getsockname()[:2]
         return {"host": host, "port": port}

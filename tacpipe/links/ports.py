@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.errors import DeviceError, MissingModuleError, UsageError
 from tacpipe.io import files
@@ -58,7 +58,7 @@ def serial_ports() -> list[Port]:
 def hid_ports() -> list[Port]:
     """Return the interfaces of HID devices, none where hidapi is not installed."""
     try:
-        interfaces = hid_module().enumerate()
+        interfaces: list[HidInterface] = hid_module().enumerate()
     except (DeviceError, MissingModuleError):
         return []
     return [
@@ -71,7 +71,19 @@ def hid_ports() -> list[Port]:
     ]
 
 
-def _described(described: dict[str, Any]) -> str:
+class HidInterface(TypedDict):
+    """An interface of a HID device, as hidapi lists it."""
+
+    path: bytes
+    vendor_id: int
+    product_id: int
+    product_string: str | None
+    serial_number: str
+    interface_number: int
+    usage_page: int
+
+
+def _described(described: HidInterface) -> str:
     place = f"interface {described['interface_number']} usage page {described['usage_page']:04x}"
     return f"{described['product_string'] or ''} {place}".strip()
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from time import monotonic
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from tacpipe.links.opening import open_link, run_dialogue
 from tacpipe.plugins import params, registry
 from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.sensor import Dialogue, Sensor, SerialLine
+from tacpipe.sensors.sensor import Dialogue, Options, Sensor, SerialLine
 
 # Kinds of links whose entries are packets, whose size is evidence too
 PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl", "v4l2", "mjpeg")
@@ -34,7 +33,7 @@ class SensorCandidate:
 
     kind: str  # registered name
     sensor: Sensor
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
 
     def __str__(self) -> str:
         described = ", ".join(

@@ -12,7 +12,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Literal, get_args
 
 from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
@@ -23,6 +23,7 @@ from tacpipe.live.wire import AlarmsJson, RecorderTap, SessionFigures
 from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import StreamNote
+from tacpipe.recording.spool_folders import ClockReading
 from tacpipe.sensors.framing import Chunks
 
 MODULE = "tacpipe.live.process"  # runs as the model's process
@@ -125,7 +126,7 @@ class Supervisor:
         """Pass a block of a stream to the model's process."""
         self.tap.put(stream, content)
 
-    def begin(self, clock: Mapping[str, int]) -> None:
+    def begin(self, clock: ClockReading) -> None:
         """Begin a recording, whose UTC is the monotonic clock and a constant."""
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self._beginning = None

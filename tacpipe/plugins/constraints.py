@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from tacpipe.errors import UsageError
 from tacpipe.io import regular
 from tacpipe.plugins import fields
+from tacpipe.plugins.stage import Values
 from tacpipe.printable import plain
 
 MAX_TOML_BYTES = 1 << 20  # maximum size of a TOML file
@@ -92,7 +93,7 @@ class Assignments:
     item_type: Any
     between: str = ","
 
-    def items(self, text: str) -> Mapping[str, Any]:
+    def items(self, text: str) -> Values:
         """Return the values of a valid text by name.
 
         >>> Assignments(float).items("biotac=0.025, roboskin=0.05")

@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from tacpipe.errors import MissingModuleError
 
@@ -109,7 +109,36 @@ def command(extra: str) -> str:
     return " ".join([pip, "install", *(shlex.quote(package) for package in packages)])
 
 
-def _pip_arguments(source: dict[str, Any], extra: str) -> list[str]:
+class VersionControl(TypedDict):
+    """The version of a repository that a distribution was installed from (PEP 610)."""
+
+    vcs: str
+    commit_id: str
+
+
+class InstalledFolder(TypedDict, total=False):
+    """The folder that a distribution was installed from (PEP 610)."""
+
+    editable: bool
+
+
+class DirectUrl(TypedDict):
+    """The direct URL that a distribution was installed from (PEP 610)."""
+
+    url: str
+    vcs_info: NotRequired[VersionControl]
+    dir_info: NotRequired[InstalledFolder]
+
+
+class StageFailure(TypedDict):
+    """The stage that raised an exception."""
+
+    stage: str
+    recording: str
+    frames: str  # of the traceback
+
+
+def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:
     """Return the arguments of ``pip install`` for an extra of a package with this direct URL."""
     url = str(source["url"])
     if "vcs_info" in source:
@@ -125,13 +154,13 @@ def _pip_arguments(source: dict[str, Any], extra: str) -> list[str]:
     return ["-e", requirement] if source.get("dir_info", {}).get("editable") else [requirement]
 
 
-def _source(distribution: Distribution) -> dict[str, Any] | None:
+def _source(distribution: Distribution) -> DirectUrl | None:
     """Return the direct URL that a distribution was installed from (PEP 610), or None if it is gone."""
     import json
     from pathlib import Path
 
     try:
-        value: dict[str, Any] = json.loads(distribution.read_text("direct_url.json") or "null")
+        value: DirectUrl = json.loads(distribution.read_text("direct_url.json") or "null")
         place = _path(str(value["url"]))
     except (ValueError, TypeError, KeyError):
         return None
@@ -220,7 +249,7 @@ def attach_stage(error: BaseException, stage: str, recording: str, outer: tuple[
 
 def failure_text(error: BaseException) -> str | None:
     """Return the message for an exception that a stage raised; None for other exceptions and if all frames are requested."""
-    failure: dict[str, Any] | None = getattr(error, _NAME, None)
+    failure: StageFailure | None = getattr(error, _NAME, None)
     if failure is None or os.environ.get(ALL_FRAMES):
         return None
     place = f" on recording {failure['recording']}" if failure["recording"] else ""

@@ -11,16 +11,18 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal, Protocol, get_args, get_origin, runtime_checkable
 
 from tacpipe.errors import UsageError
+from tacpipe.plugins.stage import Values
 from tacpipe.printable import excerpt, plain, suggestion
 
 REFUSED = object()
 _EXPONENT = re.compile(
     r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+"
 )  # YAML 1.1 reads 1e-3 as text, contrary to all other formats
+Annotation: typing.TypeAlias = Any  # type of a field, such as int | None or Literal["a", "b"]
 _HINTS: dict[
     type[Any], Mapping[str, Any]
 ] = {}  # cache, because evaluating the annotations of many fields takes milliseconds
@@ -38,7 +40,7 @@ class Constraint(Protocol):
         """Return the description that completes "it must be …". ``kind`` describes the type, as in "a whole number"."""
 
 
-def hints(kind: type[Any]) -> Mapping[str, Any]:
+def hints(kind: type[Any]) -> Mapping[str, Annotation]:
     """Return the annotation of each field of a dataclass, including constraints."""
     if kind not in _HINTS:
         annotations = typing.get_type_hints(kind, include_extras=True)
@@ -112,7 +114,7 @@ def fits(value: Any, annotation: Any) -> bool:
     return _fit(value, annotation, "") is not REFUSED
 
 
-def filled(kind: type[Any], values: Mapping[str, Any], place: str, noun: str = "param") -> Any:
+def filled(kind: type[Any], values: Values, place: str, noun: str = "param") -> Any:
     """Return the dataclass ``kind`` with ``values`` in place of defaults; an int becomes a float if a float is expected.
 
     Raises `UsageError` for unknown names, invalid values, and missing values without a default.
@@ -133,7 +135,7 @@ def filled(kind: type[Any], values: Mapping[str, Any], place: str, noun: str = "
     return kind(**fitting)
 
 
-def unknown(key: Any, names: Mapping[str, Any], place: str, noun: str) -> UsageError:
+def unknown(key: Any, names: Collection[str], place: str, noun: str) -> UsageError:
     """Return the error for a key that is not among ``names``."""
     shown_key = plain(key) if isinstance(key, str) else excerpt(key)
     valid = ", ".join(names) or "none"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.params import Kind
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Values
 from tacpipe.printable import excerpt, listed
 
 
@@ -42,7 +42,7 @@ def build(
     block: str | None = None,
     preset: str | None = None,
     sets: Sequence[str] = (),
-    options: Mapping[str, Any] | None = None,
+    options: Values | None = None,
 ) -> Any:
     """Return the params of stage ``name``.
 
@@ -99,7 +99,7 @@ def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
     return kind
 
 
-def _checked(stage: AnyStage, kind: Kind, setting: _Setting, before: Mapping[str, Any]) -> Any:
+def _checked(stage: AnyStage, kind: Kind, setting: _Setting, before: Values) -> Any:
     """Return the value of ``setting`` converted to the type of its field in ``kind``."""
     annotations, name = fields_of.hints(kind), params_of.tag(stage)
     if setting.key not in params_of.fields(stage):
@@ -156,7 +156,7 @@ def _from_file(path: Path, block: str, *, required: bool) -> list[_Setting]:
     return [_Setting(place, key, value) for key, value in _block(path, block, required=required).items()]
 
 
-def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
+def _block(path: Path, block: str, *, required: bool) -> Values:
     try:
         content = config_text.load_yaml(regular.content(path)) or {}
     except FileNotFoundError:

@@ -25,7 +25,7 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.constraints import StoredAs
 from tacpipe.plugins.fields import choices as choices
 from tacpipe.plugins.fields import filled as filled
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Presets, Values
 from tacpipe.printable import excerpt
 
 Kind = type[Any]  # a dataclass of params
@@ -61,9 +61,9 @@ def _tag_name(alternatives: Sequence[Kind]) -> str:
     return dataclasses.fields(alternatives[0])[0].name
 
 
-def fields(stage: AnyStage) -> dict[str, Any]:
+def fields(stage: AnyStage) -> Mapping[str, fields_of.Annotation]:
     """Return the annotation of each param of all kinds; choices of several kinds are joined."""
-    return dict(_fields(kinds(stage)))
+    return _fields(kinds(stage))
 
 
 def having(stage: AnyStage, field: str) -> list[str]:
@@ -131,13 +131,13 @@ def to_json(params: Any) -> dict[str, Any]:
     return stored if package is None else {**stored, architectures.PLUGIN: package}
 
 
-def to_input(params: Any) -> dict[str, Any]:
+def to_input(params: Any) -> Values:
     """Return the params with the names and choices used by options, ``params.yaml`` and ``--set``."""
     values = dataclasses.asdict(params)
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
-def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
+def from_json(stage: AnyStage, values: Values) -> Any:
     """Return the params from the result of `to_json`, of this or an older version, without checking values.
 
     Fields of other kinds are ignored, and removed fields are ignored if the stage reads whole datasets. Raises
@@ -155,12 +155,15 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
             f"What is stored was computed by another version of {stage.function.__name__}, with the param {removed[0]}, "
             f"which this version does not have. Run the stage again, or use that version."
         )
-    return kind(
-        **{k: tuple(v) if get_origin(annotations[k]) is tuple else v for k, v in current.items() if k in annotations}
-    )
+    return kind(**{k: tuple(v) if _is_tuple(annotations[k]) else v for k, v in current.items() if k in annotations})
 
 
-def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
+def _is_tuple(annotation: fields_of.Annotation) -> bool:
+    origin: Any = get_origin(annotation)
+    return origin is tuple
+
+
+def counting(stage: AnyStage, values: Values) -> Values:
     """Return the stored params that the chosen kind has, with current names; older versions stored those of all kinds.
 
     Returns all of them if the tag names no kind, such as an architecture that is not installed.
@@ -169,12 +172,12 @@ def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in current.items() if kind is None or name in fields_of.hints(kind)}
 
 
-def kind_of(stage: AnyStage, values: Mapping[str, Any]) -> Kind | None:
+def kind_of(stage: AnyStage, values: Values) -> Kind | None:
     """Return the kind of stored params, or None if the tag names no kind, such as an architecture that is not installed."""
     return _current(kinds(stage), values)[0]
 
 
-def with_current_names(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def with_current_names(stage: str, values: Values) -> Values:
     """Return stored params with current names and choices, or unchanged if ``stage`` is not installed."""
     from tacpipe.plugins import registry
 
@@ -185,7 +188,7 @@ def with_current_names(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return _current(alternatives, values)[1]
 
 
-def read(union: Any, values: Mapping[str, Any], place: str) -> Any:
+def read(union: Any, values: Values, place: str) -> Any:
     """Return the params in a model's configuration, as a dataclass or one of a ``union``.
 
     The configuration may be of an older version: missing fields get their default, removed fields are ignored, and only
@@ -232,7 +235,7 @@ def _stored_name(kind: Kind, name: str) -> str:
     return _stored_as(kind, name).name
 
 
-def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
+def _stored(kind: Kind, values: Values) -> dict[str, Any]:
     """Return params of ``kind`` with their stored names and choices."""
     stored = {}
     for name, value in values.items():
@@ -241,7 +244,7 @@ def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
     return stored
 
 
-def _current(alternatives: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
+def _current(alternatives: Sequence[Kind], values: Values) -> tuple[Kind | None, Values]:
     """Return the kind of stored params, or None if there is no such kind, and the params with current names and choices.
 
     Names that the kind does not have are unchanged.
@@ -269,7 +272,7 @@ def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]
     return current
 
 
-def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
+def _tagged(kind: Kind, name: str, values: Values) -> bool:
     """Return whether stored params have a choice of the tag ``name`` that belongs to ``kind``."""
     mark = _stored_as(kind, name)
     stored = values.get(mark.name)
@@ -312,8 +315,8 @@ def comments_of(kind: Kind) -> dict[str, str]:
 
 
 @functools.cache
-def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, Any]:
-    annotations: dict[str, list[Any]] = {}
+def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, fields_of.Annotation]:
+    annotations: dict[str, list[fields_of.Annotation]] = {}
     for kind in alternatives:
         for name, annotation in fields_of.hints(kind).items():
             if annotation not in annotations.setdefault(name, []):
@@ -332,7 +335,7 @@ def _joined(annotations: Sequence[Any]) -> Any:
     return annotations[0] if len(annotations) == 1 else typing.Union[tuple(annotations)]  # noqa: UP007
 
 
-def presets_of(kind: Kind | None) -> Mapping[str, Mapping[str, Any]]:
+def presets_of(kind: Kind | None) -> Presets:
     """Return the values of each preset of a kind of params, by its name."""
-    presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
+    presets: Presets = getattr(kind, "PRESETS", {})
     return presets

@@ -49,6 +49,7 @@ ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # path by name in the source
 Values = Mapping[str, Any]  # JSON values by name
+Presets = Mapping[str, Values]  # named sets of params
 RecordingName = str
 Fitted = Mapping[str, bytes]  # content by file name
 Trial = int
@@ -104,7 +105,7 @@ class Source:
 Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
 # (params, source) -> (path in the source -> reason why it is not read, "" for files used otherwise, such as labels)
 WhyUnread = Callable[[Any, Path], Callable[[str], str]]
-First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # params -> params of preceding stages by name
+First = Callable[[Any], Mapping[str, Values]]  # params -> params of preceding stages by name
 
 
 @dataclass(frozen=True)

@@ -210,8 +210,8 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
     attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
     attributes |= {**rig.labels, **spooled.header["attributes"]}
     attributes["ended"] = spooled.ended
-    if spooled.header.get("duration_s") is not None:
-        attributes["requested_duration_s"] = float(spooled.header["duration_s"])
+    if (duration_s := spooled.header.get("duration_s")) is not None:
+        attributes["requested_duration_s"] = float(duration_s)
     for name, stream in sealed.items():
         attributes[f"{name}_lost"] = stream.lost
         if not stream.rows:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from typing import Protocol
@@ -19,10 +19,12 @@ from tacpipe.recording import spool as spool_of
 from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.recording.spool import Spool, StreamNote
+from tacpipe.recording.spool_folders import ClockReading
 from tacpipe.recording.station import LOST, Station, explain_silence
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Options
 
 TICK_S = 0.05  # period of moving bytes to the spool; a crash costs about as much
 SYNC_S = 0.5  # period of syncing the spool
@@ -38,7 +40,7 @@ class Companion(Protocol):
     def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Receive bytes or a note of a stream. The reading threads call this."""
 
-    def begin(self, clock: Mapping[str, int]) -> None:
+    def begin(self, clock: ClockReading) -> None:
         """Begin a recording. ``clock`` has one reading of the monotonic clock and of UTC."""
 
     def end(self) -> None:
@@ -281,7 +283,7 @@ def _complete_stream(stream: RigStream) -> RigStream:
     return replace(stream, options=options, sensor=sensor)
 
 
-def _read_options(stream: RigStream) -> variants.Options:
+def _read_options(stream: RigStream) -> Options:
     chunks: list[tuple[int, bytes]] = []
     until_s = clock.now_s() + STATED_S
     with closing(opening.open_link(stream.address, stream.sensor, stream.name)) as link:

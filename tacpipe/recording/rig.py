@@ -17,17 +17,16 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import config_text, regular
 from tacpipe.links import link
 from tacpipe.plugins import params, registry
-from tacpipe.plugins.stage import Attribute
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.sensor import Sensor
 
@@ -44,8 +43,8 @@ class RigStream:
     kind: str  # the sensor's registered name
     sensor: Sensor
     address: link.Address
-    options: Mapping[str, Any] = field(default_factory=dict)  # options of the sensor, as written
-    emulate: Mapping[str, Any] = field(default_factory=dict)  # options of `tacpipe sensors emulate`
+    options: Values = field(default_factory=dict)  # options of the sensor, as written
+    emulate: Values = field(default_factory=dict)  # options of `tacpipe sensors emulate`
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,8 @@ class Rig:
     streams: Mapping[str, RigStream]
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
-    emulate: Mapping[str, Any] = field(default_factory=dict)
-    live: Mapping[str, Any] = field(default_factory=dict)  # options of `tacpipe live`, as written
+    emulate: Values = field(default_factory=dict)
+    live: Values = field(default_factory=dict)  # options of `tacpipe live`, as written
     text: str = ""  # the text of the file, which is stored with every recording
 
 
@@ -88,7 +87,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
         raise UsageError(f"{source} lists no stream; each is a table [[stream]] with name, sensor and transport.")
     streams: dict[str, RigStream] = {}
     for number, table in enumerate(tables, start=1):
-        stream = _stream(table, f"{source}, stream {_stream_label(table, number)}")
+        stream = _stream(table, f"{source}, stream {_stream_label(table.get('name', number))}")
         if stream.name in streams:
             raise UsageError(f"{source} has two streams named {stream.name}; names must be unique.")
         streams[stream.name] = stream
@@ -105,7 +104,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
     return Rig(streams, master, labels, _table(contents, "emulate", source), _table(contents, "live", source), text)
 
 
-def _stream(table: Mapping[str, Any], source: str) -> RigStream:
+def _stream(table: Values, source: str) -> RigStream:
     _refuse_unknown(table, KEYS, source)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
@@ -127,26 +126,25 @@ def _stream(table: Mapping[str, Any], source: str) -> RigStream:
     return RigStream(name, kind, sensor, address, options, emulate)
 
 
-def _table(table: Mapping[str, Any], key: str, source: str) -> Mapping[str, Any]:
+def _table(table: Values, key: str, source: str) -> Values:
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise UsageError(f"{source}: {key} is {excerpt(value)}; it must be a table, as in {key} = {{ … }}.")
     return value
 
 
-def build_sensor(kind: str, options: Mapping[str, Any], source: str) -> Sensor:
+def build_sensor(kind: str, options: Values, source: str) -> Sensor:
     """Return a sensor with these options. Raises `UsageError` for an unknown option or a value of a wrong type."""
     sensor: Sensor = params.filled(registry.load_sensor(kind), options, source, "option")
     return sensor
 
 
-def _stream_label(table: Mapping[str, Any], number: int) -> str:
+def _stream_label(name: object) -> str:
     """Return the name of a stream for errors."""
-    name = table.get("name", number)
     return plain(name) if isinstance(name, str) else excerpt(name)
 
 
-def _refuse_unknown(table: Mapping[str, Any], keys: tuple[str, ...], source: str) -> None:
+def _refuse_unknown(table: Iterable[str], keys: tuple[str, ...], source: str) -> None:
     for key in table:
         if key not in keys:
             raise UsageError(f"{source}: there is no key {plain(key)}; there are {', '.join(keys)}.")

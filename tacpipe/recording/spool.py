@@ -25,7 +25,7 @@ import struct
 import time
 import uuid
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,16 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sync_folder, write_whole
 from tacpipe.recording import spool_folders
-from tacpipe.recording.spool_folders import COMPLETED, FOLDER, INTERRUPTED, RECOVERED, refuse_link
+from tacpipe.recording.spool_folders import (
+    COMPLETED,
+    FOLDER,
+    INTERRUPTED,
+    RECOVERED,
+    ClockReading,
+    RecordingHeader,
+    SpoolHeader,
+    refuse_link,
+)
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
@@ -109,7 +118,7 @@ TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice after a full disk
 
 
-def read_clocks() -> dict[str, int]:
+def read_clocks() -> ClockReading:
     """Return one reading of the monotonic clock and the UTC time then, both in ns: the tightest of five tries."""
     tries = []
     for _ in range(5):
@@ -122,7 +131,7 @@ def read_clocks() -> dict[str, int]:
 class Spool:
     """A spool that is being written. One thread appends; the threads that read links `tally` their streams."""
 
-    def __init__(self, store: Path, header: Mapping[str, Any], streams: Sequence[str]) -> None:
+    def __init__(self, store: Path, header: RecordingHeader, streams: Sequence[str]) -> None:
         self.folder = store / FOLDER / uuid.uuid4().hex
         self.streams = {name: number for number, name in enumerate(streams)}
         self.clock = read_clocks()
@@ -130,7 +139,7 @@ class Spool:
         with readable_errors(store):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             self.folder.mkdir(mode=0o700)
-            entry = {**header, "streams": list(streams), "clock": self.clock}
+            entry: SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # until the process ends, so that no process recovers it meanwhile
             self._tally = _tally(self.folder, len(streams))
@@ -244,7 +253,7 @@ class Spooled:
                 content = file.read(HEADER_BYTES + 1)
             if len(content) > HEADER_BYTES:
                 raise ValueError(f"it has more than {HEADER_BYTES:,} bytes")
-            self.header: dict[str, Any] = json.loads(content)
+            self.header: SpoolHeader = json.loads(content)
             self.streams: list[str] = [str(name) for name in self.header["streams"]]
         except FileNotFoundError:
             raise TacpipeError(

@@ -18,11 +18,12 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from tacpipe.datasets import manifest, paths
 from tacpipe.errors import TacpipeError
 from tacpipe.io.files import listed
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.store import layout, location
 from tacpipe.store.layout import BESIDE_NAME
@@ -145,7 +146,7 @@ def output_path(store: Store, dataset: Path) -> str:
     return str(path.relative_to(project) if project is not None and path.is_relative_to(project) else path)
 
 
-def destination(header: Mapping[str, Any], store: Store, opened: Path | None) -> Path:
+def destination(header: SpoolHeader, store: Store, opened: Path | None) -> Path:
     """Return the dataset to which a spool is appended.
 
     It must be the output of this command (``opened``), or lie in the project of the store or of the current folder without
@@ -165,7 +166,32 @@ def destination(header: Mapping[str, Any], store: Store, opened: Path | None) ->
     )
 
 
-def check_header(header: Mapping[str, Any], streams: Iterable[str]) -> None:
+class ClockReading(TypedDict):
+    """The monotonic clock, and the UTC time then."""
+
+    monotonic_ns: int
+    utc_ns: int
+
+
+class RecordingHeader(TypedDict, total=False):
+    """The request for a recording, as the header of its spool states it."""
+
+    output: str  # path of the dataset
+    recording: str  # name
+    attributes: Mapping[str, Attribute]
+    duration_s: float | None  # requested duration
+    keep: bool  # the spool is retained
+    rig: str  # text of the rig file
+
+
+class SpoolHeader(RecordingHeader):
+    """The header of a spool; what another program wrote is checked by `spool_folders.check_header`."""
+
+    streams: list[str]
+    clock: ClockReading
+
+
+def check_header(header: SpoolHeader, streams: Iterable[str]) -> None:
     """Raise `TacpipeError` for a header that no dataset can represent. ``streams`` are those of its rig file."""
     name, attributes, clock = header.get("recording"), header.get("attributes"), header.get("clock")
     if not isinstance(name, str) or not is_name(name):
@@ -177,7 +203,7 @@ def check_header(header: Mapping[str, Any], streams: Iterable[str]) -> None:
             f"Its attributes are {excerpt(attributes)}; each must be text, a finite number, true or false."
         )
     duration_s = header.get("duration_s")  # older spools have none
-    if duration_s is not None and (not _is_attribute(duration_s) or isinstance(duration_s, str)):
+    if not (duration_s is None or (isinstance(duration_s, int | float) and _is_attribute(duration_s))):
         raise TacpipeError(f"Its duration is {excerpt(duration_s)}; it must be a number of seconds.")
     readings = [clock.get(key) for key in ("monotonic_ns", "utc_ns")] if isinstance(clock, dict) else [None]
     if not all(type(reading) is int and abs(reading) < MOST_NS for reading in readings):
@@ -224,8 +250,14 @@ MOST = 20  # lines
 UNCERTAIN = "_uncertain_samples"
 
 
+class StreamDuration(TypedDict, total=False):
+    """The duration of a stream among its other figures."""
+
+    duration_s: float
+
+
 def describe_incomplete(
-    attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, Mapping[str, Any]]
+    attributes: Mapping[str, Mapping[str, Attribute]], recordings: Mapping[str, Mapping[str, StreamDuration]]
 ) -> list[str]:
     """Return one line per recording that was cut off, and one per recording with uncertain arrivals.
 
@@ -234,13 +266,13 @@ def describe_incomplete(
     lines = []
     for name in sorted(attributes):
         values = attributes[name]
-        if values.get("ended") in REASONS:
+        if (ended := values.get("ended")) in REASONS:
             figures = recordings.get(name, {}).values()
             durations_s = [stream["duration_s"] for stream in figures if "duration_s" in stream]
             requested_s = values.get("requested_duration_s")
             part = f" of {requested_s:g}" if isinstance(requested_s, int | float) else ""
             duration = f", {max(durations_s):.1f}{part} s" if durations_s else ""
-            lines.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}{duration}")
+            lines.append(f"not completed: {plain(name)}: {REASONS[str(ended)]}{duration}")
         late = {stream: count for stream, count in values.items() if stream.endswith(UNCERTAIN)}
         if late:
             described = ", ".join(

@@ -21,7 +21,7 @@ from tacpipe.recording.appending import NothingError
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import ENDED, Spool, Spooled, StreamNote
-from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, users
+from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, RecordingHeader, users
 from tacpipe.recording.watch import RigView
 from tacpipe.store.store import Store
 
@@ -160,9 +160,15 @@ def _record(
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
-    described = {"output": spool_folders.output_path(store, plan.output), "recording": name, "attributes": attributes}
-    requested = {"duration_s": plan.duration_s, "keep": plan.keep_spool}
-    spool = Spool(store.root, {**described, **requested, "rig": recorder.rig.text}, list(recorder.stations))
+    header: RecordingHeader = {
+        "output": spool_folders.output_path(store, plan.output),
+        "recording": name,
+        "attributes": attributes,
+        "duration_s": plan.duration_s,
+        "keep": plan.keep_spool,
+        "rig": recorder.rig.text,
+    }
+    spool = Spool(store.root, header, list(recorder.stations))
     began_s = clock.now_s()
     ending = COMPLETED
 

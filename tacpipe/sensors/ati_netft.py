@@ -8,16 +8,15 @@ metre stands on the box's configuration page. Source: ATI, Net F/T manual 9620-0
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bytes, Floats
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -111,7 +110,7 @@ class AtiNetFT(Sensor):
     def _scale(self) -> Floats:
         return np.repeat([self.counts_per_force, self.counts_per_torque], 3)  # (axis,)
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Ask for records without end; the first of them is the reply."""
         yield Ask(request(START))
 

@@ -19,7 +19,7 @@ import numpy as np
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
-from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.sensor import Options, Samples, Sensor
 from tacpipe.video.encoding import jpeg_format
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _shape_of_frame(segment: bytes) -> ImageShape | None:
     return ImageShape(width, height, pixel_format) if pixel_format and width and height else None
 
 
-def options(data: Chunks) -> list[dict[str, Any]]:
+def options(data: Chunks) -> list[Options]:
     """Return the options that the packets of a camera state, as a list of one, empty until there is a frame."""
     packets = data.packets()
     settings = next((values for packet in packets if (values := unpack_settings(packet)) is not None), None)

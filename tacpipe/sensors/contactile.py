@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.pts import FreshFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -176,7 +176,7 @@ class Contactile(Sensor):
         frames[:, stop - 2 : stop] = sum16(frames[:, start : stop - 2]).astype("<u2")[:, None].view(np.uint8)
         return frames
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Set the rate, and whether slip is watched for."""
         yield Ask(f"f{self.rate_hz:.0f}\n".encode(), pause_s=0.1)
         yield Ask(b"S\n" if self.slip else b"s\n")

@@ -8,9 +8,8 @@ milliseconds and 1369 bytes, packed, little-endian, numbers as float32. Reading 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
@@ -151,7 +150,7 @@ class Franka(Sensor):
             states[name] = errors[:, number : number + 1] >> np.arange(FLAGS, dtype=np.uint64) & np.uint64(1)
         return states.view(np.uint8).reshape(len(samples), STATE.itemsize)
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Ask for the state at the port that the link listens on. Raises `DeviceError` if the arm refuses."""
         request = CONNECT.pack(CONNECT_COMMAND, 1, CONNECT.size, VERSION, local["port"])
         reply = yield Ask(request, whole, what="the arm's reply to a connection (FCI must be activated in Desk)")

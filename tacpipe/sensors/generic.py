@@ -17,9 +17,8 @@ sum = { kind = "sum8", number = "check", begin = 2 }
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing, PacketFramer
 from tacpipe.sensors.layout import Board, Clock, DescribedSensor, Length, Number, Order, Place, Sequence, Sum, device_ns
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -260,7 +259,7 @@ class Generic(DescribedSensor):
         place = self._places[name]
         place.put(frames, numbers[:, None].astype(place.kind))
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Write ``start``."""
         if self.start:
             yield Ask(_bytes("start", self.start))

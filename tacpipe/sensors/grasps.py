@@ -18,7 +18,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 
 import numpy as np
 
@@ -91,13 +91,30 @@ class GraspRequests(Sensor):
     def encode(self, samples: Samples) -> list[bytes]:
         """Return a request without a cloud for each run of samples whose grasps are counted from 0."""
         numbers, places = samples.values
-        requests: list[dict[str, Any]] = []
+        requests: list[GraspRequest] = []
         for (request, grasp), place in zip(numbers.tolist(), places, strict=True):
             if not grasp or not requests:
                 requests.append({"version": VERSION, "request": request, "cloud": None, "grasps": []})
             wrist = place[6:].reshape(3, 3).tolist() if np.isfinite(place[6:]).all() else None
             requests[-1]["grasps"].append({"g1": place[:3].tolist(), "g2": place[3:6].tolist(), "wrist": wrist})
         return [json.dumps(request).encode() for request in requests]
+
+
+class GraspPlace(TypedDict):
+    """Where a requested grasp touches the object, and the orientation of the wrist."""
+
+    g1: list[float]
+    g2: list[float]
+    wrist: list[list[float]] | None  # rotation matrix
+
+
+class GraspRequest(TypedDict):
+    """A request to predict grasps."""
+
+    version: int
+    request: int
+    cloud: None
+    grasps: list[GraspPlace]
 
 
 def is_request(text: bytes) -> bool:

@@ -14,16 +14,15 @@ long as half a period in it is torn. A frame is a scan: its CAN frames one behin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Int64s, Times
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Framer, FrameRun, FramingLoss
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -258,7 +257,7 @@ class IcubSkin(Sensor):
         scans[:, :, 1, DATA + 6 :] = np.ascontiguousarray(diagnostics, ">u2")[..., None].view(np.uint8)
         return scans.reshape(len(taxels), 2 * CAN * len(self.triangles))
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Configure board and triangles, and let the board send."""
         if self.old:
             yield self._command(OLD_TIMING, 1, 1, 1, 0, OFFSET >> 8, 0, 0, pause_s=0.01)

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor, SerialLine
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, SerialLine
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -105,7 +104,7 @@ class JustFloat(Sensor):
         tails = np.broadcast_to(np.frombuffer(TAIL, np.uint8), (len(floats), len(TAIL)))
         return np.hstack([floats.view(np.uint8), tails])
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Have a fulai stream; any other board streams by itself."""
         if self.model != "any":
             yield Ask(ON)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
 from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineNumbers, LineSum, Parser, line_sums
 from tacpipe.sensors.line_layout import LineSequence as Counter
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, Samples
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, LocalAddress, Samples
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -187,7 +187,8 @@ class Lines(DescribedSensor):
         return self._read(lines) is not None
 
     def _read(self, lines: Sequence[bytes]) -> Read | None:
-        return _read(self._parser, tuple(line.strip() for line in lines) if self.packets else tuple(lines))
+        read: Read | None = _read(self._parser, tuple(map(bytes.strip, lines)) if self.packets else tuple(lines))
+        return read
 
     def decode(self, frames: Frames) -> Samples:
         """Return the channels (line, channel), side by side by their type, with sequence and clock; comments hold none."""
@@ -236,7 +237,7 @@ class Lines(DescribedSensor):
                 words = [self.missing[0] if word == "nan" else word for word in words]
         return [cell.label + word for word in words]
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Write ``start``."""
         if self.start:
             yield Ask(self.start.encode())

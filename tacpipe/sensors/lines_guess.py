@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from tacpipe.arrays import Bools, Floats, Int64s, Times
 from tacpipe.sensors import layout
 from tacpipe.sensors.framing import Chunks, Pending
 from tacpipe.sensors.line_layout import LineSum, line_sums
+from tacpipe.sensors.sensor import Options, OptionValue
 
 FEWEST = 5  # lines that a guess takes
 MOST = 1000  # lines that are looked at
@@ -35,8 +35,6 @@ OFF = 0.2  # largest deviation of a clock from the arrivals of a second or two
 STEADY = 0.9  # fraction of the steps of a counter that are alike
 ROUND = 2  # significant digits of a rate
 
-Options = dict[str, Any]
-
 
 def of(data: Chunks) -> list[Options]:
     """Return the options of `Lines` for what came, at most one set; none where it is not lines of numbers."""
@@ -46,7 +44,7 @@ def of(data: Chunks) -> list[Options]:
     texts, t_ns = [lines[row] for row in rows], t_ns[rows]
     if len(texts) < FEWEST:
         return []
-    options: Options = {}
+    options: dict[str, OptionValue] = {}
     total, bodies = _sum(texts)
     cells_of_lines = _cells(bodies)
     if cells_of_lines is None:
@@ -64,9 +62,9 @@ def of(data: Chunks) -> list[Options]:
     rate_hz = _rate_hz(t_ns)
     sequence = _counter(numbers, is_integer)
     clock = _clock(numbers, is_integer, t_ns, sequence)
-    options["rate_hz"] = rate_hz
-    options["columns"] = _columns(names, labels, numbers, is_integer, sequence, clock)
-    flat = [column["name"] for column in options["columns"]] if names else None
+    columns = _columns(names, labels, numbers, is_integer, sequence, clock)
+    options |= {"rate_hz": rate_hz, "columns": columns}
+    flat = [column["name"] for column in columns] if names else None
     options |= {} if separator == "," or len(labels) == 1 else {"separator": separator}
     options |= {} if decimal == "." else {"decimal": decimal}
     options |= {"prefix": prefix} if prefix else {}
@@ -75,9 +73,9 @@ def of(data: Chunks) -> list[Options]:
     options |= {"comments": comments} if comments else {}
     options |= {"sum": total} if total else {}
     if sequence is not None:
-        options["sequence"] = {"column": flat[sequence] if flat else "count"}
         step = _step(numbers[:, sequence])
-        options["sequence"] |= {} if step == 1 else {"step": step}
+        column = flat[sequence] if flat else "count"
+        options["sequence"] = {"column": column, **({} if step == 1 else {"step": step})}
     if clock is not None:
         options["clock"] = {"column": flat[clock[0]] if flat else "device_time", "unit": clock[1]}
     return [options]
@@ -99,7 +97,7 @@ def _lines(data: Chunks) -> tuple[list[str], Times]:
     return lines, pending.arrivals(ends) if len(ends) else np.zeros(0, dtype=np.int64)
 
 
-def _sum(lines: Sequence[str]) -> tuple[Options | None, list[str]]:
+def _sum(lines: Sequence[str]) -> tuple[dict[str, str | bool] | None, list[str]]:
     """Return the check sum that every line ends with, and the lines without it."""
     tail = max(ALIKE * len(lines), FEWEST)
     marks = ["*"] if sum(bool(MARKED.search(line)) for line in lines) >= tail else [",", ";", "\t", " "]
@@ -114,7 +112,7 @@ def _sum(lines: Sequence[str]) -> tuple[Options | None, list[str]]:
     return None, list(lines)
 
 
-def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Options | None:
+def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> dict[str, str | bool] | None:
     base = 16 if digits == "hex" else 10
     words = [options.strip() for _, _, options in parted]
     try:
@@ -135,7 +133,7 @@ def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Opt
                 end = mark if through else ""
                 texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in parted]
                 if (line_sums(texts, total) == declared).mean() >= STEADY:
-                    options: Options = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
+                    options: dict[str, str | bool] = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
                     options["mark_summed"] = through
                     usual = {"mark": "*", "digits": "hex", "begin": "", "mark_summed": False}
                     return {name: value for name, value in options.items() if usual.get(name) != value}
@@ -231,9 +229,9 @@ def _columns(
     whole: Bools,
     sequence: int | None,
     clock: tuple[int, str] | None,
-) -> list[Options]:
+) -> list[dict[str, str]]:
     """Return the columns, those of a kind next to each other as one where nothing names them."""
-    options: list[Options] = []
+    options: list[dict[str, str]] = []
     taxels = 0
     for place in range(len(whole)):
         role = place == sequence or (clock is not None and place == clock[0])
@@ -248,7 +246,7 @@ def _columns(
             taxels += 1
             unit = {} if kind == "f32" else {"unit": "count"}
             last = options[-1] if options else {}
-            if last.get("type") == kind and str(last.get("name", "")).startswith("taxel{"):
+            if last.get("type") == kind and last.get("name", "").startswith("taxel{"):
                 last["name"] = re.sub(r"\.\.\d+", f"..{taxels}", last["name"])
             else:
                 options.append({"name": f"taxel{{{taxels}..{taxels}}}", "type": kind, **unit})

@@ -21,7 +21,7 @@ from tacpipe.channels.lsl import LslChannel
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
-from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.sensor import Options, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -150,7 +150,7 @@ def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
     return head + np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
 
 
-def options(data: Chunks) -> list[dict[str, Any]]:
+def options(data: Chunks) -> list[Options]:
     """Return the options of the stream whose description is among packets; none where none is."""
     for packet in data.packets():
         description = _described(packet) if packet[:1] == DESCRIPTION else None

@@ -7,9 +7,9 @@ Source: the package tactile-pressure-sdk 2.0.0 (MIT); MODBUS over Serial Line V1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -90,7 +90,7 @@ class ModbusTactile(Sensor):
         """Return what asks for all taxels."""
         return with_crc(bytes([self.address, PRESSURES]))
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Have the module wait to be asked, see that it has so many taxels, and set their unit.
 
         Raises `DeviceError` if it has more or fewer, or refuses.

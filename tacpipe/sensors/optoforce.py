@@ -7,9 +7,8 @@ Source: DAQ communication protocol, as read by the package optoforce 0.3.0 (MIT)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -93,7 +92,7 @@ class OptoForce(Sensor):
         body = np.hstack([header, words.view(np.uint8).reshape(len(axes), -1)])
         return np.hstack([body, sum16(body).astype(">u2")[:, None].view(np.uint8)])
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Set rate and filter; what the sensor showed before counts as load, see `taring`."""
         yield Ask(self._configure(SPEEDS[int(self.rate_hz)]))
 

@@ -9,7 +9,7 @@ Source: the package pyrobotiqtactile 0.1.2 (BSD-3-Clause).
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -20,7 +20,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -153,7 +153,7 @@ class Robotiq(Sensor):
         head = np.frombuffer(bytes([START, 0, SYNCHRONOUS, body.shape[1]]), np.uint8)
         return np.hstack([np.broadcast_to(head, (len(body), HEADER)), body])
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Have both fingers send all they have at once, at ``rate_hz``."""
         yield Ask(command(SYNCHRONOUS, bytes([self.period_ms])))
 

@@ -6,9 +6,9 @@ comment that is its help. Nothing here does input or output: a link carries the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 
 from tacpipe.arrays import AnyArray, Int64s, Times
 from tacpipe.errors import UsageError
@@ -85,6 +85,17 @@ class Device:
         return 0
 
 
+OptionValue = str | float | bool | Sequence[str] | Mapping[str, str | float | bool] | Sequence[Mapping[str, str]]
+Options = Mapping[str, OptionValue]  # options of a sensor, as a rig file states them
+
+
+class LocalAddress(TypedDict, total=False):
+    """The address on which a link of this computer listens."""
+
+    host: str
+    port: int
+
+
 class Sensor:
     """A product. Subclasses are frozen dataclasses, registered under the entry-point group ``tacpipe.sensors``."""
 
@@ -130,7 +141,7 @@ class Sensor:
         """Return the frames that hold these samples: the inverse of `decode`."""
         raise NotImplementedError
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Yield the requests that the device needs before it streams; ``local`` holds what the link knows (``port``)."""
         yield from ()
 

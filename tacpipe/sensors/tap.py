@@ -20,14 +20,13 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Floats
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.stage import Values
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-Record = Mapping[str, Any]
 
 ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
 TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
@@ -142,7 +141,7 @@ class Tap(Sensor):
         values = [_at(record, _path(entry)) for entry in self.numbers]
         return all(value is None or isinstance(value, float) or _is_whole(value) for value in values)
 
-    def _numbers(self, records: Sequence[Record]) -> Floats:
+    def _numbers(self, records: Sequence[Values]) -> Floats:
         """Return the numbers (sample, channel) of records, NaN where there is none."""
         numbers = np.full((len(records), len(self.numbers)), np.nan)
         for column, entry in enumerate(self.numbers):
@@ -153,7 +152,7 @@ class Tap(Sensor):
                     numbers[row, column] = value
         return numbers
 
-    def _grasps(self, records: Sequence[Record]) -> Floats:
+    def _grasps(self, records: Sequence[Values]) -> Floats:
         """Return points and wrist (sample, channel) of records, in the order of the columns."""
         rows = [[*grasp["g1"], *grasp["g2"]] for grasp in (record["grasp"] for record in records)]
         points = np.array(rows, dtype=np.float64).reshape(len(records), len(POINTS))
@@ -214,7 +213,7 @@ def _at(record: Any, path: Sequence[str]) -> Any:
     return record
 
 
-def _put(record: dict[str, Any], path: Sequence[str], value: float) -> None:
+def _put(record: Any, path: Sequence[str], value: float) -> None:
     for part in path[:-1]:
         record = record.setdefault(part, {})
     record[path[-1]] = value

@@ -9,9 +9,8 @@ Distances stay as they were sent, codes included: 0 is too near, 1 could not be 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc8
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,7 +67,7 @@ class TeraRanger(Sensor):
         body = np.hstack([marker, np.ascontiguousarray(distance, ">u2").view(np.uint8)])
         return np.hstack([body, crc8(body)[:, None]])
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Ask for binary frames and start the stream, which older firmware does by itself."""
         yield Ask(BINARY, pause_s=0.1)
         yield Ask(START)

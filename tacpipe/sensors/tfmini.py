@@ -21,9 +21,9 @@ distance what it states
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum8
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -116,7 +116,7 @@ class TfMini(Sensor):
         body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *further_columns])
         return np.hstack([body, sum8(body)[:, None]])
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Set unit and rate and switch the stream on; the original streams by itself and is given nothing."""
         if self.model == "original":
             return

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tacpipe.arrays import AnyArray, Bools, Bytes, Ints
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class UrRtde(Sensor):
             packages[name] = wire[:, 0] if packages[name].ndim == 1 else wire
         return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Agree on the version, ask for the outputs, start. Raises `DeviceError` where the controller refuses."""
         reply = yield _ask(VERSION, PROTOCOL.to_bytes(2, "big"))
         if reply[HEADER.size :] != b"\1":

@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from tacpipe.sensors import camera, lines_guess, lsl
 from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Options, OptionValue
 
-Options = dict[str, Any]
 GRIDS = {
     384: (12, 32),
     256: (16, 16),
@@ -61,9 +60,11 @@ def _flexitac(data: bytes) -> list[Options]:
 
 def _anyskin(data: bytes) -> list[Options]:
     sizes = [distance - 2 for distance in distances(data, b"\r\n")]
-    binary = [{"magnetometers": size // 16} for size in sizes if size and size % 16 == 0]
+    binary: list[Options] = [{"magnetometers": size // 16} for size in sizes if size and size % 16 == 0]
     lines = [line.split() for line in data.split(b"\n")[1:4] if _has_temperatures(line.split())]
-    text = [{"mode": "ascii", "magnetometers": count // 4} for count in sorted({len(words) for words in lines})]
+    text: list[Options] = [
+        {"mode": "ascii", "magnetometers": count // 4} for count in sorted({len(words) for words in lines})
+    ]
     return [*binary, *text] or [{}]
 
 
@@ -83,7 +84,7 @@ def _justfloat(data: bytes) -> list[Options]:
     return plain + [{"model": model} for model in ("fulai-3.0", "fulai-3.1", "fulai-3.2")]
 
 
-def _several(name: str, *values: object) -> Callable[[bytes], list[Options]]:
+def _several(name: str, *values: OptionValue) -> Callable[[bytes], list[Options]]:
     return lambda _: [{name: value} for value in values]
 
 

@@ -15,9 +15,9 @@ The time goes round after 11.9 hours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor, grid
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, grid
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -133,7 +133,7 @@ class WeissWts(Sensor):
             for tick, row in zip(ticks, cells, strict=True)
         ]
 
-    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+    def opening(self, local: LocalAddress) -> Dialogue:
         """Stop what still streams, compare the matrix with the options, start frames.
 
         Raises `DeviceError` where the sensor has another matrix, or states no.

@@ -178,10 +178,13 @@ def _counts(texts: Sequence[str], width: int) -> Counts:
 def _text(
     sensor: int, taxels: int, number: int, stamp_s: float, counts: Sequence[int], forces: Sequence[float] | None
 ) -> bytes:
-    reading: dict[str, Any] = {"sensor": str(sensor), "time": stamp_s, "taxels": taxels}
-    reading["data"] = ",".join(f"{count:04X}" for count in counts)
-    if forces is not None and all(math.isfinite(force) for force in forces):
-        reading["calibrated"] = forces
+    reading = {
+        "sensor": str(sensor),
+        "time": stamp_s,
+        "taxels": taxels,
+        "data": ",".join(f"{count:04X}" for count in counts),
+        **({"calibrated": forces} if forces is not None and all(map(math.isfinite, forces)) else {}),
+    }
     return json.dumps({"message": number, "time": stamp_s, "sensors": 1, str(sensor): reading}).encode()
 
 

@@ -9,6 +9,7 @@ and is missing after them, until a detection is where its neighbours suggest. Op
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -145,11 +146,10 @@ class MarkerTracker:
         tracked = np.flatnonzero(~np.isnan(self.positions_px[:, 0]))
         if not len(tracked):
             return expected, is_confirmed
-        options: dict[str, Any] = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": LEVELS}
-        follow: Any = cv2.calcOpticalFlowPyrLK
+        follow: Any = partial(cv2.calcOpticalFlowPyrLK, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS)
         start = self.positions_px[tracked].astype(np.float32)[:, None]
-        ahead, is_ahead, _ = follow(self.previous, grey, start, None, **options)
-        back, is_back, _ = follow(grey, self.previous, ahead, None, **options)
+        ahead, is_ahead, _ = follow(self.previous, grey, start, None)
+        back, is_back, _ = follow(grey, self.previous, ahead, None)
         agrees = np.linalg.norm((back - start)[:, 0], axis=1) < CONFIRMED_PX
         usable = is_ahead.ravel().astype(bool)
         expected[tracked[usable]] = ahead[usable, 0]

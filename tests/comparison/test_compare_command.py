@@ -114,7 +114,9 @@ def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None
 
     assert (first["settings"], first["results"]) == ({"width": 4}, ["r/small/0"])
     assert second["results"] == ["r/large/0", "r/large/1"] and second["runs"] == 2
-    assert first["gain"] == pytest.approx(1 - 1.25 / 4) and first["low"] <= first["gain"] <= first["high"]
+    assert first["gain"] == pytest.approx(1 - 1.25 / 4)
+    low, gain, high = first["low"], first["gain"], first["high"]
+    assert low is not None and gain is not None and high is not None and low <= gain <= high
     assert third["kind"] == "baseline" and third["gain"] is None and third["errors"] == {"error": 4.0}
     assert len(rows) == 3
     assert {row["width"]: float(row["gain"]) for row in rows[:2]} == {

@@ -14,6 +14,7 @@ import pytest
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import hid, ports
+from tacpipe.links.ports import HidInterface
 from tacpipe.sensors.generic import RawHid
 
 HERE = Path(__file__).parent
@@ -103,7 +104,7 @@ def test_a_board_that_is_unplugged_is_lost() -> None:
     assert summary["lost"].startswith("Stream board (hid:16c0:0486) is lost: it was unplugged")
 
 
-def interface(number: int, page: int, serial: str = "1", path: str = "") -> dict[str, Any]:
+def interface(number: int, page: int, serial: str = "1", path: str = "") -> HidInterface:
     return {
         "path": (path or f"/dev/hidraw{number}").encode(),
         "vendor_id": 0x16C0,

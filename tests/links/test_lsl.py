@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -71,13 +71,13 @@ def stop_outlet(process: subprocess.Popen[str]) -> int:
     return int(process.stdout.readline())
 
 
-def build_lsl(options: dict[str, Any] | None = None) -> lsl.Lsl:
+def build_lsl(options: Mapping[str, Any] | None = None) -> lsl.Lsl:
     sensor = rig.build_sensor("lsl", options or {}, "test")
     assert isinstance(sensor, lsl.Lsl)
     return sensor
 
 
-def opened(place: str, options: dict[str, Any] | None = None) -> Link:
+def opened(place: str, options: Mapping[str, Any] | None = None) -> Link:
     return open_link(parse(f"lsl:{place}"), build_lsl(options), "wrist")
 
 

@@ -38,6 +38,7 @@ from tacpipe.links import hid
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
 from tacpipe.recording import rig, spool, spool_folders
+from tacpipe.recording.spool_folders import SpoolHeader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store.records import Content, RecordingEntry, Shard, Step
 from tests.conftest import Lab, Ran
@@ -148,8 +149,14 @@ def _rig(data: bytes) -> object:
     return [stream.sensor.fields() for stream in parsed.streams.values()]
 
 
-HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": "", "streams": ["a", "b"]}
-HEADER |= {"clock": {"monotonic_ns": 1, "utc_ns": 2}}
+HEADER: SpoolHeader = {
+    "output": "o",
+    "recording": "r",
+    "attributes": {},
+    "rig": "",
+    "streams": ["a", "b"],
+    "clock": {"monotonic_ns": 1, "utc_ns": 2},
+}
 
 
 def _spool(data: bytes) -> object:

@@ -17,9 +17,10 @@ from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
+from tacpipe.recording.spool_folders import RecordingHeader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
-from tacpipe.sensors.sensor import Samples
+from tacpipe.sensors.sensor import LocalAddress, Samples
 from tests.conftest import Lab
 
 RIG = """
@@ -66,7 +67,7 @@ class Link:
     """A link that gives the items of a list and raises those that are errors."""
 
     packets, overruns, foreign, kernel_stamped = False, 0, 0, False
-    local: dict[str, Any] = {}  # noqa: RUF012
+    local: LocalAddress = {}  # noqa: RUF012
 
     def __init__(self, incoming: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:
         self.incoming, self.closing, self.pace_s = incoming, closing, pace_s
@@ -131,7 +132,7 @@ def test_a_driver_that_fails_ends_no_recording_and_other_streams_are_sealed(
     fail_on = [True]
     monkeypatch.setattr(OptoForce, "decode", fail)
     recorder = opened(monkeypatch, {"a": [Link(list(sent), pace_s=0.003)], "b": [Link([])]})
-    header = {"rig": RIG, "output": "", "recording": "r", "attributes": {}}
+    header: RecordingHeader = {"rig": RIG, "output": "", "recording": "r", "attributes": {}}
     with recorder.open():
         spool = Spool(tmp_path, header, ["a", "b"])
         with recorder.recording(spool):

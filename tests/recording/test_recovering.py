@@ -19,6 +19,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.sealing import seal
 from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.recording.spool_folders import RecordingHeader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.store import store as store_of
@@ -39,7 +40,12 @@ def rig(lab: Lab) -> Iterator[Emulator]:
 
 def spooled(lab: Lab, name: str = "one", text: str = RIG, unread: int = 0, count: int = 100) -> Path:
     """Write a spool as a process leaves it that was killed, ``unread`` chunks short of what it had received."""
-    header = {"output": str(lab.folder / "rec"), "recording": name, "attributes": {"material": "cork"}, "rig": text}
+    header: RecordingHeader = {
+        "output": str(lab.folder / "rec"),
+        "recording": name,
+        "attributes": {"material": "cork"},
+        "rig": text,
+    }
     spool = Spool(lab.folder / ".tacpipe", header, ["force"])
     sent = [(row * PERIOD_NS, frame) for row, frame in enumerate(frames(count))]
     size = sum(len(frame) for _, frame in sent)

@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 from tacpipe.errors import TacpipeError
 from tacpipe.recording import spool_folders
 from tacpipe.recording.spool import Spool, Spooled, StreamNote, Tallied
+from tacpipe.recording.spool_folders import RecordingHeader
 from tacpipe.sensors.framing import Chunks
 
 STREAMS = ["a", "b"]
-HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": ""}
+HEADER: RecordingHeader = {"output": "o", "recording": "r", "attributes": {}, "rig": ""}
 
 
 def pairs(blocks: list[tuple[str, Chunks | StreamNote]]) -> list[tuple[str, int, bytes]]:

@@ -20,6 +20,7 @@ from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.station import READ_S, Station
+from tacpipe.sensors.sensor import LocalAddress
 from tests.conftest import Lab
 from tests.recording import force_rig, live
 from tests.recording.scripted import Script
@@ -36,7 +37,7 @@ class Device:
     """A serial device that sends a frame a millisecond, and a computer that stops now and then."""
 
     overruns = foreign = 0
-    local: dict[str, Any] = {}  # noqa: RUF012
+    local: LocalAddress = {}  # noqa: RUF012
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, sent: list[bytes], stops: dict[int, int], asleep: bool = False):
         self.now_ns, self.asleep_ns = START_NS, 0

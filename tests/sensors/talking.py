@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Sensor
 
 
 def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> bytes:
@@ -33,7 +30,7 @@ def reply_of(ask: Ask, incoming: bytes) -> bytes:
     return incoming[slice(*span)]
 
 
-def opened(sensor: Sensor, local: Mapping[str, Any] | None = None, greeting: bytes = b"") -> Device:
+def opened(sensor: Sensor, local: LocalAddress | None = None, greeting: bytes = b"") -> Device:
     """Return the device of a sensor after the stream was opened."""
     device = sensor.device()
     assert carried_out(sensor.opening(local or {}), device, greeting) == greeting

@@ -297,7 +297,8 @@ def test_a_guess_finds_the_options_that_wrote_the_lines(board: str) -> None:
 def test_a_header_that_the_board_prints_names_the_columns() -> None:
     text = "boot\n# n, Fx (N), fy\n" + "".join(f"{row},{row / 7:.3f},{row / 3:.2f}\n" for row in range(40))
     (guessed,) = lines_guess.of(Chunks.of([(row, part.encode() + b"\n") for row, part in enumerate(text.split("\n"))]))
-    assert [column["name"] for column in guessed["columns"]] == ["n", "fx_n", "fy"]
+    columns: Any = guessed["columns"]
+    assert [column["name"] for column in columns] == ["n", "fx_n", "fy"]
     assert guessed["comments"] == ["#"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def test_weights_and_their_sums_stay_in_float32(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stage", ["train.forward", "train.material", "train.touch"])
 def test_the_precision_is_in_a_key_where_it_is_not_the_default(stage: str) -> None:
-    def stored(**options: Any) -> dict[str, Any]:
+    def stored(**options: Any) -> Mapping[str, Any]:
         choice = {"train.forward": "gru", "train.material": "raec", "train.touch": "patches"}[stage]
         return params_of.to_json(
             given_params.build(stage, registry.load(stage), options={"architecture": choice, **options})

@@ -18,7 +18,7 @@ import multiprocessing
 import os
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from multiprocessing import util
 from pathlib import Path
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-def local_versions(stage: str) -> dict[str, Any]:
+def local_versions(stage: str) -> dict[str, str]:
     """Return the versions that must match for another process to compute a task of ``stage``.
 
     Raises `UsageError` if the stage does not exist.
@@ -57,7 +57,7 @@ def local_versions(stage: str) -> dict[str, Any]:
     }
 
 
-def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
+def unlike(local: Mapping[str, str], worker: Mapping[str, str]) -> list[str]:
     """Return phrases about the differences between a ``worker`` and this process.
 
     >>> unlike({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
@@ -187,8 +187,8 @@ class Dask:
                 messages.put(None)
                 thread.join()
 
-    def _workers(self) -> Mapping[str, Any]:
-        workers: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
+    def _workers(self) -> Collection[str]:
+        workers: Collection[str] = self.client.scheduler_info(n_workers=-1)["workers"]
         if not workers:
             raise TacpipeError(
                 f"The scheduler at {self._scheduler} has no worker. Start some, for example with `dask worker "
@@ -336,7 +336,7 @@ _leases: dict[str, str] = {}  # this worker's leases by the lease of their run
 
 
 def _work(
-    versions: Mapping[str, Any], compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], topic: str
+    versions: Mapping[str, str], compute: Callable[[WorkerTask], Done], tasks: Sequence[WorkerTask], topic: str
 ) -> list[Done] | Exception:
     """Return ``compute`` of each task, or the error that prevented it. Progress of trainings is published on ``topic``."""
     from distributed import get_worker
@@ -353,7 +353,7 @@ def _work(
         return compute_chunk(compute, [replace(task, run=lease) for task in tasks])
 
 
-def _check(name: str, versions: Mapping[str, Any], task: WorkerTask) -> None:
+def _check(name: str, versions: Mapping[str, str], task: WorkerTask) -> None:
     differences = unlike(versions, local_versions(task.name))
     if differences:
         raise UsageError(

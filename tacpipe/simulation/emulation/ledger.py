@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -205,7 +205,15 @@ def take_rows(samples: Samples, rows: Int64s) -> Samples:
     return Samples(tuple(values[rows] for values in samples.values), seq, t_device_ns, device_seq)
 
 
-def _clock(source: Sampled) -> dict[str, Any]:
+class ClockTruth(TypedDict):
+    """The true relation of a source's clock to that of the host."""
+
+    offset_ns: float
+    skew: float
+    set_at_ns: Sequence[int]  # when the clock was set
+
+
+def _clock(source: Sampled) -> ClockTruth:
     """Return what is true of a source's clock, and when it was set."""
     timing = source.timing
     moments_ns = getattr(timing.steps, "moments_ns", [])
