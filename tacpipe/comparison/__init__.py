@@ -1,1 +1,1 @@
-"""Results of evaluations next to each other: what differs between them, how they compare with baselines, and how surely."""
+"""Compare results of evaluations: how methods differ, their gain over baselines, and its uncertainty."""

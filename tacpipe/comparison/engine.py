@@ -38,20 +38,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ComparisonRow:
-    """How one predictor does on one question."""
+    """The results of one predictor on one question."""
 
     name: str
     kind: Kind
     family: str
     predictor: str
-    method: Method  # methods whose runs report on the question
-    values: tuple[float, ...]  # one value for each column of the comparison
-    score: Estimate  # the score that charts draw
-    spread: float  # standard deviation of the score over runs; NaN for a single one
-    baseline: str  # the best baseline on the same recordings, or empty if none was evaluated, and for baselines
-    gain: Gain  # over it
-    p: float  # p of the hypothesis that both are alike (`pairing.swap_test`), not corrected for the number of methods
-    n: int  # clusters
+    method: Method  # method whose runs include the question
+    values: tuple[float, ...]  # one value per column of the comparison
+    score: Estimate  # score drawn in charts
+    spread: float  # standard deviation of the score over runs; NaN for a single run
+    baseline: str  # best baseline on the same recordings; empty for baselines, and if none was evaluated
+    gain: Gain  # gain over the baseline
+    p: float  # p value of the hypothesis that both are equal (`pairing.swap_test`), not corrected for the number of methods
+    n: int  # number of clusters
     recordings: int
     runs: int
     seeds: int
@@ -64,7 +64,7 @@ class ComparisonRow:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All predictors on one question, by kind, those of a kind the best first."""
+    """All predictors on one question by kind, the best of each kind first."""
 
     task: str
     question: Question
@@ -72,7 +72,7 @@ class Comparison:
     rows: tuple[ComparisonRow, ...]
 
     def of(self, *kinds: Kind) -> list[ComparisonRow]:
-        """Return the rows of some kinds, the best first."""
+        """Return the rows of these kinds, the best first."""
         return [row for row in self.rows if row.kind in kinds]
 
     @property
@@ -94,11 +94,11 @@ class Comparison:
 
     @property
     def headline(self) -> Headline | None:
-        """The best method next to its baselines, as ``headline.json`` has a single one; None without a method."""
+        """The best method with its baselines, like a single result's ``headline.json``; None without a method."""
         return headline(self.best, self) if self.best else None
 
     def frame(self) -> pd.DataFrame:
-        """Return a row a predictor: part, target, name, kind, differing settings, errors, baseline, gain, interval, p, n."""
+        """Return one row per predictor: part, target, name, kind, settings, errors, baseline, gain, interval, p, n."""
         import pandas as pd
 
         names = list(dict.fromkeys(name for row in self.rows for name in row.differing))
@@ -128,10 +128,10 @@ class Comparison:
 
 
 def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison]:
-    """Return the comparisons of results of any tasks, a task and question each, tasks in the order in which they come.
+    """Return the comparisons of results, one per task and question, with tasks in the order of the results.
 
-    With ``pool``, runs that differ in seed or fold alone are one method; without, each run is a row of its own. Results
-    that hold nothing to compare are left out.
+    With ``pool``, runs that differ only in seed or fold are one method; otherwise each run is a row. Results without
+    anything to compare are skipped.
     """
     all_comparisons = []
     for name, same in by_task(results).items():
@@ -142,7 +142,7 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
 
 
 def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]:
-    """Return one comparison per question and unit of its errors, questions in the order in which runs have them."""
+    """Return one comparison per question and unit of its errors, with questions in the order of the runs."""
     questions = questions_of([run for method in methods for run in method.runs])
     answers = [
         compare_on(task, alike, question) for question in questions for alike in _by_unit(methods, question).values()
@@ -151,7 +151,7 @@ def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]
 
 
 def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Method]]:
-    """Return the methods with a run on a question by the unit of its errors: errors in other units are not comparable."""
+    """Return the methods with a run on a question by error unit, because errors in different units cannot be compared."""
     methods_by_unit: dict[str, list[Method]] = {}
     for method in methods:
         for run in method.of(question)[:1]:
@@ -160,7 +160,7 @@ def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Me
 
 
 def questions_of(runs: Sequence[ComparedRun]) -> list[Question]:
-    """Return the questions that any run was evaluated on by their places, those of one place as most runs order them."""
+    """Return the questions of all runs ordered by their place, and questions of equal place as most runs order them."""
     ordered = sorted(runs, key=lambda run: -len(run.questions))
     return sorted(
         dict.fromkeys(question for run in ordered for question in run.questions), key=lambda candidate: candidate.place
@@ -168,10 +168,10 @@ def questions_of(runs: Sequence[ComparedRun]) -> list[Question]:
 
 
 def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) -> Comparison:
-    """Return how methods compare on one question.
+    """Return the comparison of methods on one question.
 
-    Baselines, oracles and controls are those of one method's runs (`reference`), because a split has the same for all; a
-    variant of the model is given for each method.
+    Baselines, oracles and controls are taken from one method's runs (`reference`), because they are equal for all
+    methods of a split; variants of the model are included for each method.
     """
     evaluated = [evaluated_method for evaluated_method in methods if evaluated_method.of(question)]
     measure = evaluated[0].of(question)[0].questions[question].measure
@@ -208,7 +208,7 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
 
 
 def reference(task: TaskReport, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
-    """Return the method whose runs report on baselines: with most baselines, then most runs, then the least error."""
+    """Return the method whose baselines are reported: the one with most baselines, then most runs, then the lowest error."""
 
     def place(method: Method) -> tuple[int, int, float]:
         counted = sum(task.kind(name) not in ("model", "variant") for name in method.predictors(question))
@@ -219,7 +219,7 @@ def reference(task: TaskReport, methods: Sequence[Method], question: Question, m
 
 
 def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
-    """Return a row of a method as a headline, with all baselines that it was compared with."""
+    """Return a method's row as a headline, with all baselines that it was compared with."""
     question, method = comparison.question, row.method
     source = next((row.method for row in comparison.rows if row.kind == "baseline"), method)
     task = report_on(comparison.task)
@@ -242,14 +242,17 @@ def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
 
 
 def difference(first: Method, second: Method, question: Question, predictors: tuple[str, str] = (MODEL, MODEL)) -> Gain:
-    """Return what one method gains over another on the recordings of both."""
+    """Return the gain of one method over another on the recordings that both have."""
     measure = first.of(question)[0].questions[question].measure
     first_sums, second_sums = first.sums(question, predictors[0]), second.sums(question, predictors[1])
     return pairing.difference(measure, first_sums, second_sums, _clusters(first, question))
 
 
 def _ranked(task: TaskReport, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
-    """Return a method's own predictor next to each baseline, the best first; nothing for a predictor of another kind."""
+    """Return a predictor of a method paired with each baseline, the best baseline first.
+
+    Empty for other kinds of predictors.
+    """
     if task.kind(predictor) not in ("model", "variant"):
         return {}
     measure, sums = method.of(question)[0].questions[question].measure, method.sums(question, predictor)
@@ -266,7 +269,10 @@ def _row(
     pairs: Mapping[str, Pair],
     picked: Sequence[Pair],
 ) -> ComparisonRow:
-    """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with the best."""
+    """Return the row of a predictor. ``pairs``: with its baselines.
+
+    ``picked``: those of all methods with the best baseline.
+    """
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
     run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
@@ -291,7 +297,7 @@ def _row(
 
 
 def _baselines(task: TaskReport, method: Method, source: Method, question: Question) -> dict[str, Sums]:
-    """Return the baselines of a method's own runs, or else of ``source``, by what tables call them."""
+    """Return the baselines of a method's own runs, or else of ``source``, by their names in tables."""
     baselines = {}
     for name in dict.fromkeys([*method.predictors(question), *source.predictors(question)]):
         if task.kind(name) == "baseline":
@@ -311,17 +317,17 @@ ABOUT = ("run", "seed", "fold", "tested", "recording")  # columns of a table of 
 
 @dataclass(frozen=True)
 class PairedRuns:
-    """Two methods compared over what both were repeated for."""
+    """Two methods compared over repeated runs."""
 
-    unit: str  # ``folds``, or ``seeds`` where there is one fold
-    units: int  # units that both methods have, or 0 if there are fewer than two
-    p: float  # p of the paired t test, NaN below two units and where all differ by as much
+    unit: str  # ``folds``, or ``seeds`` if there is one fold
+    units: int  # number of units that both methods have, or 0 if there are fewer than two
+    p: float  # p value of the paired t test; NaN below two units, and if all differences are equal
 
 
 def observations(runs: Sequence[ComparedRun], question: Question, predictor: str = MODEL) -> pd.DataFrame:
-    """Return a row a run and recording: run (its place), seed, fold, tested, recording, and ``s0``, ``s1`` … of its sums.
+    """Return one row per run and recording: run (its index), seed, fold, tested, recording, sums ``s0``, ``s1`` ….
 
-    ``tested`` is the set of a run's recordings as text: what distinguishes folds that have no name.
+    ``tested`` is the set of a run's recordings as text, which identifies folds without names.
     """
     import pandas as pd
 
@@ -340,9 +346,9 @@ def paired_runs(
     question: Question,
     predictors: tuple[str, str] = (MODEL, MODEL),
 ) -> PairedRuns:
-    """Return the paired t test of two methods' scores by fold, or by seed where there is one fold.
+    """Return the paired t test of two methods' scores by fold, or by seed if there is one fold.
 
-    Folds are those that runs name, or else the recordings that they were evaluated on.
+    Folds are identified by name, or else by the recordings that were evaluated.
     """
     for unit, column in (("folds", "fold"), ("folds", "tested"), ("seeds", "seed")):
         first_scores, second_scores = (

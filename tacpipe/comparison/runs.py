@@ -1,4 +1,4 @@
-"""Describe the results of a task, pool them as runs of methods, and name the methods."""
+"""Read the results of a task, pool runs as methods, and name the methods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Spread:
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """Return mean and standard deviation of one value a run.
+    """Return mean and standard deviation of one value per run.
 
     >>> spread([1.0, 3.0])
     Spread(mean=2.0, sd=1.4142135623730951)
@@ -42,16 +42,16 @@ def spread(values: Sequence[float]) -> Spread:
     )
 
 
-Settings = Mapping[str, Scalar]  # params and whatever else makes a method, by name
+Settings = Mapping[str, Scalar]  # params and other settings of a method, by name
 
 
 def distinct_names(
     methods: Sequence[tuple[str, Settings]], usual: Collection[str | tuple[str, Scalar]] = ()
 ) -> list[tuple[str, Settings]]:
-    """Return a name for each method, given a first name and all its settings, and the settings that are part of it.
+    """Return a unique name for each method, given as first name and settings, and the settings in that name.
 
-    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``:
-    names, or names with values.
+    A name includes the settings in which methods with the same first name differ, except empty ones and those in
+    ``usual``: names, or names with values.
 
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
@@ -71,7 +71,7 @@ def distinct_names(
 
 
 def marks(differing: Settings) -> list[str]:
-    """Return settings as a name states them, those that are empty left out.
+    """Return settings in the form used in names, without empty ones.
 
     >>> marks({"width": 8, "deep": True, "of": ""})
     ['deep', 'width 8']
@@ -83,30 +83,30 @@ def marks(differing: Settings) -> list[str]:
     ]
 
 
-MODEL = "model"  # the predictor that a run is about
+MODEL = "model"  # name of a run's own predictor
 
 
 @dataclass(frozen=True)
 class Question:
-    """A comparison: its recordings ("unseen objects"), and which of several targets ("PDC thumb"), as text."""
+    """The subject of a comparison: recordings ("unseen objects"), and one of several targets ("PDC thumb"), as text."""
 
     part: str = ""
     target: str = ""
-    place: int = 0  # order of the questions of a task: 0 is the main one
+    place: int = 0  # order among the questions of a task; 0 is the main question
 
     @property
     def where(self) -> str:
-        """Part and target in words."""
+        """Part and target as text."""
         return ", ".join(filter(None, (self.target, self.part))) or "all recordings"
 
 
 @dataclass(frozen=True)
 class PredictorErrors:
-    """Errors of the predictors of one run on one question."""
+    """Errors of a run's predictors on one question."""
 
     measure: Measure
-    sums: Mapping[str, Mapping[str, AnyFloats]]  # sums of `Measure` by predictor and recording, (part,)
-    clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None: itself
+    sums: Mapping[str, Mapping[str, AnyFloats]]  # sums of `Measure` (part,) by predictor and recording
+    clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None if each is its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,41 +115,43 @@ class ComparedRun:
 
     dataset: Dataset
     task: str
-    method: str  # name of all runs that differ in settings only
-    settings: Settings  # all that makes its method; neither seed nor fold
+    method: str  # name of all runs that differ only in settings
+    settings: Settings  # settings that define its method; neither seed nor fold
     questions: Mapping[Question, PredictorErrors]
     family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None
     simulated: bool = False
-    control: bool = False  # True if it was trained to show the size of an effect, as with a wrong plan or fewer data
-    published: bool = False  # True if it was evaluated on the recordings of the task's paper only
-    details: Any = None  # whatever the task's own sections read
+    control: bool = (
+        False  # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
+    )
+    published: bool = False  # whether it was evaluated only on the recordings of the task's paper
+    details: Any = None  # data for the task's own sections
 
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """Runs that differ in seed or fold alone."""
+    """Runs that differ only in seed or fold."""
 
     name: str
     family: str
     settings: Settings
-    differing: Settings  # those in which others of the same first name differ
+    differing: Settings  # settings in which methods of the same first name differ
     runs: tuple[ComparedRun, ...]
 
     @property
     def control(self) -> bool:
-        """True if it was trained to show the size of an effect, and does not compete."""
+        """Whether it was trained to show the size of an effect and does not compete."""
         return self.runs[0].control
 
     @property
     def simulated(self) -> bool:
-        """True if any of its runs was evaluated on simulated recordings."""
+        """Whether any of its runs was evaluated on simulated recordings."""
         return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
-        """True if all its runs were evaluated on the recordings of the task's paper."""
+        """Whether all its runs were evaluated on the recordings of the task's paper."""
         return all(run.published for run in self.runs)
 
     @property
@@ -158,7 +160,7 @@ class Method:
         return [run.details for run in self.runs]
 
     def key_without(self, *names: str) -> str:
-        """Return what methods share that differ in these settings alone."""
+        """Return a key that is equal for methods that differ only in these settings."""
         return json.dumps(
             [self.family, {name: value for name, value in self.settings.items() if name not in names}],
             sort_keys=True,
@@ -166,11 +168,11 @@ class Method:
         )
 
     def of(self, question: Question) -> list[ComparedRun]:
-        """Return its runs that were evaluated on a question."""
+        """Return its runs that include a question."""
         return [run for run in self.runs if question in run.questions]
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
-        """Return what a predictor of its runs errs, by seed and recording; of several runs with a seed, added up."""
+        """Return the error sums of a predictor by seed and recording; runs with the same seed are added."""
         return pairing.add_by_key(
             ((run.seed, name), run_sums)
             for run in self.of(question)
@@ -178,15 +180,15 @@ class Method:
         )
 
     def predictors(self, question: Question) -> list[str]:
-        """Return the predictors that any of its runs holds, in the order in which they come."""
+        """Return the predictors of all of its runs, in order of appearance."""
         return list(dict.fromkeys(name for run in self.of(question) for name in run.questions[question].sums))
 
 
 def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Scalar]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    Runs of one task whose method, settings and units of errors are alike are one method. Names state the settings in which
-    methods of the same first name differ, but for empty ones and those in ``usual``: names, or names with values.
+    Runs of a task with equal method, settings and error units form one method. Names include the settings in which
+    methods with the same first name differ, except empty ones and those in ``usual``: names, or names with values.
     """
     by_key: dict[str, list[ComparedRun]] = {}
     for run in runs:
@@ -201,7 +203,7 @@ def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Scal
 
 
 def separate(runs: Sequence[ComparedRun]) -> list[Method]:
-    """Return a method a run, in the order given: nothing is pooled, and names state seed and fold too."""
+    """Return one method per run, in order, with seed and fold in its name; nothing is pooled."""
     methods = []
     for method in grouped(runs):
         for run in method.runs:
@@ -225,12 +227,12 @@ CONFIG = "config.json"
 class TaskReport:
     """How results of one task are read, compared and reported.
 
-    A task's own report is a subclass that overrides `read`, so that its results are compared, and what it adds to the page.
-    An instance of this class reports results by their headlines and the numbers of ``metrics.json``.
+    A task's report is a subclass that overrides `read`, so that its results are compared, and the methods that add to
+    the page. An instance of this class reports results by their headlines and the numbers in ``metrics.json``.
     """
 
-    title: str = ""  # predicted quantity, in a few words; empty: the name of the task
-    usual: Sequence[str | tuple[str, Any]] = ()  # settings that no method's name states, or these values of them
+    title: str = ""  # predicted quantity in a few words; empty for the name of the task
+    usual: Sequence[str | tuple[str, Any]] = ()  # settings, or settings with values, that are omitted from names
 
     def __init__(self, name: str) -> None:
         """Report on the task ``name``."""
@@ -238,11 +240,11 @@ class TaskReport:
         self.title = self.title or name.replace("_", " ")
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
-        """Return the runs of results that can be compared, in their order; others are left out."""
+        """Return the runs of results that can be compared, in order; others are skipped."""
         return []
 
     def kind(self, predictor: str) -> Kind:
-        """Return what a predictor is: ``variant`` is the model's own in another form, ``oracle`` knows the future."""
+        """Return the kind of a predictor: a ``variant`` is another form of the model, an ``oracle`` knows the future."""
         return "model" if predictor == MODEL else "baseline"
 
     def predictor_name(self, predictor: str) -> str:
@@ -256,39 +258,39 @@ class TaskReport:
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return more columns of the table of all methods: pairs of a head and the function of a row to its cell."""
+        """Return additional columns for the table of all methods, as pairs of a head and a function from row to cell."""
         return []
 
     def sentence(self, context: Context) -> tuple[str, str] | None:
-        """Return the sentence that the section opens with, and its verdict; None: how the best method compares."""
+        """Return the first sentence of the section and its verdict, or None for how the best method compares."""
         return None
 
     def folds(self, context: Context) -> Sequence[Fold]:
-        """Return what the section of the task holds beyond the comparison."""
+        """Return the parts of the task's section after the comparison."""
         return []
 
     def caveats(self, context: Context) -> Sequence[str]:
-        """Return what must be known about the numbers."""
+        """Return sentences about the limits of the numbers."""
         return []
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return more columns of the table of runs, by their heads."""
+        """Return additional columns for the table of runs, by head."""
         return {}
 
 
 def report_on(task: str) -> TaskReport:
-    """Return the report of the task of this name, by headlines where no installed task has the name or it brings none."""
+    """Return the report of a task, or one by headlines if the task is not installed or has none."""
     task_report = registry.load_task(task).report if task in registry.tasks() else None
     return task_report or TaskReport(task)
 
 
 def task_of(result: Dataset) -> str:
-    """Return the name of the task that a result is of, or empty if it does not state."""
+    """Return the name of a result's task, or "" if it is not recorded."""
     return str(json.loads(result.files.get(CONFIG, b"{}")).get("task", ""))
 
 
 def by_task(results: Sequence[Dataset]) -> dict[str, list[Dataset]]:
-    """Return results by task, in the order in which tasks first come."""
+    """Return results by task, in order of appearance."""
     grouped: dict[str, list[Dataset]] = {}
     for result in results:
         grouped.setdefault(task_of(result), []).append(result)

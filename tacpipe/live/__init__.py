@@ -1,1 +1,1 @@
-"""A trained model while the hand moves: its chain of stages, fed samples as they arrive."""
+"""Live sessions: run a trained model and its chain of stages while samples arrive."""

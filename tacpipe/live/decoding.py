@@ -1,4 +1,4 @@
-"""Decode one stream of a live session into batches, as they will stand in the recording."""
+"""Decode one stream of a live session into batches, as they will be stored in the recording."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 class Decoder:
-    """Decodes the bytes of a stream on request: many small chunks cost less together than one by one."""
+    """Decodes the bytes of a stream on request, because decoding many small chunks together is cheaper."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        self.heard_ns: int | None = None  # arrival of the newest chunk
+        self.heard_ns: int | None = None  # arrival time of the newest chunk
         self.failures = 0
         self._reading = LinkReader(sensor)
         self._waiting: list[Chunks | StreamNote] = []
@@ -30,27 +30,27 @@ class Decoder:
         self._places: Places = {}
 
     def columns(self, batch: Batch, offset_ns: int) -> BatchColumns:
-        """Return a batch of this stream as it is recorded; ``offset_ns`` is added to the monotonic clock to have UTC."""
+        """Return a batch of this stream as it is recorded; ``offset_ns`` converts the monotonic clock to UTC."""
         if self._schema is None:
             self._schema = batch_schema(batch, self.sensor)
         return BatchColumns(batch, self._schema, offset_ns, self._places)
 
     def take(self, block: Chunks | StreamNote) -> None:
-        """Keep a block."""
+        """Store a block."""
         if isinstance(block, Chunks):
             self.heard_ns = int(block.t_ns[-1])
         if isinstance(block, Chunks) or block.what == LOST:
             self._waiting.append(block)
 
     def may_hold(self, until_ns: int) -> bool:
-        """Return whether what waits may hold a sample that arrived by a moment, or complete one that began by then."""
+        """Return whether pending bytes may contain a sample that arrived, or started to arrive, by ``until_ns``."""
         if not self._waiting:
             return False
         first = self._waiting[0]
         return not isinstance(first, Chunks) or int(first.t_ns[0]) <= until_ns or self._reading.account.pending > 0
 
     def batches(self) -> list[Batch]:
-        """Return the samples that are complete now, as `tacpipe.recording.sealing` will decode them."""
+        """Return the samples that are now complete, decoded as `tacpipe.recording.sealing` will decode them."""
         waiting, self._waiting = self._waiting, []
         batches: list[Batch] = []
         chunks: list[Chunks] = []
@@ -66,31 +66,31 @@ class Decoder:
         return [batch for batch in batches if len(batch)]
 
     def last(self) -> list[Batch]:
-        """Return the samples that are complete now that nothing more comes."""
+        """Return the samples that are complete at the end of the stream."""
         batches = [*self.batches(), self._reading.finish()]
         return [batch for batch in batches if len(batch)]
 
     def _feed(self, chunks: Chunks) -> list[Batch]:
         try:
             return [self._reading.feed(chunks)]
-        except Exception:  # a driver failed: later bytes are tried again, as when the recording is sealed
+        except Exception:  # a driver failed; decoding continues with later bytes, as when the recording is sealed
             self.failures += 1
             self._reading = LinkReader(self.sensor)
             return []
 
 
-Place = tuple[int, Indices, Indices]  # number of a block, which columns are in it, and where
+Place = tuple[int, Indices, Indices]  # number of a block, indices of the columns in it, and their positions
 Places = dict[tuple[int, ...], list[Place]]
 
 
 class BatchColumns:
-    """A batch as the recording will hold it, without a copy. It has what a causal chain reads of a table.
+    """A batch as the recording will store it, without a copy, with the table interface that a causal chain needs.
 
-    A table of pyarrow costs 10 us a column, and an arm has fifty of which a model reads ten.
+    A pyarrow table costs 10 us per column, and an arm has fifty columns, of which a model reads ten.
     """
 
     def __init__(self, batch: Batch, schema: pa.Schema, offset_ns: int, places: Places | None = None) -> None:
-        """Take a batch; ``places`` keeps where columns are from one batch of a stream to the next."""
+        """Wrap a batch; ``places`` caches column positions between the batches of a stream."""
         self.schema, self.num_rows = schema, len(batch)
         self._places: Places = {} if places is None else places
         self._first = [batch.t_ns + offset_ns]
@@ -98,7 +98,7 @@ class BatchColumns:
         self._blocks = batch.values
 
     def column(self, place: int | str) -> AnyArray:
-        """Return a column (sample,) by its number or name."""
+        """Return a column (sample,) by its index or name."""
         number = self.schema.get_field_index(place) if isinstance(place, str) else place
         if number < len(self._first):
             return self._first[number]
@@ -107,14 +107,14 @@ class BatchColumns:
         return column
 
     def columns_of(self, numbers: tuple[int, ...]) -> Floats:
-        """Return columns of values (sample, column) by their numbers."""
+        """Return columns of values (sample, column) by index."""
         values = np.empty((self.num_rows, len(numbers)))
         for block, columns, places in self._find_columns(numbers):
             values[:, columns] = self._blocks[block][:, places]
         return values
 
     def _find_columns(self, numbers: tuple[int, ...]) -> list[Place]:
-        """Return each block that columns are in, which of ``numbers`` these are, and where they are in it."""
+        """Return each block that contains some of the columns, which of ``numbers`` these are, and their positions."""
         if numbers not in self._places:
             ends = np.cumsum([len(self._first), *(block.shape[1] for block in self._blocks)])
             blocks = np.searchsorted(ends, numbers, side="right") - 1  # (column,)
@@ -126,7 +126,7 @@ class BatchColumns:
         return self._places[numbers]
 
     def table(self) -> pa.Table:
-        """Return the same as a table."""
+        """Return the batch as a table."""
         import pyarrow as pa
 
         arrays = [pa.array(self.column(number), field.type) for number, field in enumerate(self.schema)]
@@ -134,7 +134,7 @@ class BatchColumns:
 
 
 def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
-    """Return the schema of a stream as it is recorded, with the columns of a device's clock and counters if it has them."""
+    """Return the recorded schema of a stream, with device clock and counter columns if present."""
     import pyarrow as pa
 
     from tacpipe.channels import schema as schemas
@@ -143,11 +143,11 @@ def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
 
 
 def likely_schema(sensor: Sensor) -> pa.Schema:
-    """Return the schema of a stream that has given nothing yet: its channels are certain, its clock is not."""
+    """Return the schema of a stream without data so far: its channels are certain, its clock is not."""
     counters = ["seq"] * (sensor.counter is not None) + ["device_seq"] * (sensor.device_counter is not None)
     return schema(sensor, device=False, counters=counters)
 
 
 def batch_schema(batch: Batch, sensor: Sensor) -> pa.Schema:
-    """Return the schema of a stream that gave this batch."""
+    """Return the schema of the stream that produced this batch."""
     return schema(sensor, device=batch.t_device_ns is not None, counters=batch.counters)

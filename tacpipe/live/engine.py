@@ -1,7 +1,7 @@
-"""The logic of a live session that all tasks share: blocks of bytes in, messages out.
+"""The logic that live sessions of all tasks share: it receives blocks of bytes and returns messages.
 
-An engine reads no clock and does no input or output. `Engine.take` keeps blocks, `Engine.due_ns` returns when
-`Engine.step` is to be called next, and `step` returns the messages that are due.
+An engine reads no clock and performs no input or output. `Engine.take` stores blocks, `Engine.due_ns` returns when
+`Engine.step` must be called next, and `step` returns the messages that are due.
 """
 
 from __future__ import annotations
@@ -18,49 +18,49 @@ from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
-SETTLE_NS = 2_000_000  # time after a moment in which samples that belong to it may still come from other threads
+SETTLE_NS = 2_000_000  # time after a row's time in which its samples may still arrive from other threads
 
 
 class Continuation(Protocol):
-    """The state that a new process needs to continue the recording of the process before."""
+    """The state with which a new process continues a recording."""
 
     def to_json(self) -> Json:
-        """Return it as the note `wire.CONTINUE` holds it."""
+        """Return the state as the JSON of the note `wire.CONTINUE`."""
 
 
 class Engine(ABC):
-    """Turns the blocks of a session's streams into messages of a model."""
+    """Converts the blocks of a session's streams to messages of a model."""
 
     def __init__(self, sensors: Mapping[str, Sensor], settle_ns: int = SETTLE_NS) -> None:
         self.sensors = dict(sensors)
         self.settle_ns = settle_ns
-        self.skipped = 0  # messages so far that were left out under overload
-        self.overflows = 0  # times that blocks were thrown away
+        self.skipped = 0  # number of messages skipped under overload
+        self.overflows = 0  # number of times that blocks were dropped
         self._offset_ns: int | None = None
-        self._seq = 0  # number of the last message
+        self._seq = 0  # number of the latest message
 
     @property
     def offset_ns(self) -> int | None:
-        """The difference of the recording's UTC and the monotonic clock, or None if no recording runs."""
+        """The offset from the monotonic clock to the recording's UTC, or None if no recording is running."""
         return self._offset_ns
 
     @property
     def running(self) -> bool:
-        """True while a recording runs."""
+        """Whether a recording is running."""
         return self._offset_ns is not None
 
     @property
     def late(self) -> int:
-        """Samples so far that came too late to be read."""
+        """Number of samples that arrived too late to be used."""
         return 0
 
     @property
     def beginning(self) -> Continuation | None:
-        """The state that another process needs to continue the recording; None while there is none."""
+        """The state with which another process can continue the recording, or None if there is none yet."""
         return None
 
     def take(self, stream: str, block: Chunks | StreamNote) -> None:
-        """Take a block of a stream, or a note on all streams (``stream`` is empty)."""
+        """Process a block of a stream, or a note on all streams (``stream`` is empty)."""
         if isinstance(block, Chunks):
             self.take_chunks(stream, block)
         elif stream:
@@ -76,7 +76,7 @@ class Engine(ABC):
             self.overflow()
 
     def take_note(self, stream: str, note: StreamNote) -> None:
-        """Take a note on a stream: that its part of the recording begins or is over, or that bytes of it were lost."""
+        """Process a note on a stream: that its part of the recording begins or ends, or that bytes were lost."""
         if note.what == BEGAN:
             self.begin_stream(stream)
         elif note.what == OVER:
@@ -88,7 +88,7 @@ class Engine(ABC):
         return self._seq
 
     def published(self, message: Message, now_ns: int) -> None:
-        """Write the latency into a message that is about to be published."""
+        """Write the latency into a message just before it is published."""
         if self._offset_ns is not None and message.answers:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
@@ -97,44 +97,47 @@ class Engine(ABC):
         return None
 
     def finish(self) -> Sequence[Message]:
-        """Return the messages that are left when the session is over."""
+        """Return the remaining messages at the end of the session."""
         return []
 
     def continue_recording(self, beginning: str) -> None:
-        """Take what `Continuation.to_json` gave, as JSON, of the process before; the next recording continues it."""
+        """Restore the JSON state from `Continuation.to_json` of the previous process.
+
+        The next recording continues from it.
+        """
         return
 
     def end_recording(self) -> None:
-        """Take note that the recording is over."""
+        """Handle the end of the recording."""
         self._offset_ns = None
 
     def end_stream(self, stream: str) -> None:
-        """Take note that nothing more of a stream belongs to the recording."""
+        """Handle the end of a stream's part of the recording."""
         return
 
     def overflow(self) -> None:
-        """Take note that blocks were thrown away."""
+        """Handle dropped blocks."""
         self.overflows += 1
 
     @abstractmethod
     def describe(self, model: str) -> Description:
-        """Return what the messages of this engine are, made by the model of a path."""
+        """Return the description of this engine's messages; ``model`` is the model's path."""
 
     @abstractmethod
     def begin_recording(self, offset_ns: int) -> None:
-        """Begin a recording whose UTC is the monotonic clock plus ``offset_ns``."""
+        """Start a recording whose UTC is the monotonic clock plus ``offset_ns``."""
 
     @abstractmethod
     def begin_stream(self, stream: str) -> None:
-        """Take note that what comes of a stream now belongs to the recording."""
+        """Handle the start of a stream's part of the recording."""
 
     @abstractmethod
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Keep bytes of a stream."""
+        """Store bytes of a stream."""
 
     @abstractmethod
     def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock."""
+        """Return when `step` must be called next, on the monotonic clock."""
 
     @abstractmethod
     def step(self, now_ns: int) -> Sequence[Message]:

@@ -1,7 +1,7 @@
 """Messages of a live session and their formats: JSON, msgpack, and the packets of the sensor ``live``.
 
-The values of a task's messages are declared once, in its `Declaration`. `VERSION` is raised when a field changes its meaning
-or goes; fields may be added at any time.
+A task's `Declaration` declares the values of its messages once. `VERSION` is raised when a field is removed or changes
+its meaning; fields may be added at any time.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ ABSENT: frozenset[str] = frozenset()
 
 
 class Message:
-    """A message of any task. A subclass is a dataclass that has each value of its `declaration` as an attribute."""
+    """A message of any task. Subclasses are dataclasses with an attribute for each value in their `declaration`."""
 
     declaration: ClassVar[Declaration]
     seq: int
-    t_ns: int  # time that it is about, UTC as the recording has it
-    cause: str  # reason why there is no answer of the model, or what it was made without
-    made_from_t_ns: int  # arrival of the newest sample that was read
+    t_ns: int  # time that it refers to, in the recording's UTC
+    cause: str  # reason why there is no answer, or what was missing for it
+    made_from_t_ns: int  # arrival time of the newest sample used
     latency_ms: float
     skipped: int
     late: int
@@ -40,21 +40,21 @@ class Message:
 
     @property
     def answers(self) -> bool:
-        """True for an answer of the model, False for a reason why there is none."""
+        """Whether this is an answer of the model rather than a reason why there is none."""
         raise NotImplementedError
 
     @property
     def states(self) -> Mapping[str, str]:
-        """The answer in words, for the view of the session."""
+        """The answer as text, for the view of the session."""
         raise NotImplementedError
 
     @property
     def absent(self) -> frozenset[str]:
-        """Declared values that this message does not have."""
+        """Declared values that this message lacks."""
         return ABSENT
 
     def to_dict(self) -> Json:
-        """Return the message as JSON and msgpack hold it; numbers that are not finite are null."""
+        """Return the message for JSON and msgpack; numbers that are not finite become null."""
         fields = {
             value.name: _plain(value.read(self), value.digits)
             for value in self.declaration.values
@@ -63,7 +63,7 @@ class Message:
         return {"version": VERSION, "kind": self.declaration.kind, **fields}
 
     def numbers(self, about: Description) -> Float32s:
-        """Return the numbers (column,) that `Description.columns` names, or NaN if a value is None."""
+        """Return the numbers (column,) that `Description.columns` lists, with NaN for None."""
         parts = []
         for value in self.declaration.recorded(LSL):
             content = value.read(self)
@@ -72,7 +72,7 @@ class Message:
         return np.concatenate(parts).astype(np.float32)
 
     def stream_blocks(self, stream: str) -> tuple[AnyArray, ...] | None:
-        """Return the numbers of a recorded stream as blocks (row, column) of one type; None: no row for this message."""
+        """Return the values of a recorded stream as blocks (row, column) of one type, or None for no row."""
         values = [(value.type, value.read(self)) for value in self.declaration.recorded(stream)]
         if any(content is None for _, content in values):
             return None
@@ -80,13 +80,13 @@ class Message:
         return blocks([(kind, np.asarray(content).reshape(shape)) for kind, content in values])
 
     def row_count(self, stream: str) -> int:
-        """Return how many rows it gives a recorded stream."""
+        """Return the number of rows for a recorded stream."""
         return 1
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """The lists over which the values of messages repeat (`tacpipe.sensors.live.MessageSizes`)."""
+    """The lists over which values of messages repeat (`tacpipe.sensors.live.MessageSizes`)."""
 
     channels: tuple[str, ...] = ()
     steps: tuple[int, ...] = ()
@@ -96,11 +96,11 @@ class Sizes:
 
 
 class Description:
-    """Describes the messages of a session; each subscriber gets it once, before the first message."""
+    """The description of a session's messages, sent once to each subscriber before the first message."""
 
     declaration: ClassVar[Declaration]
-    answers: ClassVar[str] = "answers"  # plural noun for answers of the model, in the lines about a session
-    rate_hz: float  # messages per second; 0: irregular
+    answers: ClassVar[str] = "answers"  # plural noun for answers of the model, used in lines about a session
+    rate_hz: float  # messages per second; 0 if irregular
 
     @property
     def sizes(self) -> MessageSizes:
@@ -114,15 +114,15 @@ class Description:
 
     @property
     def absent(self) -> frozenset[str]:
-        """Declared values that messages of this session do not have."""
+        """Declared values that messages of this session lack."""
         return ABSENT
 
     def columns(self) -> list[tuple[str, str]]:
-        """Return name and unit of each of `Message.numbers`."""
+        """Return name and unit of each number in `Message.numbers`."""
         return [(column.name, column.unit) for _, column in self.declaration.columns(LSL, self.sizes)]
 
     def schema(self) -> Json:
-        """Return the properties of `Message.to_dict`, as JSON schema has them."""
+        """Return the JSON schema properties of `Message.to_dict`."""
         values = [value for value in self.declaration.values if value.json and value.name not in self.absent]
         fields = {
             value.name: {"type": value.json} if value.schema is None else value.schema(self.sizes) for value in values
@@ -130,12 +130,12 @@ class Description:
         return {"version": {"type": "integer"}, "kind": {"type": "string"}, **fields}
 
     def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+        """Return the description for JSON and msgpack."""
         raise NotImplementedError
 
 
 def head_values() -> tuple[Value, ...]:
-    """Return the values that messages of every task begin with."""
+    """Return the first values of every task's messages."""
     return (
         Value("seq", "number of the message, from 1", "integer"),
         Value("t_ns", "time that the message is about, UTC", "integer", unit="ns"),
@@ -148,7 +148,7 @@ def to_json(content: Json) -> bytes:
 
 
 def packets(message: Message, sensor: Live, seq: int) -> list[bytes]:
-    """Return the packets of a message for one stream, numbered from ``seq`` on, or None if it has no row for it."""
+    """Return the packets of a message for one stream, numbered from ``seq``; an empty list if it has no row for it."""
     values = message.stream_blocks(sensor.output)
     if values is None:
         return []
@@ -158,12 +158,12 @@ def packets(message: Message, sensor: Live, seq: int) -> list[bytes]:
 
 
 def rounded(value: float, digits: int = 4) -> float | None:
-    """Return a number to some digits, None for one that is not finite."""
+    """Return a rounded number, or None if it is not finite."""
     return round(value, digits) if math.isfinite(value) else None
 
 
 def reference_page(declarations: Mapping[str, Declaration]) -> str:
-    """Return the reference page of the messages of tasks, by the name of the task, as Markdown."""
+    """Return the Markdown reference page of messages, by task name."""
     lines = [
         "# Live messages\n",
         "Each message is one JSON object (or the same in msgpack) with `version` 1 and its `kind`. The declarations of the "
@@ -184,7 +184,7 @@ def reference_page(declarations: Mapping[str, Declaration]) -> str:
 
 
 def _plain(value: Any, digits: int | None) -> Any:
-    """Return a value as JSON can hold it."""
+    """Return a value that JSON can represent."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value if digits is None else rounded(value, digits)

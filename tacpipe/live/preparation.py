@@ -38,7 +38,7 @@ class LiveModel(NamedTuple):
 
 @dataclass(frozen=True)
 class PreparedSession:
-    """A live session that may start."""
+    """A checked live session that may start."""
 
     rig: Rig  # includes the session's own streams
     options: SessionOptions
@@ -46,9 +46,10 @@ class PreparedSession:
 
 
 def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
-    """Return a session with a rig (read from the file ``rig_file``) and options of the command; None: not given.
+    """Return a session for a rig, read from ``rig_file``, and options of the command, which are None if not given.
 
-    Raises `UsageError` that names option, or file and key, for what this computer, the model or the rig does not allow.
+    Raises `UsageError`, which names the option, or file and key, if this computer, the model or the rig does not
+    support it.
     """
     path = str(options.get("model") or rig.live.get("model", ""))
     if not path:
@@ -77,7 +78,7 @@ def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
 
 
 def open_model(path: str) -> LiveModel:
-    """Return the model at a path. Raises `UsageError` if it is no model, or its task does not run live."""
+    """Return the model at a path. Raises `UsageError` if it is not a model, or its task does not run live."""
     from tacpipe.datasets import model_files
     from tacpipe.engine.pipeline import open_dataset
 
@@ -92,7 +93,7 @@ def open_model(path: str) -> LiveModel:
 
 
 def with_absolute_paths(settings: Settings) -> Settings:
-    """Return settings whose paths do not depend on the working directory."""
+    """Return settings with absolute paths."""
     task = {
         name: str(Path(getattr(settings.task, name)).absolute())
         for name in PATHS
@@ -102,9 +103,9 @@ def with_absolute_paths(settings: Settings) -> Settings:
 
 
 def add_streams(rig: Rig, streams: Mapping[str, SettingValues]) -> Rig:
-    """Return a rig with further streams of the sensor ``live``, given by their options, at free ports of this computer.
+    """Return a rig with additional streams of the sensor ``live``, given by their options, at free local ports.
 
-    Raises `UsageError` if the rig has a stream of such a name, and for messages too large for a packet.
+    Raises `UsageError` if the rig already has a stream of that name, and for messages too large for a packet.
     """
     conflicting = [name for name in streams if name in rig.streams]
     if conflicting:
@@ -122,7 +123,7 @@ def add_streams(rig: Rig, streams: Mapping[str, SettingValues]) -> Rig:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return UDP ports of this computer that nobody listens on."""
+    """Return free local UDP ports."""
     with contextlib.ExitStack() as sockets:
         ports = []
         for _ in range(count):

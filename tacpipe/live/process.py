@@ -1,8 +1,8 @@
-"""Run the model of a live session in a process of its own: fetch samples, predict, publish, and report.
+"""Run the model of a live session in a separate process: receive samples, predict, publish, and report.
 
-Neither its interpreter lock nor a crash of it affects the recording. It sleeps until an answer is nearly due and decodes the
-samples since, then sleeps until it is due and decodes the remaining few. At 1 kHz that costs a fifth of waking for each
-sample.
+So neither its interpreter lock nor a crash affects the recording. The process sleeps until an answer is nearly due and
+decodes the samples since, then sleeps until it is due and decodes the remaining few. At 1 kHz that costs a fifth of
+waking up for each sample.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from tacpipe.plugins import extras
 from tacpipe.recording.spool import StreamNote
 
 REPORT_NS = 250_000_000  # period of reports to the recording process
-FETCH_BYTES = 1 << 18  # read at once
-SWITCH_S = 0.0005  # time that a publisher's thread may hold up an answer
+FETCH_BYTES = 1 << 18  # number of bytes read at once
+SWITCH_S = 0.0005  # maximum time that a publisher's thread delays an answer
 MAX_WAIT_S = 0.02
-REFUSED = 2  # exit code: the session cannot begin with this model and rig
+REFUSED = 2  # exit code if the session cannot start with this model and rig
 SHORTEST_MS, LONGEST_MS = 0.01, 100_000.0
-PER_DECADE = 100  # bins; a quantile is exact to 2.3 %
+PER_DECADE = 100  # bins per decade; quantiles are accurate to 2.3 %
 BINS = PER_DECADE * round(math.log10(LONGEST_MS / SHORTEST_MS))
 
 
 class Latencies:
-    """A histogram of latencies: a session of hours needs no more memory than one of seconds."""
+    """A histogram of latencies, whose memory does not grow with the length of a session."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -53,7 +53,7 @@ class Latencies:
         self.max_ms = max(self.max_ms, latency_ms)
 
     def quantile_ms(self, fraction: float) -> float:
-        """Return the latency that this fraction does not exceed, to 2.3 % above it, or 0 if there is none.
+        """Return a quantile of the latency, accurate to 2.3 % above it, or 0 if there is none.
 
         >>> latencies = Latencies()
         >>> for latency_ms in (1.0, 2.0, 3.0, 40.0):
@@ -67,7 +67,7 @@ class Latencies:
         return min(SHORTEST_MS * 10 ** ((place + 1) / PER_DECADE), self.max_ms)
 
     def above(self, limit_ms: float) -> int:
-        """Return how many were longer, to the width of a bin."""
+        """Return the number of longer latencies, to the width of a bin."""
         first = int(math.log10(limit_ms / SHORTEST_MS) * PER_DECADE) + 1
         return int(self._bins[first:].sum())
 
@@ -90,11 +90,11 @@ class Loop:
         self.forecasts = 0
         self.cause = ""
         self._reported_ns = 0
-        self._reported: Continuation | None = None  # the beginning that was reported
+        self._reported: Continuation | None = None  # the continuation state reported last
         self._ended = False
 
     def run(self) -> None:
-        """Work until the session is over."""
+        """Run until the session ends."""
         self.connection.setblocking(False)
         while not self._ended:
             now_ns = time.monotonic_ns()
@@ -105,7 +105,7 @@ class Loop:
             if now_ns - self._reported_ns > REPORT_NS:
                 self._reported_ns = now_ns
                 self.report()
-                gc.collect(1)  # a full collection would take longer than an answer may
+                gc.collect(1)  # a full collection would exceed the time for an answer
             wait_s = (self.engine.due_ns(time.monotonic_ns()) - time.monotonic_ns()) / 1e9
             if wait_s > 0:
                 time.sleep(min(wait_s, MAX_WAIT_S))
@@ -114,7 +114,7 @@ class Loop:
         self.report()
 
     def publish(self, message: Message) -> None:
-        """Send a message to all subscribers, and count how long it took."""
+        """Send a message to all subscribers and record its latency."""
         self.publishers.publish(message, lambda sent: self.engine.published(sent, time.monotonic_ns()))
         self.cause = message.cause
         if message.answers:
@@ -122,7 +122,7 @@ class Loop:
             self.latencies.add(message.latency_ms)
 
     def report(self) -> None:
-        """Send the recording process what the session did so far; where it does not read, the report is left out."""
+        """Report the session's state to the recording process; skipped if that process does not read."""
         figures: wire.SessionFigures = {
             "kind": self.publishers.about.kind,
             "answers": self.publishers.about.answers,
@@ -162,7 +162,7 @@ class Loop:
 
 
 def send(connection: socket.socket, content: wire.ModelLine) -> None:
-    """Send a line to the recording process, unless it does not read or is gone."""
+    """Send a line to the recording process, unless it does not read or has ended."""
     try:
         connection.send(wire.line(content))
     except OSError:
@@ -170,7 +170,7 @@ def send(connection: socket.socket, content: wire.ModelLine) -> None:
 
 
 def open_engine(options: SessionOptions) -> Engine:
-    """Return the engine of a session. Raises `UsageError` if model, rig and settings do not belong together."""
+    """Return the engine of a session. Raises `UsageError` if model, rig and settings do not match."""
     from tacpipe.live.preparation import open_model
     from tacpipe.recording import rig as rigs
 
@@ -186,7 +186,7 @@ def open_engine(options: SessionOptions) -> Engine:
 
 
 def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine] = open_engine) -> int:
-    """Run the model's process on an inherited socket, whose number is given; return its exit code."""
+    """Run the model's process on an inherited socket with the given number; return its exit code."""
     connection = socket.socket(fileno=int(arguments[0]))
     connection.setblocking(True)
     options = SessionOptions.from_json(_first_line(connection))
@@ -205,9 +205,9 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     if options.settings.realtime:
         wire.realtime(wire.MODEL)
     send(connection, {"ready": True, "alarms": engine.alarm_levels()})
-    from tacpipe.models.tensors import one_thread  # torch, which the engine has loaded
+    from tacpipe.models.tensors import one_thread  # imports torch, which the engine has already loaded
 
-    with publishers, one_thread():  # once, not in each forecast
+    with publishers, one_thread():  # set once, not in each forecast
         Loop(connection, engine, publishers, wire.Blocks(options.streams)).run()
     return 0
 

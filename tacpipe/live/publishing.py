@@ -1,4 +1,4 @@
-"""Publish messages to the session's own streams and to its subscribers. No publisher waits for its readers."""
+"""Publish messages to the session's own streams and to subscribers, without ever waiting for readers."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ EXAMPLES = {
     "lsl": "lsl:tacpipe",
     "mcap": "mcap:session.mcap",
 }
-DESCRIBED_EVERY = 100  # messages from one description to the next, because datagrams may be lost
+DESCRIBED_EVERY = 100  # number of messages between descriptions, which are repeated because datagrams may be lost
 MAX_DATAGRAM_BYTES = 65_000  # bytes
 FORMATS = ("json", "msgpack")
-MCAP_QUEUED = 500  # messages that wait for the disk: 10 s at 50 Hz
+MCAP_QUEUED = 500  # maximum number of messages waiting for the disk: 10 s at 50 Hz
 
 
 class Publisher(Protocol):
-    """An address that messages go to; it never waits for its readers."""
+    """Sends messages to one address without waiting for readers."""
 
-    dropped: int  # messages that did not go out, over all subscribers
+    dropped: int  # number of messages not sent, over all subscribers
 
     def publish(self, message: Message) -> None:
         """Send a message, or drop it."""
 
     def close(self) -> None:
-        """Send what still waits and close."""
+        """Send pending messages and close."""
 
 
 class StreamPublisher:
@@ -53,7 +53,7 @@ class StreamPublisher:
     def __init__(self, places: Mapping[str, tuple[str, int]], sensors: Mapping[str, Live]) -> None:
         self.dropped = 0
         self._places, self._sensors = places, sensors
-        self._sent = dict.fromkeys(sensors, 0)  # packets of each stream so far
+        self._sent = dict.fromkeys(sensors, 0)  # number of packets sent per stream
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
@@ -73,13 +73,13 @@ class StreamPublisher:
 
 
 class Publishers:
-    """All publishers of a session; the session's own streams come last, so that the latency they carry covers the others."""
+    """All publishers of a session. The session's own streams come last, so that their latency covers the others."""
 
     def __init__(self, subscribed: list[Publisher], streams: StreamPublisher | None, about: Description) -> None:
         self.about = about
         self._subscribed = subscribed
         self._streams = streams
-        self.states: Mapping[str, str] = {}  # the last message in words
+        self.states: Mapping[str, str] = {}  # the latest message as text
 
     @property
     def _all(self) -> list[Publisher]:
@@ -87,11 +87,11 @@ class Publishers:
 
     @property
     def dropped(self) -> int:
-        """How many messages did not go out."""
+        """Number of messages not sent."""
         return sum(publisher.dropped for publisher in self._all)
 
     def publish(self, message: Message, stamp: Callable[[Message], None]) -> None:
-        """Send a message to all; ``stamp`` writes its latency so far into it."""
+        """Send a message to all; ``stamp`` writes its current latency into it."""
         stamp(message)
         for subscriber in self._subscribed:
             subscriber.publish(message)
@@ -114,7 +114,7 @@ class Publishers:
 def open_publishers(options: SessionOptions, about: Description) -> Publishers:
     """Return the publishers of a session whose messages ``about`` describes.
 
-    Raises `UsageError` for an address that nothing can be published to, `DeviceError` for one in use.
+    Raises `UsageError` for an unsupported address, `DeviceError` for one in use.
     """
     rig = rigs.parse(options.rig)
     places: dict[str, tuple[str, int]] = {}
@@ -135,7 +135,7 @@ def open_publishers(options: SessionOptions, about: Description) -> Publishers:
 
 
 def publisher(address: str, about: Description) -> Publisher:
-    """Return the publisher of an address. Raises `UsageError` and `DeviceError`, as `open_publishers`."""
+    """Return the publisher of an address. Raises `UsageError` and `DeviceError` as `open_publishers` does."""
     scheme, place = check(address)
     if scheme == "ws":
         with extras.explain_missing("--publish ws"):
@@ -148,7 +148,7 @@ def publisher(address: str, about: Description) -> Publisher:
 
 
 def check(address: str) -> tuple[str, str]:
-    """Return scheme and place of an address. Raises `UsageError` for one that nothing can be published to."""
+    """Return scheme and location of an address. Raises `UsageError` if it is not supported."""
     scheme, colon, place = address.partition(":")
     if scheme not in EXAMPLES or not colon or not place:
         raise UsageError(
@@ -159,7 +159,7 @@ def check(address: str) -> tuple[str, str]:
 
 
 class LslPublisher:
-    """An outlet; LSL keeps what its readers have not fetched and drops the oldest, so nobody is waited for."""
+    """Publishes to an LSL outlet, which drops the oldest unread messages instead of waiting for readers."""
 
     def __init__(self, place: str, about: Description) -> None:
         with extras.explain_missing("--publish lsl"):
@@ -179,16 +179,16 @@ class LslPublisher:
         self._outlet = pylsl.StreamOutlet(info, max_buffered=2)
 
     def publish(self, message: Message) -> None:
-        """Push a message; numbers that it does not have are NaN."""
+        """Push a message; missing numbers are NaN."""
         self._outlet.push_sample(message.numbers(self._about))
 
     def close(self) -> None:
-        """Take the outlet away."""
+        """Close the outlet."""
         del self._outlet
 
 
 class McapPublisher:
-    """Writes a file that did not exist before."""
+    """Writes a new MCAP file."""
 
     def __init__(self, place: str, about: Description) -> None:
         with extras.explain_missing("--publish mcap"):
@@ -217,14 +217,14 @@ class McapPublisher:
         self._thread.start()
 
     def publish(self, message: Message) -> None:
-        """Have a message written, if the disk keeps up."""
+        """Queue a message for writing, or drop it if the disk is too slow."""
         try:
             self._waiting.put_nowait((message.t_ns, message))
         except queue.Full:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what waits, and end the file."""
+        """Write pending messages, and finish the file."""
         self._waiting.put(None)
         self._thread.join()
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -262,7 +262,7 @@ class UdpPublisher:
         self._until_about = 0
 
     def publish(self, message: Message) -> None:
-        """Send a message; what the network does not take at once is dropped."""
+        """Send a message, or drop it if the network does not accept it immediately."""
         if not self._until_about:
             self._until_about = DESCRIBED_EVERY
             self._send(self._about)

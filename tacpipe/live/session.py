@@ -1,6 +1,6 @@
-"""Run a live session: the rig is recorded as ever, and a process of its own runs the model.
+"""Run a live session: the rig is recorded as usual, and a separate process runs the model.
 
-The `Supervisor` starts that process, listens to it, and starts it again when it ends by itself.
+The `Supervisor` starts that process, reads its reports, and restarts it if it ends unexpectedly.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.spool_folders import ClockReading
 from tacpipe.sensors.framing import Chunks
 
-MODULE = "tacpipe.live.process"  # runs as the model's process
-RESTART_S = (0.5, 10.0)  # wait from its end to the next start: the first, and the longest
-STOP_S = 5.0  # time that it has to end and to close its publishers
+MODULE = "tacpipe.live.process"  # module run as the model's process
+RESTART_S = (0.5, 10.0)  # wait between its end and the next start: first and maximum
+STOP_S = 5.0  # time for the process to end and close its publishers
 LOOK_S = 0.05
 Counted = Literal["forecasts", "skipped", "late", "dropped"]  # figures that add up over processes
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
-SWITCH_S = 0.0005  # time that one thread may hold up another: the threads that read must not wait 5 ms for the view
+SWITCH_S = 0.0005  # maximum time that a thread delays another; reading threads must not wait 5 ms for the view
 
 
 @contextlib.contextmanager
 def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[], bool]) -> Iterator[Supervisor]:
-    """Have the model's process follow a rig while in the block. Raises what it refuses the session with."""
+    """Run the model's process on a rig's data within the block. Raises the error with which it rejects the session."""
     supervisor = Supervisor(options, RecorderTap(options.streams))
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
@@ -45,7 +45,7 @@ def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[],
         supervisor.start(is_over)
         recorder.accompany(supervisor, options.streams)
         gc.collect()
-        gc.freeze()  # a later collection would hold up the threads that read for 20 ms and more
+        gc.freeze()  # a later full collection would delay the reading threads by 20 ms and more
         yield supervisor
     finally:
         gc.unfreeze()
@@ -83,33 +83,33 @@ def lines(figures: SessionFigures) -> list[str]:
 
 
 class Supervisor:
-    """Keeps the model's process of a session running: a `tacpipe.recording.recorder.Companion`."""
+    """Keeps the model's process of a session running; a `tacpipe.recording.recorder.Companion`."""
 
     def __init__(self, options: SessionOptions, tap: RecorderTap) -> None:
         self.options, self.tap = options, tap
-        self._noted_stream = options.own_streams[0]  # stream that gets the notes on the process
-        self.report: SessionFigures = {}  # the last report of the running process
+        self._noted_stream = options.own_streams[0]  # stream for notes on the process
+        self.report: SessionFigures = {}  # last report of the running process
         self.alarms: AlarmsJson | None = None  # levels of the alarms
         self.deaths = 0
         self.ready = False
-        self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)  # counts of processes that ended
+        self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)  # counts of processes that have ended
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         self._lines = wire.LineCutter()
         self._offset_ns: int | None = None  # offset of the running recording
-        self._beginning: Json | None = None  # state that a new process continues from
+        self._beginning: Json | None = None  # state from which a new process continues
         self._restart_s = RESTART_S[0]
         self._due_s = 0.0
         self._refusal: tuple[str, int] | None = None
 
     def start(self, is_over: Callable[[], bool]) -> None:
-        """Start the process and wait until it is ready. Raises what it refuses the session with, as its exit code states."""
+        """Start the process and wait until it is ready. Raises the error with which it rejects the session."""
         self._spawn()
         while not is_over() and not self._is_ready():
             clock.sleep(LOOK_S)
 
     def _is_ready(self) -> bool:
-        """Return whether the process waits for the rig. Raises what it refuses the session with, or that it ended."""
+        """Return whether the process is waiting for data. Raises its error if it rejects the session or has ended."""
         code = None if self._process is None else self._process.poll()
         self._read()
         if self._refusal is not None:
@@ -127,7 +127,7 @@ class Supervisor:
         self.tap.put(stream, content)
 
     def begin(self, clock: ClockReading) -> None:
-        """Begin a recording, whose UTC is the monotonic clock and a constant."""
+        """Start a recording whose UTC is the monotonic clock plus a constant."""
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self._beginning = None
         self.tap.note(StreamNote(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
@@ -135,14 +135,14 @@ class Supervisor:
             wire.realtime(wire.RECORDER)
 
     def end(self) -> None:
-        """End the recording: what comes until the next one begins is not predicted."""
+        """End the recording; data until the next one are not predicted."""
         self._offset_ns = None
         if self.options.settings.realtime:
             wire.ordinary()  # decoding and writing have no deadline
         self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[StreamNote]:
-        """Take what the process reports, start it anew where it ended; return notes on that. Never raises, never waits."""
+        """Read the process's reports and restart it if it has ended; return notes on that. Never raises and never waits."""
         self.tap.flush()
         self._read()
         notes = []
@@ -154,7 +154,7 @@ class Supervisor:
             self._restart_s = min(2 * self._restart_s, RESTART_S[1])
             notes.append(StreamNote(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
         if self._process is None and clock.now_s() >= self._due_s:
-            with contextlib.suppress(OSError):  # too little memory: it is tried again
+            with contextlib.suppress(OSError):  # too little memory: try again later
                 self._spawn()
                 notes.append(
                     StreamNote(clock.now_ns(), self._noted_stream, RESTARTED, f"restart {self.deaths} of this session")
@@ -162,7 +162,7 @@ class Supervisor:
         return notes
 
     def stop(self) -> None:
-        """End the process in good order; one that does not end is killed."""
+        """Ask the process to end, and kill it if it does not."""
         process = self._process
         if process is None:
             return
@@ -182,7 +182,7 @@ class Supervisor:
         self._process = self._socket = None
 
     def figures(self) -> SessionFigures:
-        """Return what the session did so far, over all its processes."""
+        """Return the session's figures over all of its processes."""
         figures = self.report.copy()
         for name, count in self._totals.items():
             figures[name] = count + self.report.get(name, 0)
@@ -191,7 +191,7 @@ class Supervisor:
 
     def _spawn(self) -> None:
         ours, theirs = socket.socketpair()
-        threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more would only take the recorder's processor
+        threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more threads would only compete with the recorder
         environment = {**os.environ, **threads}
         words = [sys.executable, "-m", MODULE, str(theirs.fileno())]
         try:
@@ -237,7 +237,7 @@ class Supervisor:
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
                 elif "beginning" in content:
-                    if content["offset_ns"] == self._offset_ns:  # else it is that of the recording before
+                    if content["offset_ns"] == self._offset_ns:  # otherwise it belongs to the previous recording
                         self._beginning = content["beginning"]
                 elif "report" in content:
                     self.report = content["report"]

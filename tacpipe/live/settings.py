@@ -32,26 +32,26 @@ if TYPE_CHECKING:
     from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.task import PredictionRequest
 
-SettingValues = Mapping[str, Scalar | Sequence[Scalar] | None]  # by name, from a rig file or options
+SettingValues = Mapping[str, Scalar | Sequence[Scalar] | None]  # values by name, from a rig file or options
 NOT_SET = ("task", "places")  # fields of `Settings` that are neither keys nor options
 
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """The settings that only sessions of one task have. A subclass is a frozen dataclass; its comments are the help."""
+    """The settings specific to sessions of one task. Subclasses are frozen dataclasses whose field comments are the help."""
 
     @classmethod
     def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:
-        """Return what a rig file states, without the keys that ``options`` make void."""
+        """Return the settings of a rig file without the keys that ``options`` override."""
         return file_settings
 
     def check(self, settings: Settings) -> None:
-        """Raise `UsageError` for settings that do not go together."""
+        """Raise `UsageError` for an invalid combination of settings."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that sessions of all tasks have, and those of the task. Names are those of options, with ``_`` for ``-``."""
+    """Settings common to sessions of all tasks, and those of the task. Names are those of options, with ``_`` for ``-``."""
 
     model: str = ""  # Trained model, as of `tacpipe train`
     publish: tuple[str, ...] = ()  # Address to publish to: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE
@@ -59,9 +59,7 @@ class Settings:
     realtime: bool = False  # Real-time scheduling of the session, where the system allows it
     allow_look_ahead: bool = False  # Accept a model that was trained on rows that look ahead
     task: TaskSettings = field(default_factory=TaskSettings)  # settings of the model's task
-    places: Mapping[str, str] = field(
-        default_factory=dict, compare=False
-    )  # file and table of each key that a file states
+    places: Mapping[str, str] = field(default_factory=dict, compare=False)  # file and table of each key set in a file
 
     @classmethod
     def from_sources(
@@ -71,11 +69,11 @@ class Settings:
         rig_file: str,
         options: SettingValues,
     ) -> Self:
-        """Return the settings that a rig file ``rig_file`` states in its table ``[live]``, overridden by ``options``.
+        """Return the settings in the table ``[live]`` of ``rig_file``, overridden by ``options``.
 
-        ``task_settings`` is the dataclass of the task's settings; None is an option that was not given.
-        Raises `UsageError` that names file and key, or option, for an unknown key, a value that is not allowed, and
-        settings that do not go together.
+        ``task_settings`` is the dataclass of the task's settings; options that were not given are None. Raises
+        `UsageError`, which names file and key, or the option, for an unknown key, an invalid value, and an invalid
+        combination.
         """
         options = {name: value for name, value in options.items() if value is not None}
         common = {name: kind for name, kind in fields.hints(cls).items() if name not in NOT_SET}
@@ -102,7 +100,7 @@ class Settings:
 
     @contextlib.contextmanager
     def naming(self, name: str) -> Iterator[None]:
-        """Have an error about the option of a key, raised in the block, name file and key where a file states it."""
+        """Make an error about a key's option, raised in the block, name the file and key if a file sets it."""
         try:
             yield
         except UsageError as error:
@@ -111,20 +109,20 @@ class Settings:
             raise UsageError(f"{self.places[name]}: {str(error).replace(option(name), name)}") from error
 
     def name_in_errors(self, name: str) -> str:
-        """Return how errors name a key: by the file that states it, else by its option."""
+        """Return the name of a key in errors: file and key if a file sets it, else its option."""
         return f"{self.places[name]}: {name}" if name in self.places else option(name)
 
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """A live session as the recording process hands it to the model's process."""
+    """A live session as passed from the recording process to the model's process."""
 
     task: str  # name of the model's task
     rig: str  # text of the rig file, with the session's own streams
-    streams: tuple[str, ...]  # streams of the rig that are handed on, in the order of their numbers
+    streams: tuple[str, ...]  # streams of the rig that are passed on, ordered by their numbers
     own_streams: tuple[str, ...]  # streams that the session adds to the rig
     settings: Settings  # its paths are absolute
-    nice: int = 1  # niceness of the model's process, which stands back behind the recording
+    nice: int = 1  # niceness of the model's process, which yields to the recording
 
     def to_json(self) -> str:
         """Return the options as one line."""
@@ -132,7 +130,7 @@ class SessionOptions:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return the options of such a line."""
+        """Return the options in a line from `to_json`."""
         content = json.loads(text)
         live = registry.load_task(content["task"]).live
         if live is None:
@@ -159,12 +157,12 @@ def option(name: str) -> str:
 
 
 def parse_option(name: str, text: Any, annotation: Any) -> Any:
-    """Return the value that an option's text has for an annotation; a list is separated by commas.
+    """Return the value of an option's text for an annotation; a list is comma-separated.
 
     >>> parse_option("steps", "1,5", tuple[int, ...]), parse_option("settle_ms", "3", float)
     ((1, 5), 3.0)
 
-    Raises `UsageError` if the annotation does not allow it.
+    Raises `UsageError` if the value is invalid for the annotation.
     """
     if not isinstance(text, str):
         return text
@@ -176,7 +174,7 @@ def parse_option(name: str, text: Any, annotation: Any) -> Any:
 
 
 def task_settings() -> dict[str, type[TaskSettings]]:
-    """Return the dataclass of the settings of each task whose models run live, by the name of the task."""
+    """Return the settings dataclass of each task with live sessions, by task name."""
     tasks = {name: registry.load_task(name).live for name in registry.tasks()}
     return {name: live.settings for name, live in tasks.items() if live is not None}
 
@@ -190,37 +188,37 @@ def keys(settings: type[Any]) -> list[str]:
 class SessionPlan:
     """A live session that a task has checked against model, rig and settings."""
 
-    rig: Rig  # includes streams that the engine needs beyond those of the rig file
+    rig: Rig  # includes additional streams that the engine needs
     settings: TaskSettings  # completed
     streams: Mapping[str, SettingValues]  # recorded streams with the options of the sensor ``live``
     attributes: Mapping[str, Attribute] = field(default_factory=dict)  # further attributes of the recording
 
 
 class LiveTask(ABC):
-    """A task's part of live sessions. The module of a subclass imports torch and pyarrow inside of its methods only."""
+    """A task's part of live sessions. Modules of subclasses import torch and pyarrow only inside methods."""
 
     settings: ClassVar[
         type[TaskSettings]
-    ]  # dataclass of its own settings: options of ``tacpipe live`` and keys of ``[live]``
+    ]  # dataclass of its settings: options of ``tacpipe live`` and keys of ``[live]``
     declaration: ClassVar[Declaration]  # the values of its messages
 
     @abstractmethod
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
-        """Return the plan of a session, from the configuration of the model, without torch.
+        """Return the plan of a session from the model's configuration, without torch.
 
-        Raises `UsageError` for settings that do not suit model or rig, `TacpipeError` if the model was trained on rows
+        Raises `UsageError` for settings that do not match model or rig, `TacpipeError` if the model was trained on rows
         that look ahead, unless the settings allow it.
         """
 
     @abstractmethod
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
-        """Return the engine that turns the samples of ``sensors``, by stream, into messages, in the model's process.
+        """Return the engine that converts samples of ``sensors``, by stream, to messages; runs in the model's process.
 
-        Raises `UsageError` if model, rig and settings do not belong together.
+        Raises `UsageError` if model, rig and settings do not match.
         """
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return what a session publishes for recordings as they were recorded (``predict --causal``).
+        """Return what a session would publish for recordings (``predict --causal``).
 
         Raises `UsageError` if the task has no such predictions.
         """

@@ -1,4 +1,4 @@
-"""Run the stages that a model was trained behind without a store, and read their params."""
+"""Run the stages of a model's chain without a store, and read their params."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.store.records import Step
 
-EARLIER_VERSIONS = {"synchronize": (2,)}  # today's stage reads their params and gives the same rows
+EARLIER_VERSIONS = {
+    "synchronize": (2,)
+}  # earlier versions whose params today's stage reads and whose rows it reproduces
 
 
 def stage_params(step: Step) -> Any:
-    """Return the params of a stage of a chain. Raises `UsageError` if it has another version now."""
+    """Return the params of a stage of a chain. Raises `UsageError` if the stage now has another version."""
     name = step["stage"]
     stage = registry.load(name)
     if step["version"] not in (stage.version, *EARLIER_VERSIONS.get(name, ())):
@@ -72,7 +74,7 @@ class RecordingsInMemory:
 
 
 def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
-    """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
+    """Return the streams of a recording. Raises `UsageError` if it has already been synchronized."""
     if set(recording.streams) == {""}:
         raise UsageError(
             "this recording already went through a stage, so the arrival of its samples is unknown. Give the "
@@ -82,7 +84,7 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
 
 
 def run_stages(recording: Recording, model: Dataset) -> Any:
-    """Return a recording as it is after the stages of a model's chain; it went through none of them yet."""
+    """Return a recorded, unprocessed recording after the stages of a model's chain."""
     current: Any = recording
     for step in model.source.chain:
         stage = registry.load(step["stage"])

@@ -163,7 +163,7 @@ class BoundedConnection(ServerConnection):
         self._all = connections
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take a place among the connections of the server, or end."""
+        """Register with the server, or close if there are too many connections."""
         self._began_s, self._received = self.loop.time(), 0
         super().connection_made(transport)
         if len(self._all) < CONNECTIONS:
@@ -172,7 +172,7 @@ class BoundedConnection(ServerConnection):
             self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Take what the client sent, or end."""
+        """Process data from the client, or close."""
         self._received += len(data)
         allowed = RECEIVED_BYTES + RECEIVED_BYTES_S * (self.loop.time() - self._began_s)
         if self._received > allowed:
@@ -181,6 +181,6 @@ class BoundedConnection(ServerConnection):
             super().data_received(data)
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Leave the place."""
+        """Unregister from the server."""
         self._all.discard(self)
         super().connection_lost(error)

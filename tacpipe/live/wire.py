@@ -1,12 +1,12 @@
 """Connect the recording process with the model's process, and schedule their threads in real time.
 
 The threads that read the links call `RecorderTap.put`, which never waits and never raises. Blocks that the socket does
-not accept at once wait in a queue of bounded size. When it is full, the whole queue is dropped and counted, and the
-model's process is informed. The recording loses nothing.
+not accept immediately wait in a bounded queue. When it is full, the whole queue is dropped and counted, and the model's
+process is notified. The recording loses nothing.
 
-Blocks go one way, as in a spool, lines of JSON back. The threads of both run before all ordinary programs, the recorder's
-before the model's. The priority of ``nice`` is no substitute: where the kernel groups processes by session
-(``sched_autogroup_enabled``, as on most desktops), it counts among the programs of one terminal only.
+Blocks are sent one way, in the format of a spool; JSON lines are sent back. The threads of both processes run before
+all ordinary programs, the recorder's before the model's. ``nice`` is no substitute: if the kernel groups processes by
+session (``sched_autogroup_enabled``, as on most desktops), it only affects programs of one terminal.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, StreamNote
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 
-CLOCK = "clock"  # a note on all streams: what is added to the monotonic clock to have the recording's UTC, ns
-BEGIN = "begin"  # a recording begins: what its streams give follows behind a note of each
-CONTINUE = "continue"  # precedes BEGIN: the state that a new process continues from
+CLOCK = "clock"  # note on all streams: offset in ns from the monotonic clock to the recording's UTC
+BEGIN = "begin"  # a recording begins; each stream's data follow after a note of its own
+CONTINUE = "continue"  # precedes BEGIN: the state from which a new process continues
 END = "end"  # the recording ends
-OVERFLOW = "overflow"  # blocks were thrown away, because the model's process did not fetch them
-STOP = "stop"  # the session is over
-QUEUED_BYTES = 8 << 20  # limit of the bytes that wait for the model's process: many seconds of a rig
+OVERFLOW = "overflow"  # blocks were dropped because the model's process did not read them
+STOP = "stop"  # the session ends
+QUEUED_BYTES = 8 << 20  # maximum size of the queue, enough for many seconds of a rig
 
 
 def block(stream: int | None, content: Chunks | StreamNote) -> bytes:
-    """Return one block as bytes; ``stream`` is the number of its stream, None for a note on all of them."""
+    """Return an encoded block; ``stream`` is the number of its stream, or None for a note on all streams."""
     if isinstance(content, Chunks):
         body = content.t_ns.astype("<i8").tobytes() + content.size.astype("<u4").tobytes() + content.data
         return spool.pack_block(CHUNKS, 0 if stream is None else stream, len(content.size), body)
@@ -47,16 +47,16 @@ def block(stream: int | None, content: Chunks | StreamNote) -> bytes:
 
 
 class Blocks:
-    """Cuts received bytes into blocks again."""
+    """Splits received bytes into blocks."""
 
     def __init__(self, streams: Sequence[str]) -> None:
         self._streams = list(streams)
         self._text = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[str, Chunks | StreamNote]]:
-        """Yield each block that is complete now with the name of its stream, empty for a note on all.
+        """Yield each complete block with the name of its stream, which is empty for a note on all streams.
 
-        Raises `TacpipeError` for bytes that are not blocks: the other process is not of this version.
+        Raises `TacpipeError` for invalid bytes, which come from a process of another version.
         """
         self._text += data
         place = 0
@@ -78,7 +78,7 @@ class Blocks:
 
 
 class AlarmsJson(TypedDict):
-    """The levels of the alarms of a session; null where there is none."""
+    """The levels of a session's alarms; null if there is none."""
 
     axes: list[list[str]]  # stream and axis of each load
     levels: dict[str, list[float | None]]  # by alarm
@@ -87,7 +87,7 @@ class AlarmsJson(TypedDict):
 
 
 class LatencyFigures(TypedDict):
-    """The latencies of the answers of a session."""
+    """The latencies of a session's answers."""
 
     count: int
     p50_ms: float
@@ -96,7 +96,7 @@ class LatencyFigures(TypedDict):
 
 
 class SessionFigures(TypedDict, total=False):
-    """The state of a session, as the model's process reports it, and as the recording process completes it."""
+    """The state of a session as reported by the model's process and completed by the recording process."""
 
     kind: str
     answers: str  # plural noun for answers of the model
@@ -115,7 +115,7 @@ class SessionFigures(TypedDict, total=False):
 
 
 class ModelLine(TypedDict, total=False):
-    """A line from the model's process: its readiness, a refusal, a report, or the beginning of a recording."""
+    """A line from the model's process: its readiness, a rejection, a report, or the start of a recording."""
 
     ready: bool
     alarms: AlarmsJson | None
@@ -127,27 +127,27 @@ class ModelLine(TypedDict, total=False):
 
 
 class LineCutter:
-    """Cuts received bytes into objects, one a line."""
+    """Splits received bytes into JSON objects, one per line."""
 
     def __init__(self) -> None:
         self._text = b""
 
     def feed(self, data: bytes) -> list[ModelLine]:
-        """Return the objects that are complete now."""
+        """Return the objects that are now complete."""
         *lines, self._text = (self._text + data).split(b"\n")
         return [json.loads(line) for line in lines if line]
 
 
 def line(content: ModelLine) -> bytes:
-    """Return an object as a line."""
+    """Return an object as one line."""
     return json.dumps(content, separators=(",", ":")).encode() + b"\n"
 
 
 class RecorderTap:
-    """The recorder's side of the connection to the model's process, which may be replaced while it is in use."""
+    """The recorder's side of the connection to the model's process, which can be replaced while in use."""
 
     def __init__(self, streams: Sequence[str], most_bytes: int = QUEUED_BYTES) -> None:
-        self.overflows = 0  # how often the queue was thrown away
+        self.overflows = 0  # number of times that the queue was dropped
         self.bytes_lost = 0
         self._numbers: Mapping[str, int] = {name: number for number, name in enumerate(streams)}
         self._most_bytes = most_bytes
@@ -157,7 +157,7 @@ class RecorderTap:
         self._waiting_bytes = 0
 
     def connect(self, connection: socket.socket | None, *first: StreamNote) -> None:
-        """Send later blocks over a socket, ``first`` before it; None: send nothing until the next call."""
+        """Send later blocks over this socket, starting with ``first``; with None, send nothing until the next call."""
         with self._keeping:
             self._waiting.clear()
             self._waiting_bytes = 0
@@ -168,7 +168,7 @@ class RecorderTap:
                 self._append(block(None, note))
 
     def put(self, stream: str, content: Chunks | StreamNote) -> None:
-        """Send a block of a stream, or a note on it; thread-safe."""
+        """Send a block of a stream, or a note on it. Thread-safe."""
         with self._keeping:
             if self._connection is not None:
                 self._append(block(self._numbers[stream], content))
@@ -180,12 +180,12 @@ class RecorderTap:
                 self._append(block(None, note))
 
     def put_begins(self) -> None:
-        """Send the note that each stream begins to a process that is started during a recording."""
+        """Send the note that each stream begins, for a process started during a recording."""
         for stream in self._numbers:
             self.put(stream, StreamNote(clock.now_ns(), stream, BEGAN))
 
     def flush(self) -> None:
-        """Send the blocks that wait, as far as the socket accepts them."""
+        """Send queued blocks as far as the socket accepts them."""
         with self._keeping:
             self._send()
 
@@ -197,7 +197,7 @@ class RecorderTap:
         self._send()
 
     def _overflow(self) -> None:
-        """Throw away all but the rest of a block whose beginning was sent."""
+        """Drop the queue, except the rest of a partially sent block."""
         is_partly_sent = len(self._waiting) > 0 and self._waiting[0].nbytes < len(self._waiting[0].obj)  # type: ignore[arg-type]
         retained = [self._waiting[0]] if is_partly_sent else []
         self.overflows += 1
@@ -212,7 +212,7 @@ class RecorderTap:
                 sent = self._connection.send(self._waiting[0])
             except (BlockingIOError, InterruptedError):
                 return
-            except OSError:  # the process is gone; who watches it connects the next one
+            except OSError:  # the process has ended; the supervisor connects the next one
                 self._connection = None
                 return
             self._waiting_bytes -= sent
@@ -222,7 +222,7 @@ class RecorderTap:
                 self._waiting[0] = self._waiting[0][sent:]
 
 
-RECORDER, MODEL = 20, 10  # priorities: the recording never waits for the model
+RECORDER, MODEL = 20, 10  # priorities, so that the recording never waits for the model
 
 
 def check() -> None:
@@ -238,14 +238,14 @@ def check() -> None:
 
 
 def realtime(priority: int) -> None:
-    """Have all threads of this process run before ordinary programs; without the right to, they stay as they are."""
+    """Run all threads of this process before ordinary programs, if permitted."""
     for thread in _threads():
         with contextlib.suppress(OSError):  # the thread may have ended
             _set(thread, priority)
 
 
 def ordinary() -> None:
-    """Have all threads of this process scheduled as ever."""
+    """Schedule all threads of this process normally again."""
     for thread in _threads():
         with contextlib.suppress(OSError):
             os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))

@@ -1,1 +1,1 @@
-"""Tables and figures of results, on one page."""
+"""Report results as tables and figures on one page."""

@@ -1,4 +1,4 @@
-"""The parts of a page as data: tables, charts, notes and folds; `tacpipe.report.html` writes them."""
+"""The parts of a page as data: tables, charts, notes and folds, which `tacpipe.report.page` renders."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 from tacpipe.report.charts import Spec
 
-TINY = 1e-12  # a smaller number is a rounded 0
-NONE = "–"  # stands where there is no number
+TINY = 1e-12  # smaller numbers are rounded zeros
+NONE = "–"  # shown in place of a missing number
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Text of a table, small text below it, what it is sorted by where that is not the text, and what a click copies."""
+    """A table cell: its text, small text below, a sort value if that is not the text, and the text copied on a click."""
 
     text: str
     below: str = ""
@@ -24,7 +24,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table; its kind is one of ``best``, ``quiet`` or empty."""
+    """A table row, of kind ``best``, ``quiet`` or empty."""
 
     cells: Sequence[str | Cell]
     kind: str = ""
@@ -32,7 +32,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that stay together: a heading, or a first row behind which the others fold."""
+    """Rows that stay together: under a heading, or folded behind the first row."""
 
     rows: Sequence[Row]
     title: str = ""
@@ -41,12 +41,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Table:
-    """A table that can be sorted by its columns and scrolls sideways below its first one."""
+    """A table that can be sorted by column and scrolled sideways with its first column fixed."""
 
     title: str
     heads: Sequence[str]
     groups: Sequence[Group]
-    words: bool = False  # True: cells are text, to the left
+    words: bool = False  # whether cells are left-aligned text
 
     @property
     def rows(self) -> list[Row]:
@@ -56,7 +56,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and what it shows; a wide one takes the whole column."""
+    """A chart with a caption; a wide one fills the column."""
 
     title: str
     spec: Spec
@@ -80,7 +80,7 @@ class Charts:
 
 @dataclass(frozen=True)
 class Fold:
-    """A heading behind which blocks are folded."""
+    """A heading that folds its blocks."""
 
     title: str
     blocks: Sequence[Block]
@@ -92,7 +92,7 @@ Block = Table | Chart | SmallPrint | Charts | Fold
 
 @dataclass(frozen=True)
 class Section:
-    """The part of the page that one task has: its first screen, then what is folded."""
+    """The section of a task: its first screen, then folds."""
 
     name: str  # name of the task
     title: str
@@ -113,12 +113,12 @@ def table(
     *,
     words: bool = False,
 ) -> Table:
-    """Return a table of one group, with the kinds of rows by their number."""
+    """Return a table of one group; ``kinds`` are the kinds of rows by index."""
     return Table(title, heads, [Group([Row(row, (kinds or {}).get(at, "")) for at, row in enumerate(rows)])], words)
 
 
 def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
-    """Return a fold of those blocks that are there, or None if none is."""
+    """Return a list with a fold of the blocks that are not None, or an empty list if there are none."""
     shown_blocks = [
         block for block in blocks if block is not None and not (isinstance(block, SmallPrint) and not block.text)
     ]
@@ -128,12 +128,12 @@ def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
 
 
 def notes(*texts: str) -> SmallPrint:
-    """Return texts as one paragraph, empty ones left out."""
+    """Return the non-empty texts as one paragraph."""
     return SmallPrint(" ".join(filter(None, texts)))
 
 
 def number(value: float, digits: int = 4) -> Cell:
-    """Return a number with so many digits, without exponent where it is not tiny.
+    """Return a number with this many digits, without an exponent unless it is tiny.
 
     >>> number(12345.6).text, number(-0.012345).text, number(float("nan")).text
     ('12,346', '−0.01235', '–')
@@ -146,7 +146,7 @@ def number(value: float, digits: int = 4) -> Cell:
 
 
 def fixed(value: float, digits: int) -> str:
-    """Return a number with so many decimals.
+    """Return a number with this many decimals.
 
     >>> fixed(0.05496, 4), fixed(float("nan"), 4)
     ('0.0550', '–')
@@ -155,7 +155,7 @@ def fixed(value: float, digits: int) -> str:
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """Return a number with its sign, with fewer decimals where it is large.
+    """Return a number with its sign, with fewer decimals if it is large.
 
     >>> signed(0.5), signed(-123.4), signed(float("nan")), signed(2.0, 1)
     ('+0.500', '−123', '–', '+2.0')
@@ -167,7 +167,7 @@ def signed(value: float, digits: int = 3) -> str:
 
 
 def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
-    """Return a signed number above its interval, where that is more than a point.
+    """Return a signed number with its interval below, unless the interval is a point.
 
     >>> interval(0.5, 0.25, 0.75)
     Cell(text='+0.500', below='+0.250 to +0.750', value=0.5, copy='')
@@ -180,7 +180,7 @@ def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
 
 
 def with_sd(mean: float, sd: float, digits: int = 4) -> Cell:
-    """Return mean ± standard deviation, as far as both are defined.
+    """Return mean ± standard deviation, without the latter if it is NaN.
 
     >>> with_sd(0.05, 0.00123).text, with_sd(0.05, float("nan")).text
     ('0.0500 ± 0.0012', '0.0500')
@@ -200,7 +200,7 @@ def p_value(p: float) -> Cell:
 
 
 def form(name: str, text: str, published: bool) -> str:
-    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
+    """Return a caption or title, marked as in the form of the paper's table or figure if the data are the paper's.
 
     >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
     ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
@@ -209,7 +209,7 @@ def form(name: str, text: str, published: bool) -> str:
 
 
 def counted(count: int, plural: str) -> str:
-    """Return how many there are of a noun.
+    """Return a count with its noun.
 
     >>> counted(1, "recordings"), counted(1200, "slides")
     ('1 recording', '1,200 slides')
@@ -218,7 +218,7 @@ def counted(count: int, plural: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names as a sentence has them.
+    """Return names joined as in a sentence.
 
     >>> listed(["a", "b", "c"]), listed(["a"]), listed([])
     ('a, b and c', 'a', '')

@@ -1,4 +1,4 @@
-"""Read what results hold and where they come from, and collect the results of one task."""
+"""Read the content and origin of results, and collect the results of one task."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `t
 SHORTENED = (
     "shortened"  # setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
 )
-GROWS = "trained_on"  # a part that names the recordings of the calibration too
+GROWS = "trained_on"  # a part that also contains the recordings of the calibration
 
 
 class ReportResult(Generic[Config]):
     """One result: a model trained once and evaluated once."""
 
     STAGE: ClassVar[str] = ""  # stage that trained the model
-    SETS: ClassVar[Collection[str]] = ()  # published sets whose paper's tables and figures are next to ours
+    SETS: ClassVar[Collection[str]] = ()  # published sets whose paper's tables and figures are shown next to ours
 
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
@@ -55,12 +55,12 @@ class ReportResult(Generic[Config]):
 
     @cached_property
     def history(self) -> Sequence[Line]:
-        """The lines of ``history.jsonl``, one per epoch; empty where nothing was trained by epochs."""
+        """The lines of ``history.jsonl``, one per epoch; empty if training had no epochs."""
         return read_history(self.dataset.files.get("history.jsonl", b""))
 
     @cached_property
     def params(self) -> Settings:
-        """The params of the training that count for the model's architecture."""
+        """The training params that the model's architecture uses."""
         return params_of.counting(registry.load(self.STAGE), self.given)
 
     @property
@@ -71,7 +71,10 @@ class ReportResult(Generic[Config]):
 
     @property
     def epochs_of_paper(self) -> str:
-        """The epochs of a paper's network, where they are fewer than the paper's, as "150 of 2,000 epochs"; else empty."""
+        """The epochs of a paper's network, such as "150 of 2,000 epochs", if they are fewer than the paper's.
+
+        Otherwise "".
+        """
         tagged = {"architecture": self.config.get("architecture"), **self.given}
         presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged))
         epochs, printed = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
@@ -80,24 +83,24 @@ class ReportResult(Generic[Config]):
 
     @property
     def simulated(self) -> bool:
-        """True if any of its recordings was simulated."""
+        """Whether any of its recordings was simulated."""
         return is_simulated(self.dataset)
 
     @property
     def published(self) -> bool:
-        """True if its recordings are those of the task's paper."""
+        """Whether its recordings are those of the task's paper."""
         return is_published(self.dataset, self.SETS)
 
 
 def read_json(result: Dataset, name: str) -> Any:
-    """Return what a JSON file of a result holds, or empty if there is none of the name."""
+    """Return the content of a JSON file of a result, or an empty value if there is no such file."""
     return json.loads(result.files[name]) if name in result.files else {}
 
 
 def drop_duplicates(results: Sequence[Dataset]) -> list[Dataset]:
-    """Return results without those whose model was evaluated on the same recordings once it was calibrated too.
+    """Drop uncalibrated results that also exist calibrated on the same recordings.
 
-    Both hold the same predictions, so that one training would count as two.
+    Both contain the same predictions, so one training would count twice.
     """
     keys = [_result_key(result) for result in results]
     calibrated = {key for key, result in zip(keys, results, strict=True) if _is_calibrated(result)}
@@ -111,7 +114,7 @@ def _is_calibrated(result: Dataset) -> bool:
 
 
 def _result_key(result: Dataset) -> str:
-    """Return what is the same of a model and its calibrated copy, and what they were evaluated on."""
+    """Return a key that is equal for a model and its calibrated copy evaluated on the same recordings."""
     config = {key: value for key, value in read_json(result, "config.json").items() if key not in (*CALIBRATION, GROWS)}
     inputs = {name: value for name, value in result.manifest["inputs"].items() if name != "model"}
     return json.dumps([config, inputs], sort_keys=True)
@@ -126,17 +129,17 @@ def is_simulated(result: Dataset) -> bool:
 
 
 def is_published(result: Dataset, sets: Collection[str]) -> bool:
-    """Return whether all recordings of a result are of published ``sets``.
+    """Return whether all recordings of a result belong to published ``sets``.
 
-    The papers' numbers are about these data alone. The attribute ``published``, which `tacpipe ingest` sets, names the
-    set of a recording.
+    The papers' numbers apply only to these data. `tacpipe ingest` sets the attribute ``published`` of a recording to
+    its set.
     """
     set_names = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.recordings.values()]
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
 
 
 def provenance_blocks(manifest: ManifestJson) -> list[Block]:
-    """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
+    """Return the chain of stages that produced a dataset, from its manifest, with params and digests."""
     last: Step = {
         "stage": manifest["stage"],
         "version": manifest["version"],
@@ -162,9 +165,9 @@ def provenance_blocks(manifest: ManifestJson) -> list[Block]:
 def loss_chart(
     runs: Mapping[str, Sequence[Sequence[float]]], quantity: str, order: Sequence[str] = (), *, log: bool = False
 ) -> Spec:
-    """Return a thin line a run, one value an epoch, and the mean over the runs of each name.
+    """Return a thin line per run with one value per epoch, and the mean over the runs of each name.
 
-    The mean ends where the first of its runs does. NaN breaks a line.
+    The mean ends with the shortest of its runs. NaN breaks a line.
     """
     lines = []
     for name, curves in runs.items():
@@ -173,12 +176,12 @@ def loss_chart(
         length = min(map(len, curves))
         mean = np.mean([curve[:length] for curve in curves], axis=0)
         lines.append(Curve(name, range(1, length + 1), mean))
-    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value makes no line
+    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value does not make a line
     return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
 
 
 def without_gaps(values: Sequence[float | None]) -> list[float]:
-    """Return one value an epoch, or NaN if an epoch states none, or empty if no epoch states any.
+    """Return one value per epoch, NaN for epochs without one, or an empty list if no epoch has one.
 
     >>> without_gaps([None, 1]), without_gaps([None, None])
     ([nan, 1.0], [])
@@ -191,21 +194,24 @@ def without_gaps(values: Sequence[float | None]) -> list[float]:
 
 
 def curves_of_methods(methods: Sequence[Method], read: Callable[[Any], list[float]]) -> dict[str, list[list[float]]]:
-    """Return the curves that ``read`` gives of the results of each method, by its name; methods without any left out."""
+    """Return the curves that ``read`` returns for each method's results, by method name.
+
+    Methods without curves are omitted.
+    """
     by_method = {method.name: [curve for result in method.details if (curve := read(result))] for method in methods}
     return {name: curves for name, curves in by_method.items() if curves}
 
 
 @dataclass(frozen=True)
 class Context:
-    """The results of one task, compared, and the datasets next to them."""
+    """The results of one task with their comparisons, and related datasets."""
 
     task: TaskReport
     methods: Sequence[Method]
     comparisons: Sequence[Comparison]
     others: Sequence[Dataset] = ()  # datasets that are not results
-    bare: Sequence[Dataset] = ()  # results that hold nothing to compare
-    traces: int = 0  # recordings that are drawn in full
+    bare: Sequence[Dataset] = ()  # results without anything to compare
+    traces: int = 0  # number of recordings that are drawn completely
     runs: Sequence[ComparedRun] = field(default=())
 
     @cached_property
@@ -218,16 +224,16 @@ class Context:
 
     @property
     def simulated(self) -> bool:
-        """True if any run was evaluated on simulated recordings."""
+        """Whether any run was evaluated on simulated recordings."""
         return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
-        """True if all runs were evaluated on the recordings of the task's paper."""
+        """Whether all runs were evaluated on the recordings of the task's paper."""
         return bool(self.runs) and all(run.published for run in self.runs)
 
     def winner(self, part: str) -> Method | None:
-        """Return the method of the best mean rank over the targets of a part; of several the first by name."""
+        """Return the method with the best mean rank over the targets of a part; ties are broken by name."""
         ranks: dict[str, list[int]] = {}
         for method in self.parts[part]:
             for place, row in enumerate(method.models):
@@ -238,14 +244,14 @@ class Context:
         return next((method for method in self.methods if method.name == best), None)
 
     def row(self, comparison: Comparison, method: Method | None) -> ComparisonRow | None:
-        """Return the row of a method itself in a comparison."""
+        """Return the row of a method in a comparison."""
         return next(
             (row for row in comparison.rows if method and row.method is method and row.name == method.name), None
         )
 
 
 def median_run(method: Method, comparison: Comparison) -> ComparedRun:
-    """Return the run of a method whose score is in the middle, of an even number the one below."""
+    """Return a method's run with the median score, or the lower of the two middle ones."""
     measure, question = comparison.measure, comparison.question
     runs = method.of(question)
 

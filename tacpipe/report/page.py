@@ -1,4 +1,4 @@
-"""Render one page of results of all tasks, as one HTML file that loads nothing."""
+"""Render one page with the results of all tasks, as a self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-LIBRARY = "vl_convert"  # brings Vega and Vega-Lite as JavaScript
+LIBRARY = "vl_convert"  # contains the JavaScript of Vega and Vega-Lite
 COMMAND = re.compile(r"`([^`]+)`")
 
 
 def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
-    """Return the page as UTF-8; the same sections give the same bytes."""
+    """Return the page as UTF-8; equal sections give equal bytes."""
     with extras.explain_missing("A report"):
         import jinja2
         from markupsafe import Markup
@@ -52,12 +52,12 @@ def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
 
 @functools.cache
 def bundle() -> str:
-    """Return Vega, Vega-Lite and Vega-Embed as one script, which puts ``vegaEmbed`` into the window."""
+    """Return Vega, Vega-Lite and Vega-Embed as one script that defines ``window.vegaEmbed``."""
     import vl_convert
 
     script: str = vl_convert.javascript_bundle(snippet="window.vegaEmbed = vegaEmbed;")
     safe = script.replace("</script", "<\\/script")
-    return f"(() => {{{safe}}})();"  # its own names stay in it
+    return f"(() => {{{safe}}})();"  # keeps its own names local
 
 
 def _template(name: str) -> str:
@@ -65,7 +65,7 @@ def _template(name: str) -> str:
 
 
 def _spec_markup(spec: Any) -> Markup:
-    """Return a chart's specification as JSON that no text in it can end, its data by column."""
+    """Return a chart's specification as JSON that no text in it can terminate, with its data by column."""
     from markupsafe import Markup
 
     text = json.dumps(_pack_spec(spec), sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
@@ -73,7 +73,7 @@ def _spec_markup(spec: Any) -> Markup:
 
 
 def _pack_spec(spec: Any) -> Any:
-    """Return a specification whose data are by column: what is the same in all rows once, other texts by their place.
+    """Return a specification with its data by column: constant columns once, texts by their index.
 
     >>> _pack_spec({"data": {"values": [{"a": 1, "b": "x"}, {"a": 2, "b": "x"}]}})
     {'data': {'rows': 2, 'columns': {'a': [1, 2], 'b': {'of': ['x'], 'at': 0}}}}
@@ -106,14 +106,14 @@ def _pack_column(values: list[Any]) -> Any:
 
 
 def _mark_commands(text: str) -> Markup:
-    """Return text in which what stands in backquotes is code that a click copies."""
+    """Return text with its parts in backquotes marked as code that is copied on a click."""
     from markupsafe import Markup, escape
 
     return Markup(COMMAND.sub(r'<code data-copy="" title="click to copy">\1</code>', str(escape(text))))
 
 
 def _has_charts(section: Section) -> bool:
-    """Return whether a section holds any chart."""
+    """Return whether a section contains a chart."""
 
     def inside(block: Block) -> bool:
         return isinstance(block, Chart | Charts) or (isinstance(block, Fold) and any(map(inside, block.blocks)))
@@ -122,11 +122,11 @@ def _has_charts(section: Section) -> bool:
 
 
 def render(datasets: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
-    """Return the page for results of ``tacpipe evaluate``, as UTF-8; the same results give the same bytes.
+    """Return the page for results of ``tacpipe evaluate`` as UTF-8; equal results give equal bytes.
 
-    Without a ``title``, it is made of what the tasks on the page predict.
-    Results are reported by task, in the order in which tasks first come, with datasets that are not results next to those
-    whose task can use them. Raises `TacpipeError` if none can, and without any result.
+    The default ``title`` consists of the predicted quantities. Results are grouped by task in order of appearance, with
+    other datasets in the sections of tasks that can use them. Raises `TacpipeError` if no task can use a dataset, or if
+    there is no result.
     """
     with model_files.validated("the results"):
         return _rendered(datasets, title, traces)

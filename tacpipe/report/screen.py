@@ -1,4 +1,4 @@
-"""The first screen of a section: one sentence, one chart, one table of at most seven rows."""
+"""The first screen of a section: one sentence, one chart, and one table of at most seven rows."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tacpipe.report.blocks import table as table_of
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context
 
-MAX_ROWS = 7  # rows of the table
-SHOWN = 4  # methods of a chart, and as many baselines
+MAX_ROWS = 7  # maximum number of rows in the table
+SHOWN = 4  # number of methods, and of baselines, in a chart
 CLAUSES = {
     headline.BETTER: "better than",
     headline.WORSE: "worse than",
@@ -23,7 +23,7 @@ CLAUSES = {
 
 
 def sentence(context: Context) -> tuple[str, str]:
-    """Return which method is best, by how much over the best baseline and on how much, and the verdict on that."""
+    """Return a sentence about the best method and its gain over the best baseline, and the verdict."""
     clauses: list[str] = []
     verdicts: list[str] = []
     last, answer = "", ("", "")
@@ -32,7 +32,7 @@ def sentence(context: Context) -> tuple[str, str]:
         rows = [(comparison, row) for comparison in compared if (row := context.row(comparison, method)) is not None]
         if not rows or method is None:
             continue
-        # parts of other splits or timelines come behind a fold
+        # parts of other splits or timelines are folded
         name = "it" if method.name == last else method.name
         last = method.name
         verdicts += [row.gain.verdict for _, row in rows]
@@ -49,7 +49,7 @@ def sentence(context: Context) -> tuple[str, str]:
 
 
 def first_chart(context: Context) -> Chart | None:
-    """Return the best methods and baselines with their intervals, a panel a question."""
+    """Return the best methods and baselines with their intervals, one panel per question."""
     dots: list[Dot] = []
     levels: dict[str, float] = {}
     chosen = _questions(context)
@@ -81,7 +81,7 @@ def first_chart(context: Context) -> Chart | None:
 
 
 def first_table(context: Context) -> Table | None:
-    """Return the best methods and the best baseline, a row each; of several targets, the best method's row a target."""
+    """Return one row per best method and the best baseline; with several targets, one row of the best method per target."""
     parts = dict(list(context.parts.items())[:2])
     if not any(comparison.models for compared in parts.values() for comparison in compared):
         return None
@@ -149,14 +149,14 @@ def gain(comparison: Comparison, row: ComparisonRow) -> Cell:
 
 
 def _questions(context: Context) -> list[Comparison]:
-    """Return the comparisons of the chart: of the first two parts, or where there are several targets those of one."""
+    """Return the comparisons for the chart: the first two parts, or all targets of one part."""
     parts = list(context.parts.values())
     has_several_targets = any(len(part) > 1 for part in parts)
     return parts[0] if parts and has_several_targets else [compared[0] for compared in parts[:2]]
 
 
 def _leaders(comparison: Comparison) -> list[ComparisonRow]:
-    """Return the best method of each family, then others, the best first."""
+    """Return the best method of each family, then the others, the best first."""
     firsts: dict[str, ComparisonRow] = {}
     for row in comparison.models:
         firsts.setdefault(row.family, row)
@@ -221,7 +221,7 @@ def _verb(comparison: Comparison, row: ComparisonRow) -> str:
 
 
 def _amount(comparison: Comparison, row: ComparisonRow, called: str = "") -> str:
-    """Return a gain with its interval and what it rests on."""
+    """Return a phrase with a gain, its interval and its basis."""
     ends = [headline.signed(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
     interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
     return f"{_gained(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"

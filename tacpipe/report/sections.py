@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def metrics_sentence(results: Sequence[Dataset]) -> str:
-    """Return the first headline of results as a sentence; what they lack where there is none."""
+    """Return the first headline of results as a sentence, or what is missing if there is none."""
     for result in results:
         headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
         if headlines:
@@ -50,7 +50,7 @@ def metrics_sentence(results: Sequence[Dataset]) -> str:
 
 
 def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
-    """Return the part of the page that one result has: the ``place``-th ``of`` so many."""
+    """Return the folds of one result, the ``place``-th of ``count``."""
     config = context.read_json(result, "config.json")
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
@@ -61,7 +61,7 @@ def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
 
 
 def leaves(tree: Json) -> dict[str, str]:
-    """Return the values of nested names as text, by the names that lead to each.
+    """Return nested values as text, by the names that lead to them.
 
     >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})
     {'model, accuracy, biotac': '0.5', 'classes': '[1, 2]', 'p': '–'}
@@ -77,8 +77,8 @@ def leaves(tree: Json) -> dict[str, str]:
     return texts
 
 
-RECORDINGS = 60  # rows of a table of recordings
-DOTS = 400  # recordings of a chart
+RECORDINGS = 60  # maximum number of rows in a table of recordings
+DOTS = 400  # maximum number of recordings in a chart
 KINDS = {
     "baseline": "Baselines",
     "variant": "The models' own forecasts in another form",
@@ -92,7 +92,7 @@ PICKED = (
 
 
 def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequence[Dataset], traces: int) -> Section:
-    """Return what results of one task state, with datasets that are not results next to them."""
+    """Return the section for the results of one task and related datasets."""
     runs = task.read(results)
     methods = grouped(runs, task.usual)
     compared = {id(result.dataset) for result in runs}
@@ -128,7 +128,7 @@ def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequen
 
 
 def everything(context: Context) -> list[Fold]:
-    """Return all methods by family, then baselines, oracles and controls, a table a question."""
+    """Return tables of all methods by family, then baselines, oracles and controls, one table per question."""
     tables = [_table(context, comparison) for comparison in context.comparisons]
     if not tables:
         return []
@@ -146,7 +146,7 @@ def everything(context: Context) -> list[Fold]:
 
 
 def headline_caption(measure: Measure) -> str:
-    """Return what the columns of a measure mean."""
+    """Return the meaning of a measure's columns."""
     skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
     points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
     return (
@@ -187,7 +187,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
 
 
 def _same(comparison: Comparison) -> bool:
-    """Return whether the score is among the columns already."""
+    """Return whether the score is already among the columns."""
     return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in comparison.rows) or all(
         row.score.mean == row.values[0] for row in comparison.rows
     )
@@ -208,7 +208,7 @@ def _line(
 
 
 def recordings(context: Context) -> list[Fold]:
-    """Return how the best method does on each recording of each part, the worst first, and the command to see one."""
+    """Return the best method's errors on each recording of each part, the worst first, with the command to view one."""
     parts: list[blocks.Block] = []
     for comparison in context.comparisons:
         row = context.row(comparison, context.winner(comparison.question.part))
@@ -234,7 +234,7 @@ def _by_recording(comparison: Comparison, row: ComparisonRow) -> list[blocks.Blo
         for sums in (mine, baseline_sums)
     )
     gains = np.asarray(measure.gain(errors, based), np.float64)
-    order = sorted(range(len(names)), key=lambda at: (np.isnan(errors[at]), -errors[at], names[at]))  # the worst first
+    order = sorted(range(len(names)), key=lambda at: (np.isnan(errors[at]), -errors[at], names[at]))  # worst first
     wrong = [at for at in order if errors[at] != 0]
     digits = 1 if measure.name == "points" else 3
     rows: list[Sequence[str | Cell]] = []
@@ -269,7 +269,7 @@ def _by_recording(comparison: Comparison, row: ComparisonRow) -> list[blocks.Blo
 
 
 def every_run(context: Context) -> list[Fold]:
-    """Return one row a run."""
+    """Return a table with one row per run."""
     rows: list[Sequence[str | Cell]] = []
     for method in context.methods:
         for run in sorted(method.runs, key=lambda run: (str(run.fold), str(run.seed))):
@@ -298,7 +298,7 @@ def every_run(context: Context) -> list[Fold]:
 
 
 def basis(context: Context) -> list[Fold]:
-    """Return what the numbers rest on and cannot show."""
+    """Return the basis and the limits of the numbers."""
     texts = list(context.task.caveats(context))
     texts += [PICKED] if len(context.methods) > 1 else []
     texts += [SIMULATED] if context.simulated else []
@@ -311,7 +311,7 @@ def basis(context: Context) -> list[Fold]:
 
 
 def source(context: Context) -> list[Fold]:
-    """Return where the best method's median run comes from."""
+    """Return the provenance of the best method's median run."""
     if not context.comparisons:
         return [Fold("Where it comes from", provenance_blocks(result.manifest)) for result in context.bare[:1]]
     first = context.comparisons[0]

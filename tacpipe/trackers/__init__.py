@@ -1,1 +1,1 @@
-"""Trackers of experiments, each a product: TensorBoard, MLflow, Weights & Biases. Third parties add theirs."""
+"""Experiment trackers: TensorBoard, MLflow, Weights & Biases, and those of plug-ins."""

@@ -1,12 +1,12 @@
 """Record runs with MLflow, TensorBoard and Weights & Biases.
 
-MLflow: the server of ``--track mlflow:URI`` or of ``MLFLOW_TRACKING_URI``, else ``mlflow.db`` in the working directory. The
-experiment is that of ``MLFLOW_EXPERIMENT_NAME``, else ``tacpipe``.
+MLflow uses the server of ``--track mlflow:URI`` or of ``MLFLOW_TRACKING_URI``, or ``mlflow.db`` in the working
+directory. The experiment is ``MLFLOW_EXPERIMENT_NAME``, or ``tacpipe``.
 
-TensorBoard: event files in ``runs/NAME``, or below the folder of ``--track tensorboard:FOLDER``.
+TensorBoard writes event files to ``runs/NAME``, or below the folder of ``--track tensorboard:FOLDER``.
 
-Weights & Biases: offline in ``wandb/``, or below the folder of ``--track wandb:FOLDER``; ``wandb sync`` sends a run.
-``WANDB_MODE=online`` sends it while it runs; ``WANDB_PROJECT`` is ``tacpipe`` unless it is set.
+Weights & Biases works offline in ``wandb/``, or below the folder of ``--track wandb:FOLDER``; ``wandb sync`` uploads a
+run. ``WANDB_MODE=online`` uploads it while it runs. The default ``WANDB_PROJECT`` is ``tacpipe``.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from tacpipe.io import Scalar
 
 
-MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow refuses its store of files
+MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow rejects its file store
 MLFLOW_EXPERIMENT = "tacpipe"
 MLFLOW_TAG = "tacpipe.run"
-MAX_PARAM_LENGTH = 500  # letters of a param that every release stores
-_DEFAULTS = {  # defaults where a user has not set these
+MAX_PARAM_LENGTH = 500  # maximum length of a param that every release of MLflow stores
+_DEFAULTS = {  # used if the user has not set these
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # attempts, 7 by default: each waits longer, and training with it
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # the default is 7 attempts with growing waits, which would delay training
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
 
 
 class MLflow:
-    """A run of MLflow; one of the same name is resumed, without the steps that it has."""
+    """An MLflow run. An existing run of the same name is resumed without repeating its steps."""
 
     def __init__(self, place: str) -> None:
         for name, value in _DEFAULTS.items():
@@ -55,10 +55,10 @@ class MLflow:
             )
         self._client = MlflowClient(self._uri)
         self._run = ""
-        self._steps: dict[str, int] = {}  # the last of each metric of a run that is resumed
+        self._steps: dict[str, int] = {}  # last step of each metric in a resumed run
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Create the run, or resume that of this name."""
+        """Create the run, or resume the one with this name."""
         from mlflow.entities import Param
 
         experiment_name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or MLFLOW_EXPERIMENT
@@ -81,11 +81,11 @@ class MLflow:
         return f"run {name} of experiment {experiment_name} at {self._uri}"
 
     def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
-        """Add the metrics that the run does not have of this epoch."""
+        """Add the metrics of an epoch that the run lacks."""
         self._log({name: value for name, value in metrics.items() if self._steps.get(name, 0) < epoch}, epoch)
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """Add the figures and the path as a tag, and end the run: finished, or killed where nothing was made."""
+        """Add the figures, and the path as a tag, and end the run as finished, or as killed if there is no path."""
         if path is not None:
             self._log({name: value for name, value in figures.items() if name not in self._steps}, 0)
             self._client.set_tag(self._run, "tacpipe.path", str(path))
@@ -104,7 +104,7 @@ TENSORBOARD_FOLDER = "runs"
 
 
 class TensorBoard:
-    """A run as scalars by epoch, with params as text and as the row of TensorBoard's table of hyperparameters."""
+    """A run with scalars by epoch, and params as text and in TensorBoard's table of hyperparameters."""
 
     def __init__(self, place: str) -> None:
         import tensorboardX  # noqa: F401  (a module that is missing is reported before anything is computed)
@@ -115,7 +115,7 @@ class TensorBoard:
         self._epoch = 0
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Begin the run's event file; what older files of this run hold is superseded."""
+        """Start the run's event file, which supersedes older files of this run."""
         from tensorboardX import SummaryWriter
 
         folder, self._params = self._folder / name, params
@@ -127,7 +127,7 @@ class TensorBoard:
         return f"{folder} (tensorboard --logdir {self._folder})"
 
     def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
-        """Add a scalar a metric, and flush them."""
+        """Add one scalar per metric and flush them."""
         assert self._writer is not None
         self._epoch = epoch
         for name, value in metrics.items():
@@ -154,7 +154,7 @@ WANDB_STEP = "epoch"
 
 
 class Wandb:
-    """A run of Weights & Biases, named by its result, so that one which was interrupted is the same run."""
+    """A Weights & Biases run named after its result, so that an interrupted run is continued."""
 
     def __init__(self, place: str) -> None:
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
@@ -164,7 +164,7 @@ class Wandb:
         self._run: Any = None
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Begin the run, or add to that of this name."""
+        """Start the run, or continue the one with this name."""
         import wandb
 
         mode: Any = os.environ.get("WANDB_MODE") or "offline"
@@ -188,7 +188,7 @@ class Wandb:
         self._run.log({WANDB_STEP: epoch, **metrics})
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """Put the figures and the path into the run's summary, and end it."""
+        """Add the figures and the path to the run's summary, and end it."""
         if path is not None:
             self._run.summary.update({**figures, "path": str(path)})
         self._run.finish(exit_code=0 if path is not None else 1)

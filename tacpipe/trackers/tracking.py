@@ -1,4 +1,4 @@
-"""Send params, epochs and figures to trackers of experiments, during training or from stored results."""
+"""Send params, epochs and figures to experiment trackers, during training or from stored results."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from tacpipe.training.schedule import learning_rate
 
 
 class Tracker(Protocol):
-    """A run of one tracker. It is made with the place behind the colon of ``--track NAME:PLACE``, empty for its own.
+    """A run of one tracker, created with the part after the colon of ``--track NAME:PLACE``, or "" for its default.
 
-    Whatever a method raises is reported once, and the tracker is not called again: it ends no training.
+    An exception of any method is reported once, and the tracker is not called again; it never ends a training.
     """
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Begin the run ``name``, which is unique to a result, or resume it; return where it can be seen.
+        """Start or resume the run ``name``, which is unique to a result; return where it can be viewed.
 
-        A run that is resumed is given all its epochs again.
+        A resumed run receives all its epochs again.
         """
 
     def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
-        """Add the metrics of an epoch, from 1: losses, learning rate, and what else is validated."""
+        """Add the metrics of an epoch, counted from 1: losses, learning rate, and other validation metrics."""
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """End the run: its model or results are at ``path``, with these figures, or None if they were not made."""
+        """End the run. ``path`` is that of the model or results with these figures, or None if there are none."""
 
 
 def flat_params(nested: Json) -> dict[str, Scalar]:
-    """Return params by dotted name; lists as text.
+    """Return params by dotted name, with lists as text.
 
     >>> flat_params({"epochs": 2, "sweep": {"kind": "pca", "widths": [2, 4]}, "init": None})
     {'epochs': 2, 'sweep.kind': 'pca', 'sweep.widths': '2, 4', 'init': 'none'}
@@ -55,7 +55,7 @@ def flat_params(nested: Json) -> dict[str, Scalar]:
 
 
 def flat_figures(nested: Json, under: str = "") -> dict[str, float]:
-    """Return the numbers in nested values by their path; what is not a finite number is left out.
+    """Return the finite numbers in nested values by their path.
 
     >>> flat_figures({"val_loss": 0.5, "best": True, "val": {"biotac": {"accuracy": 0.25}}, "note": "x"}, "a/")
     {'a/val_loss': 0.5, 'a/val/biotac/accuracy': 0.25}
@@ -64,7 +64,7 @@ def flat_figures(nested: Json, under: str = "") -> dict[str, float]:
 
 
 def flat_metrics(line: Line, learning_rate: float | None = None, *, labelled: bool) -> dict[str, float]:
-    """Return the metrics of a line of a history, below its labels if ``labelled``: where there are several networks.
+    """Return the metrics in a history line, prefixed by its labels if ``labelled``, for several networks.
 
     >>> flat_metrics({"epoch": 3, "val_loss": 0.5, "target": "pdc_th", "network": 1}, labelled=True)
     {'pdc_th/1/val_loss': 0.5}
@@ -76,7 +76,7 @@ def flat_metrics(line: Line, learning_rate: float | None = None, *, labelled: bo
 
 
 def has_several_networks(lines: Iterable[Line]) -> bool:
-    """Return whether the lines of a history are of several networks."""
+    """Return whether a history contains lines of several networks."""
     return len({_labels(line) for line in lines}) > 1
 
 
@@ -101,13 +101,13 @@ def _leaves(value: Json, between: str, name: str = "") -> Iterable[tuple[str, Sc
 
 CONFIG, HISTORY = "config.json", "history.jsonl"
 LEARNING_RATE = "learning_rate"
-_DIGITS = 8  # digits of a key that make a run's name unique
+_DIGITS = 8  # number of digits of a key that make a run's name unique
 
 
 def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
-    """Return the trackers that ``--track`` names, as ``mlflow`` or ``mlflow:http://127.0.0.1:5000``.
+    """Return the trackers in ``--track`` options such as ``mlflow`` or ``mlflow:http://127.0.0.1:5000``.
 
-    Raises `UsageError` for a name that there is not, and `MissingModuleError` for one whose extra is not installed.
+    Raises `UsageError` for an unknown tracker, and `MissingModuleError` if its extra is not installed.
     """
     trackers = {}
     for text in options:
@@ -118,23 +118,23 @@ def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
 
 
 def name_of(output: Path, key: str) -> str:
-    """Return the name of a run: the output as seen from the working directory, and the start of the result's key."""
+    """Return the name of a run: the output's path relative to the working directory, and the start of the result's key."""
     path = output.absolute()
     relative = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
     return f"{relative.as_posix()}-{key[:_DIGITS]}"
 
 
 def files(manifest: Manifest, store: Store) -> dict[str, bytes]:
-    """Return those files of a dataset that a run is given figures and epochs from."""
+    """Return the files of a dataset with figures and epochs for a run."""
     names = (CONFIG, HISTORY, headline.FILE, headline.SUMMARY)
     return {name: store.read(manifest.files[name]["digest"]) for name in names if name in manifest.files}
 
 
 @dataclass
 class Tracking:
-    """Several trackers as one, which follows trainings; what one of them raises ends it alone."""
+    """Several trackers that follow trainings as one; an exception of a tracker only ends that tracker."""
 
-    trackers: dict[str, Tracker]  # keyed by the option ``--track``
+    trackers: dict[str, Tracker]  # trackers by their option ``--track``
     name: str  # params of the run
     params: Mapping[str, Scalar]
     failures: list[str] = field(default_factory=list)
@@ -146,26 +146,26 @@ class Tracking:
     # ---- as a follower of trainings
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
-        """Start the run with the first network, and add the epochs before an interruption."""
+        """Start the run with the first network, and add the epochs from before an interruption."""
         self.start()
         self._labels, self._labelled = network.labels, network.count > 1
         for line in history:
             self._add({**line, **self._labels}, None)
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
-        """Nothing: trackers have epochs."""
+        """Do nothing, because trackers record epochs."""
 
     def line(self, line: Line, rate: float) -> None:
         """Add an epoch."""
         self._add({**line, **self._labels}, rate)
 
     def end(self, *, trained: bool) -> None:
-        """Nothing: the run ends once its model is published."""
+        """Do nothing, because the run ends when its model is published."""
 
     # ---- as the command's
 
     def start(self) -> None:
-        """Start the run, if it has not begun, and report where each tracker shows it."""
+        """Start the run if it has not started, and report where each tracker shows it."""
         if not self._started:
             self._started = True
             for option, tracker_client in list(self.trackers.items()):
@@ -174,33 +174,33 @@ class Tracking:
                     terminal.report_progress(f"tracked by {option.partition(':')[0]}: {place}")
 
     def finish(self, path: Path, files: Mapping[str, bytes]) -> None:
-        """End the run of a dataset at ``path``, some of whose files are given.
+        """End the run of a dataset at ``path``, given some of its files.
 
-        Epochs of its history that were not added as it was trained are: all of a stored model, and those whose messages
-        did not come from another computer.
+        Epochs that were not added during training are added now: all epochs of a stored model, and those whose messages
+        did not arrive from another computer.
         """
         config = _tree(files.get(CONFIG, b"{}"))
         model_params = flat_params(config.get("params", {}))
-        if not self._started:  # nothing was trained: a stored model, or a result, whose params are its model's
+        if not self._started:  # nothing was trained: a stored model, or a result, which has the params of its model
             self.params = {**model_params, **self.params}
         self.start()
         self.replay(files.get(HISTORY, b""), model_params)
         values = flat_figures(config.get("validation") or {}, "best/")
-        if headline.FILE in files:  # a result: those of an older version have no summary
+        if headline.FILE in files:  # a result; older versions have no summary
             stored = _tree(files.get(headline.SUMMARY, b"{}"))
             values = flat_figures(stored or headline.summarize(headline.read(files[headline.FILE])))
         for option, tracker_client in list(self.trackers.items()):
             self._call(option, functools.partial(tracker_client.end, path, values))
 
     def replay(self, history: bytes, model_params: Mapping[str, Scalar]) -> None:
-        """Add the epochs of a stored history that were not added yet; ``model_params`` state the learning rate."""
+        """Add the missing epochs of a stored history; ``model_params`` give the learning rate."""
         lines = read_history(history)
         self._labelled = has_several_networks(lines)
         for line in lines[self._lines :]:
             self._add(line, _rate(model_params, line["epoch"]))
 
     def abandon(self) -> None:
-        """End a run whose result was not made."""
+        """End a run without a result."""
         if self._started:
             for option, tracker_client in list(self.trackers.items()):
                 self._call(option, functools.partial(tracker_client.end, None, {}))
@@ -212,11 +212,14 @@ class Tracking:
             self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), values))
 
     def _call(self, option: str, call: Callable[[], Any]) -> Any:
-        """Return what the call returns, or None if it fails, which ends the tracker. Standard output is the command's."""
+        """Return the result of the call, or None if it fails, which ends the tracker.
+
+        Keeps standard output for the command.
+        """
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 return call()
-        except (Exception, SystemExit) as error:  # whatever a third party's client raises
+        except (Exception, SystemExit) as error:  # third-party clients may raise anything
             del self.trackers[option]
             text = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
             first = text.strip().splitlines()[0] if text.strip() else type(error).__name__
@@ -227,7 +230,7 @@ class Tracking:
 
 
 def _rate(model_params: Mapping[str, Scalar], epoch: int) -> float | None:
-    """Return the learning rate of an epoch of a stored model, or None if its params do not state it."""
+    """Return the learning rate of an epoch of a stored model, or None if its params lack it."""
     peak, epochs = model_params.get("learning_rate"), model_params.get("epochs")
     if not isinstance(peak, int | float) or not isinstance(epochs, int) or epochs < 1:
         return None
@@ -240,9 +243,9 @@ def _tree(content: bytes) -> Json:
 
 
 def track_stored(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
-    """Give each dataset's params, epochs and figures to ``trackers``; return the names of the runs.
+    """Send each dataset's params, epochs and figures to ``trackers``; return the names of the runs.
 
-    A run has the name that ``--track`` gives it, so that what was tracked as it was trained is the same run. Raises
+    A run has the name that ``--track`` gives it, so a result that was tracked during training is the same run. Raises
     `UsageError` for a dataset without epochs and figures, and for an unknown tracker.
     """
     stored = [manifest.find(path) for path in paths]

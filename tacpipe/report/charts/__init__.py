@@ -1,7 +1,7 @@
-"""Charts in Vega-Lite's grammar: the same numbers give the same specification, and colours are the page's variables.
+"""Charts as Vega-Lite specifications: equal numbers give equal specifications, and colours are variables of the page.
 
-A specification has no width: the page draws it as wide as its column. Points state their numbers under the cursor, lines
-are shown and hidden by their legend, and axes zoom with Shift and the wheel, or by dragging.
+A specification has no width, because the page draws it as wide as its column. Points show their numbers under the
+cursor, the legend shows and hides lines, and axes zoom with Shift and the wheel, or by dragging.
 """
 
 from tacpipe.report.charts.curves import POINTS, Curve, DataRow, Spec, bars, decimated, lines

@@ -1,4 +1,4 @@
-"""Draw curves over time or epochs, and bars, with the colours, legends, zoom and tips that all charts share."""
+"""Draw curves over time or epochs and bars, with the colours, legends, zoom and tooltips that all charts share."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
 
-DataRow = dict[str, str | float | None]  # a row of the data of a chart, by field
+DataRow = dict[str, str | float | None]  # a row of chart data, by field
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
-DIGITS = 5  # digits of a number: more cannot be seen
-FEW_STEPS = 12  # whole numbers on an axis, up to which each has a tick
-MARGIN = 8  # pixels between points and the ends of an axis, so that none is cut
+DIGITS = 5  # digits per number, as many as are visible
+FEW_STEPS = 12  # maximum number of integers on an axis that each have a tick
+MARGIN = 8  # pixels between points and the ends of an axis, so that no point is clipped
 
 
 class ChartScale(TypedDict, total=False):
-    """How values of a field become places or colours."""
+    """How values of a field map to positions or colours."""
 
     type: str
     zero: bool
@@ -50,7 +50,7 @@ class ChartAxis(TypedDict, total=False):
 
 
 class ChartLegend(TypedDict, total=False):
-    """The place and the symbols of a legend."""
+    """The position and the symbols of a legend."""
 
     title: str | None
     orient: str
@@ -62,21 +62,21 @@ class ChartLegend(TypedDict, total=False):
 
 
 class Condition(TypedDict):
-    """The value of what a reader has chosen."""
+    """A value that depends on the reader's selection."""
 
     param: str
     value: float
-    empty: bool  # true: all is chosen as long as nothing is
+    empty: bool  # whether everything counts as selected while nothing is
 
 
 class SortField(TypedDict):
-    """The field that another one is sorted by."""
+    """The field to sort by."""
 
     field: str
 
 
 class ChartChannel(TypedDict, total=False):
-    """A field, or a value, as a place, a colour or another property of a mark."""
+    """A field or a value that is mapped to a position, a colour or another property of a mark."""
 
     field: str
     type: str
@@ -108,7 +108,7 @@ class ChartEncoding(TypedDict, total=False):
 
 
 class ChartMark(TypedDict, total=False):
-    """The geometry of a row of data, and how it looks."""
+    """The shape and appearance of a row of data."""
 
     type: str
     clip: bool
@@ -126,7 +126,7 @@ class ChartMark(TypedDict, total=False):
 
 
 class ChartSelection(TypedDict, total=False):
-    """What a reader chooses with the pointer."""
+    """A selection that a reader makes with the pointer."""
 
     type: str
     fields: Sequence[str]
@@ -134,7 +134,7 @@ class ChartSelection(TypedDict, total=False):
 
 
 class ChartParam(TypedDict, total=False):
-    """A name for what a reader chooses."""
+    """A named selection."""
 
     name: str
     select: ChartSelection
@@ -142,7 +142,7 @@ class ChartParam(TypedDict, total=False):
 
 
 class Spec(TypedDict, total=False):
-    """The specification of a chart, or of a layer of one, in Vega-Lite's grammar: the parts that are used here."""
+    """The Vega-Lite specification of a chart or of a layer, restricted to the parts that are used here."""
 
     data: dict[str, list[DataRow]]
     transform: Sequence[dict[str, str]]
@@ -161,14 +161,14 @@ class Spec(TypedDict, total=False):
 
 
 def colour_of(number: int, count: int) -> str:
-    """Return a colour that is derived from its neighbours' on a light page and on a dark one."""
+    """Return the colour for an index, derived from the page's colours in light and dark mode."""
     if count <= len(COLOURS):
         return COLOURS[number]
     return f"hsl({360 * number // count} 70% {(42, 62)[number % 2]}%)"
 
 
 def legend_of(count: int) -> ChartLegend | None:
-    """Return the legend of so many names, or None if there is one."""
+    """Return the legend for this many names, or None for a single name."""
     if count < 2:
         return None
     return {"title": None, "orient": "bottom", "direction": "vertical" if count < 7 else "horizontal", "labelLimit": 330,
@@ -176,12 +176,12 @@ def legend_of(count: int) -> ChartLegend | None:
 
 
 def zoom() -> ChartParam:
-    """Return what zooms with Shift and the wheel and moves by dragging."""
+    """Return a selection that zooms with Shift and the wheel and pans by dragging."""
     return {"name": "zoom", "select": {"type": "interval", "zoom": "wheel![event.shiftKey]"}, "bind": "scales"}
 
 
 def whole_steps(values: Iterable[object]) -> ChartAxis:
-    """Return an axis: ticks at whole numbers where all values are whole, such as epochs and counts."""
+    """Return an axis, with ticks at integers if all values are integers, such as epochs and counts."""
     numbers = sorted({value for value in values if isinstance(value, int | float)})
     if not all(float(value).is_integer() for value in numbers):
         return {}
@@ -189,17 +189,17 @@ def whole_steps(values: Iterable[object]) -> ChartAxis:
 
 
 def tip_of(name: str, title: str) -> ChartChannel:
-    """Return a field that is stated under the cursor."""
+    """Return a field that is shown under the cursor."""
     return {"field": name, "title": title or " "}
 
 
 def y_of(name: str) -> ChartChannel:
-    """Return the place of a field up and down."""
+    """Return the vertical position of a field."""
     return {"field": name, "type": "quantitative"}
 
 
 def diagonal_of(ends: Sequence[float]) -> Spec:
-    """Return a thin line on which x and y are the same, between its ends."""
+    """Return a thin line x = y between two ends."""
     return {
         "data": {"values": [{"x": short(end), "y": short(end)} for end in ends]},
         "mark": {"type": "line", "stroke": INK, "strokeWidth": 0.8},
@@ -213,13 +213,13 @@ def text_of(value: float) -> str:
 
 
 def short(value: float) -> float | None:
-    """Return a number with as many digits as can be seen, or None if it is not defined, as JSON has it."""
+    """Return a number with its visible digits, or None if it is not finite, as in JSON."""
     value = float(value)
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
 def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
-    """Return bars in the order given, the first ``marked`` in another colour."""
+    """Return bars in the given order, the first ``marked`` in another colour."""
     rows: list[DataRow] = [
         {"x": name, "y": short(value), "kept": place < marked} for place, (name, value) in enumerate(values.items())
     ]
@@ -248,13 +248,13 @@ def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height
     }
 
 
-POINTS = 300  # most points of a line that are drawn
-ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
+POINTS = 300  # maximum number of points drawn per line
+ROOM = 0.02  # margin beyond the ends of a diagonal, as a fraction of its length
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values over x, with the bounds of each where they are given; NaN breaks the line."""
+    """Values over x with optional bounds; NaN breaks the line."""
 
     name: str
     x: Sequence[float] | AnyFloats
@@ -262,7 +262,7 @@ class Curve:
     low: Sequence[float] | AnyFloats | None = None
     high: Sequence[float] | AnyFloats | None = None
     dashed: bool = False
-    thin: bool = False  # a single run, next to its mean
+    thin: bool = False  # whether it is a single run, drawn next to a mean
 
 
 def lines(
@@ -279,10 +279,12 @@ def lines(
     points: bool = True,
     height: int = 240,
 ) -> Spec:
-    """Return lines over x, each with its band; ``level`` is drawn across, ``shade`` is a span of x, ``floor`` ends y.
+    """Return lines over x with their bands.
 
-    With ``diagonal``, two numbers, a thin line lies where x and y are the same, between them.
-    Charts with the same ``order`` of names give a name the same colour.
+    ``level`` is a horizontal line, ``shade`` a span of x, ``floor`` the lower end of y.
+
+    With ``diagonal``, two numbers, a thin line x = y is drawn between them. Charts with the same ``order`` of names
+    give each name the same colour.
     """
     names = list(order) or list(dict.fromkeys(curve.name for curve in curves if not curve.thin))
     values = [row for number, curve in enumerate(curves) for row in _rows(curve, number)]
@@ -328,7 +330,7 @@ def _scales(
             value for row in values for key in ("y", "low", "high") if isinstance(value := row.get(key), float)
         ]
         up["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
-    if diagonal:  # points on its ends are drawn whole
+    if diagonal:  # points at its ends are not clipped
         room = ROOM * (diagonal[1] - diagonal[0])
         up["nice"] = False
         up["domain"] = across["domain"] = [short(diagonal[0] - room), short(diagonal[1] + room)]
@@ -336,7 +338,7 @@ def _scales(
 
 
 def _colour(names: Sequence[str], drawn: Container[str]) -> ChartChannel:
-    """Return the colours of the names that are drawn, each by its place among all."""
+    """Return the colours of the drawn names, by their position among all names."""
     drawn_names = [name for name in names if name in drawn]
     colours = [COLOURS[names.index(name) % len(COLOURS)] for name in drawn_names]
     return {
@@ -348,7 +350,7 @@ def _colour(names: Sequence[str], drawn: Container[str]) -> ChartChannel:
 
 
 def _opacity(opacity: float, hidden: float) -> ChartChannel:
-    """Return the opacity of what is chosen in the legend, all where nothing is, and of the rest."""
+    """Return the opacity of lines selected in the legend (all if none is), and ``hidden`` for the others."""
     return {"condition": {"param": "shown", "value": opacity, "empty": True}, "value": hidden}
 
 
@@ -366,7 +368,7 @@ def _rule(name: str, at: float) -> Spec:
 
 
 def _bands(base: ChartEncoding) -> Spec:
-    """Return the layer of bands, of what has bounds."""
+    """Return the layer of bands between bounds."""
     encoding = _of_points(base)
     encoding["y"] = {**base["y"], "field": "low"}
     encoding["y2"] = {"field": "high"}
@@ -379,7 +381,7 @@ def _bands(base: ChartEncoding) -> Spec:
 
 
 def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
-    """Return the layer of lines: of single runs where ``thin``, else of all others."""
+    """Return the layer of lines: of single runs if ``thin``, else of all others."""
     dashes: ChartScale = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
     encoding = base.copy()
     encoding["strokeDash"] = {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}
@@ -393,7 +395,7 @@ def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
 
 
 def _dots(base: ChartEncoding) -> Spec:
-    """Return the layer of points, which a pointer finds."""
+    """Return the layer of points that react to the pointer."""
     return {
         "transform": [{"filter": "datum.thin === false"}],
         "mark": {"type": "circle", "size": 28, "clip": True},
@@ -402,16 +404,16 @@ def _dots(base: ChartEncoding) -> Spec:
 
 
 def _of_points(base: ChartEncoding) -> ChartEncoding:
-    """Return the channels of lines without the one that keeps runs apart."""
+    """Return the channels of lines without the one that separates runs."""
     encoding = base.copy()
     del encoding["detail"]
     return encoding
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
-    """Return a line of at most about ``count`` points: of each stretch, its least and its largest value, in their order.
+    """Return a line reduced to at most about ``count`` points: the minimum and maximum of each segment, in order.
 
-    NaN, which breaks a line, is kept where a stretch holds nothing else.
+    NaN, which breaks a line, is kept if a segment contains nothing else.
 
     >>> x, y = decimated(np.arange(1000.0), np.r_[np.zeros(500), 9.0, np.zeros(499)], 10)
     >>> len(x) <= 20, float(y.max())

@@ -49,9 +49,9 @@ def scatter(
     legend: bool = True,
     height: int = 280,
 ) -> Spec:
-    """Return points of rows with ``x``, ``y`` and ``name``, by which they are coloured; ``shape`` and ``tip`` may be there.
+    """Return points of rows with ``x``, ``y``, ``name`` (which sets the colour), and optionally ``shape`` and ``tip``.
 
-    With ``diagonal``, a line lies where both are the same.
+    With ``diagonal``, a line x = y is drawn.
     """
     values = _shortened(rows)
     names = list(order) or sorted({str(row["name"]) for row in values})
@@ -90,7 +90,7 @@ def scatter(
 
 
 def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
-    """Return a layer of diamonds at points (name, x, y), which state their numbers under the cursor."""
+    """Return a layer of diamonds at points (name, x, y), which show their numbers under the cursor."""
     return {
         "data": {"values": [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]},
         "mark": {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1},
@@ -103,7 +103,7 @@ def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
 
 
 def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
-    """Return a layer of lines between two points (x, y), each with its name at the first."""
+    """Return a layer of lines between two points (x, y), each with its name at the first point."""
     values: list[DataRow] = [
         {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
         for name, start, end in pairs
@@ -121,9 +121,11 @@ def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
 
 
 def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
-    """Return points in the plane, as many units across as down, a panel a name: rows have x, y, panel, strength and text.
+    """Return points in the plane with equal units on both axes, one panel per name.
 
-    A strength from -1 to 1 is a colour; what has no ``text`` has none.
+    Rows have x, y, panel, strength and text.
+
+    The colour shows a strength from -1 to 1; rows without ``text`` have no label.
     """
     values = _shortened(rows)
     xs, ys = ([float(row[key] or 0.0) for row in rows] for key in ("x", "y"))
@@ -165,18 +167,18 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
 
 
 def _shortened(rows: Iterable[DataRow]) -> list[DataRow]:
-    """Return rows whose numbers have as many digits as can be seen."""
+    """Return rows whose numbers have only their visible digits."""
     return [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
 
 
-LABEL_CHARACTERS = 24  # a line of a predictor's name; longer names take several lines
+LABEL_CHARACTERS = 24  # maximum length of a line of a predictor's name; longer names are wrapped
 LINE_HEIGHT = 13  # pixels
 KINDS = {"model": "var(--c0)", "baseline": "var(--faint)", "oracle": "var(--c2)", "control": "var(--c3)"}
 
 
 @dataclass(frozen=True)
 class Dot:
-    """A score with its interval, of one predictor on one question."""
+    """The score of a predictor on one question, with its interval."""
 
     name: str
     mean: float
@@ -187,9 +189,11 @@ class Dot:
 
 
 def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = None, row: int = 24) -> Spec:
-    """Return a dot and its interval a predictor, in the order given, a panel a question; ``level`` draws a rule in each.
+    """Return a dot with its interval per predictor in the given order, one panel per question.
 
-    What lies far beyond the others is drawn at the end of the axis as a triangle.
+    ``level`` draws a line in each.
+
+    Dots far beyond the others are drawn as triangles at the end of the axis.
     """
     low, high = _ends(dots)
     panels = list(dict.fromkeys(estimate.panel for estimate in dots))
@@ -257,7 +261,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
 
 
 def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
-    """Return where the axis of a ranking ends: what is far beyond most does not press the others together."""
+    """Return the ends of a ranking's axis, so that outliers do not compress the others."""
     means = np.array([dot.mean for dot in dots if not math.isnan(dot.mean)])
     if not len(means):
         return 0.0, 1.0
@@ -272,12 +276,12 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
 
 
 def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
-    """Return how often each name (row) was taken for each (column), each with its number; mistakes in another colour."""
+    """Return a confusion matrix (name, predicted name) of counts, with mistakes in another colour."""
     totals = np.maximum(counts.sum(axis=1), 1)
     values: list[DataRow] = [
         {
             "row": names[row], "column": names[column], "count": int(count), "right": bool(row == column),
-            # the square root shows a single mistake next to many right ones
+            # the square root keeps a single mistake visible next to many correct ones
             "strength": short(0.15 + 0.75 * float(np.sqrt(count / totals[row]))),
             "fraction": f"{100 * count / totals[row]:.1f} % of {totals[row]}",
         }
@@ -311,7 +315,7 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
 
 
 def grid(matrix: AnyFloats, title: str) -> Spec:
-    """Return a square matrix in squares: the stronger the colour, the farther from 0; blue above it, orange below."""
+    """Return a square matrix as squares: the colour grows with the distance from 0, blue above and orange below."""
     largest = float(np.abs(matrix).max()) or 1.0
     values: list[DataRow] = [
         {
@@ -322,7 +326,7 @@ def grid(matrix: AnyFloats, title: str) -> Spec:
             "strength": strength,
         }
         for (row, column), value in np.ndenumerate(matrix)
-        # the square root shows what is small next to the largest
+        # the square root keeps small values visible next to the largest
         if (strength := round(math.sqrt(abs(float(value)) / largest), 2)) >= 0.01
     ]
     axis: ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
