@@ -8,14 +8,16 @@ Example: tacpipe extract markers data/recordings -o data/markers
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import numpy as np
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.plugins.constraints import NonNegativeFloat, PositiveInt, Unit
+from tacpipe.plugins import registry
+from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
 from tacpipe.plugins.stage import RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
@@ -23,11 +25,16 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import AnyFloats, Bytes, Floats
-    from tacpipe.datasets.dataset import Recording
+    from tacpipe.codecs.frame_autoencoder import Encode
+    from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
+    from tacpipe.plugins.stage import Fitted, Result, Workspace
     from tacpipe.video.stream import VideoFormat
 
+T = TypeVar("T")
 COLOURS = ("red", "green", "blue")
+ENCODED_FRAMES = 32  # frames that are encoded together
+HELD_OUT = 0.15  # fraction of the training recordings that stop the training
 MAX_CELLS = 10_000  # cells of a grid; each has three columns
 
 
@@ -104,6 +111,101 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
         return _stream(columns, _marker_fields(params), _displacements(place, columns, video_format, params))
 
     return _with_channels(recording, compute)
+
+
+@dataclass(frozen=True)
+class FrameAutoencoderParams(StreamSelection):
+    """Features of the autoencoder, and its training."""
+
+    components: PositiveInt = 16  # features
+    images: PositiveInt = 4000  # images that are learned, evenly spaced over the frames of the training recordings
+    epochs: PositiveInt = 20  # maximum number of passes over the training images
+    batch: PositiveInt = 64  # images per step of the optimiser
+    learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
+    patience: PositiveInt = 5  # epochs without a lower error on held-out training recordings after which training ends
+    seed: Seed = 0  # random seed of initial weights and of the order of images
+
+
+@stage(version=1)
+def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
+    """Return the weights of an encoder that is trained on images of the training recordings."""
+    from tacpipe.codecs import frame_autoencoder
+    from tacpipe.plugins.stage import Result
+    from tacpipe.training.loop import Schedule
+
+    recordings = [params.narrow(recording) for recording in train.recordings.values()]
+    if len(recordings) < 2:
+        raise TacpipeError(
+            f"An autoencoder is stopped by recordings that it does not learn, so it needs at least 2 training recordings "
+            f"and there are {len(recordings)}. Make a split with more."
+        )
+    images = _training_images(recordings, params.images)
+    schedule = Schedule(
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience,
+        gradient_clip=frame_autoencoder.GRADIENT_CLIP,
+        seed=params.seed,
+    )
+    parts = frame_autoencoder.select_images(images, HELD_OUT)
+    weights = frame_autoencoder.fit(*parts, schedule, workspace, params.components)
+    return Result(files={frame_autoencoder.WEIGHTS: weights})
+
+
+@stage(version=1, fit=fit_autoencoder)
+def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fitted) -> RecordingOutput:
+    """Encode frames by a small autoencoder of the training recordings.
+
+    Each stream of frames becomes a stream of features with a row per frame. The network is trained on frames of the
+    training recordings, of which 15 % are held out to stop the training. Streams without frames stay as they are.
+
+    Example: tacpipe extract autoencoder data/gels --split data/split -o data/features
+    """
+    from tacpipe.codecs import frame_autoencoder
+
+    encode = frame_autoencoder.read_encoder(codec[frame_autoencoder.WEIGHTS])
+    return _with_channels(
+        recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
+    )
+
+
+@dataclass(frozen=True)
+class EncoderParams(StreamSelection):
+    """The encoder and its weights."""
+
+    encoder: str = "autoencoder"  # name of an encoder; plug-ins may add others
+    weights: str = ""  # file with the weights of the encoder
+    weights_sha256: str = ""  # sha256 of that file; computed if it is left out
+
+    def __post_init__(self) -> None:
+        """Compute the digest of the weights, which is part of the key."""
+        if not self.weights:
+            return
+        digest = _sha256(self.weights)
+        if self.weights_sha256 not in ("", digest):
+            raise UsageError(
+                f"{self.weights} has the sha256 {digest}, and weights_sha256 states {self.weights_sha256}. Give the file "
+                f"that was used before, or leave weights_sha256 out."
+            )
+        object.__setattr__(self, "weights_sha256", digest)
+
+
+@stage(version=1)
+def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
+    """Encode frames by an image encoder with given weights.
+
+    Each stream of frames becomes a stream of features with a row per frame. The digest of the weights is part of the key.
+    Streams without frames stay as they are.
+
+    Example: tacpipe extract encoder data/gels --weights data/features/encoder.safetensors -o data/codes
+    """
+    if not params.weights:
+        raise UsageError("weights names no file. Give the file with the weights of the encoder.")
+    encode = registry.load_encoder(params.encoder)(Path(params.weights))
+    return _with_channels(
+        recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
+    )
 
 
 def _with_channels(
@@ -214,10 +316,91 @@ def _displacements(
         yield row, np.append(moved.ravel(), is_detected[exists].mean())
 
 
-def _blocks(values: Iterator[tuple[int, AnyFloats]], rows: int) -> Iterator[list[tuple[int, AnyFloats]]]:
+def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[int, T]]]:
     """Yield ``values`` in lists of ``rows``."""
     while block := list(itertools.islice(values, rows)):
         yield block
+
+
+def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]:
+    """Return about ``count`` shrunk images of all streams of frames, by recording (image, row, column, rgb)."""
+    from tacpipe.codecs.frame_autoencoder import shrink
+    from tacpipe.video.decoding import decode_frames, read_batches
+    from tacpipe.video.stream import read_format
+
+    streams = [
+        [
+            (columns, video_format)
+            for name in recording.streams
+            if (video_format := read_format(columns := recording.columns(name)))
+        ]
+        for recording in recordings
+    ]
+    total = sum(columns.num_rows for parts in streams for columns, _ in parts)
+    if not total:
+        raise TacpipeError("The training recordings have no frames. Give the recordings of a camera.")
+    step = max(1, total // count)
+    return [
+        np.array(
+            [
+                shrink(image)
+                for columns, video_format in parts
+                for row, image in decode_frames(video_format, read_batches(columns))
+                if row % step == 0
+            ],
+            np.uint8,
+        )
+        for parts in streams
+        if parts
+    ]
+
+
+def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode) -> pa.RecordBatchReader:
+    """Return the features of a stream of frames, with its clocks. The first batch states how many there are."""
+    from tacpipe.video.decoding import decode_frames, read_batches
+
+    def features() -> Iterator[tuple[int, AnyFloats]]:
+        for block in _blocks(decode_frames(video_format, read_batches(columns)), ENCODED_FRAMES):
+            images = [image for _, image in block]
+            images += images[-1:] * (ENCODED_FRAMES - len(images))  # bits of a product depend on the number of rows
+            encoded = encode(np.stack(images))
+            if encoded.shape[:-1] != (ENCODED_FRAMES,):
+                raise TacpipeError(
+                    f"The encoder returned an array of the shape {encoded.shape} for {ENCODED_FRAMES} frames. It must "
+                    f"return one row of features per frame."
+                )
+            yield from zip((row for row, _ in block), encoded, strict=False)
+
+    values = features()
+    head = list(itertools.islice(values, 1))
+    width = len(head[0][1]) if head else 0
+    return _stream(columns, _feature_fields(width), itertools.chain(head, values))
+
+
+def _feature_fields(count: int) -> list[pa.Field]:
+    """Return the fields ``feature01`` …, float32."""
+    import pyarrow as pa
+
+    digits = max(2, len(str(count)))
+    return [
+        pa.field(
+            f"feature{number:0{digits}d}",
+            pa.float32(),
+            metadata={"unit": "1", "quantity": "tactile", "taxel": str(number)},
+        )
+        for number in range(1, count + 1)
+    ]
+
+
+def _sha256(path: str) -> str:
+    from tacpipe.io.hashing import file_digest
+
+    try:
+        return file_digest(Path(path)).removeprefix("sha256:")
+    except OSError as error:
+        raise UsageError(
+            f"The weights {path} cannot be read: {error.strerror}. Give a file of this computer."
+        ) from error
 
 
 def _difference_fields(params: Params) -> list[pa.Field]:

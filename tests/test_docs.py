@@ -49,7 +49,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
 ]
 EXTENDING = [  # pages whose packages tests/test_extending.py installs and whose blocks it runs, in this order in one project
     ROOT / "docs" / "extending" / f"{name}.md"
-    for name in ("model", "codec", "task", "tracker", "executor", "export", "stage", "format", "sensor")
+    for name in ("model", "codec", "encoder", "task", "tracker", "executor", "export", "stage", "format", "sensor")
 ]
 PYTHON = ROOT / "docs" / "python.md"  # tests/test_python_page.py runs its blocks.
 BUILT_IN = sorted(

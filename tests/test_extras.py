@@ -98,6 +98,8 @@ LACK = {  # Commands that need an extra, with that extra.
     "simulate gel --trials 1 --duration-s 4 -o {o}": "video",
     "extract difference data/gels -o {o}": "video",
     "extract markers data/gels -o {o}": "video",
+    "extract autoencoder data/gels --split data/gels-split -o {o}": "learn",
+    "extract encoder data/gels --weights bottle.ply -o {o}": "learn",
     "ingest table workbooks --guess": "xlsx",
     "ingest mcap bags -o {o}": "ros",
     "ingest rosbag bags -o {o}": "ros",
@@ -161,7 +163,13 @@ def prepare(folder: Path) -> None:
     slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
     video_files.write_gelsight(folder / "gels")
-    run_all(folder, ("ingest gelsight-slip gels -o data/gels",))
+    run_all(
+        folder,
+        (
+            "ingest gelsight-slip gels -o data/gels",
+            "split data/gels -o data/gels-split --scheme random --val 0 --test 0.5",
+        ),
+    )
     points_m = shapes.visible_half(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
     split = "tacpipe split data/segments -o data/split-again"

@@ -37,7 +37,8 @@ OWN = "tacpipe"  # name of tacpipe's entry point in that group
 TRACKERS = "tacpipe.trackers"
 MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
 CODECS = "tacpipe.codecs"  # kind of codec: its class (`tacpipe.codecs.codec.Codec`)
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
+ENCODERS = "tacpipe.encoders"  # name: a function from a file of weights to a function from images to features
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS, ENCODERS)
 PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # prefixes of stage names in other groups
 FIT, PART = ".fit", ".part"  # suffixes of the parts of a stage that have keys of their own
 _used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
@@ -377,6 +378,14 @@ def load_codec(kind: str) -> Any:
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
     return _load_plugin(CODECS, "codec of kind", kind)
+
+
+def load_encoder(name: str) -> Any:
+    """Return the function of an image encoder: it takes the path of its weights and returns a function of images.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    return _load_plugin(ENCODERS, "encoder", name)
 
 
 def _load_plugin(group: str, noun: str, name: Any) -> Any:

@@ -237,6 +237,12 @@ def _publish(name: str, place: Path) -> None:
         xela_files.write_psc(place / "data_sample_2022-02-21-09-58-49")
 
 
+GELS = (
+    "simulate gel --trials 3 --duration-s 4 -o data/g",
+    "split data/g -o data/gs --scheme random --val 0 --test 0.34",
+    "extract autoencoder data/g --split data/gs -o data/f --images 40 --components 4 --epochs 2",
+    "extract encoder data/g --weights data/f/encoder.safetensors -o data/e",
+)
 STAGES = (
     *_cases_of_chain("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),
     *_cases_of_chain("forward", {3: "split", 4: "train.forward", 5: "evaluate"}),
@@ -244,7 +250,10 @@ STAGES = (
     *_cases_of_chain("material", {3: "train.material"}),
     *_cases_of_chain("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
     *_cases_of_chain("touch", {3: "train.touch"}),
-    Case("simulate.gel", "simulate gel --trials 2 --duration-s 4 -o data/g", ()),
+    *(
+        Case(name, GELS[n], GELS[:n])
+        for n, name in ((0, "simulate.gel"), (2, "extract.autoencoder"), (3, "extract.encoder"))
+    ),
     Case(
         "extract.markers",
         "extract markers data/gels -o data/m --rows 2 --columns 3",

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import tacpipe
 from tacpipe.channels.places import of_taxels
 from tacpipe.channels.streams import of_quantity
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.registry import load
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
@@ -162,3 +162,62 @@ def test_a_gel_without_markers_is_refused_in_a_sentence(video: Path) -> None:
         TacpipeError, match=r"Recording trial, stream gel: no grid of dark markers .* extract difference"
     ):
         extract({"gel": frames_of(video)}, "extract.markers")
+
+
+@pytest.mark.long
+def test_features_follow_from_the_frames_and_the_digest_of_the_weights(lab: Lab) -> None:
+    lab.run("simulate gel --trials 4 --duration-s 4 -o gels")
+    lab.run("split gels -o split --scheme random --val 0.25 --test 0.25")
+    train = "extract autoencoder gels --split split --images 60 --components 5"
+    lab.run(f"{train} --epochs 2 -o codes")
+    features = tacpipe.open("codes")["trial-000"].table("gel1")
+    names = [f"feature{number:02d}" for number in range(1, 6)]
+    assert features.column_names == ["t_ns", "seq", *names]
+    assert all(features.column(name).type == pa.float32() and features.column(name).null_count == 0 for name in names)
+    assert features.column("t_ns").equals(tacpipe.open("gels")["trial-000"].table("gel1").column("t_ns"))
+
+    weights = lab.folder / "weights.safetensors"
+    weights.write_bytes(Path("codes/encoder.safetensors").read_bytes())
+    encode = "extract encoder gels --weights weights.safetensors -o encoded"
+    lab.run(encode)
+    assert tacpipe.open("encoded")["trial-000"].table("gel1").equals(features)
+    assert "0 ran, 4 reused" in lab.run(encode).err
+
+    lab.run(f"{train} --epochs 2 --seed 7 -o others")
+    weights.write_bytes(Path("others/encoder.safetensors").read_bytes())
+    assert "4 ran, 0 reused" in lab.run(encode).err
+    assert not tacpipe.open("encoded")["trial-000"].table("gel1").equals(features)
+
+
+def test_an_encoder_gives_a_frame_the_same_features_whatever_follows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(path: Path) -> Any:
+        return lambda images: images.reshape(len(images), -1)[:, :3].astype(np.float32) + len(images)
+
+    monkeypatch.setattr("tacpipe.plugins.registry.load_encoder", lambda name: load)
+    weights = tmp_path / "weights"
+    weights.write_bytes(b"any")
+    frames = frames_of(videos.write(tmp_path / "gel.avi", "mjpeg", 40))
+    features = extract({"gel": frames}, "extract.encoder", weights=str(weights))["gel"]
+    images = videos.decoded(tmp_path / "gel.avi")
+    expected = np.array([image.reshape(-1)[:3] for image in images], np.float32) + 32
+    assert np.array_equal(np.column_stack([features.column(f"feature{n:02d}").to_numpy() for n in (1, 2, 3)]), expected)
+    part = extract({"gel": frames.slice(0, 33)}, "extract.encoder", weights=str(weights))["gel"]
+    assert part.equals(features.slice(0, 33))
+
+
+def test_weights_that_are_missing_or_changed_are_refused(tmp_path: Path) -> None:
+    frames = frames_of(videos.write(tmp_path / "gel.avi", "mjpeg", 4, size=2))
+    with pytest.raises(UsageError, match="weights names no file"):
+        extract({"gel": frames}, "extract.encoder")
+    with pytest.raises(UsageError, match="cannot be read"):
+        build_params("extract.encoder", weights=str(tmp_path / "absent"))
+    path = tmp_path / "weights"
+    path.write_bytes(b"none")
+    with pytest.raises(UsageError, match="Give the file that was used before"):
+        build_params("extract.encoder", weights=str(path), weights_sha256="0" * 64)
+    with pytest.raises(TacpipeError, match="The weights are none of this autoencoder"):
+        extract({"gel": frames}, "extract.encoder", weights=str(path))
+    with pytest.raises(UsageError, match="There is no encoder sparsh"):
+        extract({"gel": frames}, "extract.encoder", weights=str(path), encoder="sparsh")

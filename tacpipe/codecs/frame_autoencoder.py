@@ -1,0 +1,126 @@
+"""A small convolutional autoencoder of camera images, which is trained on images of the training recordings.
+
+Images are shrunk to the means of a coarse grid. Three convolutions with stride 2 and a linear layer lead to the features,
+and their mirror images back; the mean squared error of held-out recordings stops the training.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from tacpipe.arrays import Bytes, Float32s
+from tacpipe.errors import TacpipeError
+from tacpipe.io import regular
+from tacpipe.printable import plain
+from tacpipe.training import devices, loop
+
+ROWS, COLUMNS = 48, 64  # grid to which an image is shrunk
+CHANNELS = (3, 16, 32, 32)  # colours, and channels after each convolution
+INNER = (CHANNELS[-1], ROWS // 8, COLUMNS // 8)  # shape after the convolutions
+GRADIENT_CLIP = 1.0  # largest norm of the gradient
+WEIGHTS = "encoder.safetensors"
+Encode = Callable[[Bytes], Float32s]  # images, uint8 (frame, height, width, rgb), to features (frame, feature)
+
+
+class _Network(nn.Module):
+    """Convolutions to the features, and back."""
+
+    def __init__(self, components: int) -> None:
+        super().__init__()
+        inward: list[nn.Module] = []
+        outward: list[nn.Module] = []
+        for number, (before, after) in enumerate(itertools.pairwise(CHANNELS)):
+            inward += [nn.Conv2d(before, after, 4, 2, 1), nn.ELU()]
+            outward = [nn.ConvTranspose2d(after, before, 4, 2, 1), *([nn.ELU()] if number else []), *outward]
+        width = int(np.prod(INNER))
+        self.encoder = nn.Sequential(*inward, nn.Flatten(), nn.Linear(width, components))
+        self.decoder = nn.Sequential(nn.Linear(components, width), nn.ELU(), nn.Unflatten(1, INNER), *outward)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return images (image, colour, row, column) as they come back."""
+        back: Tensor = self.decoder(self.encoder(images))
+        return back
+
+
+def shrink(image: Bytes) -> Bytes:
+    """Return the means of the grid's cells, uint8 (row, column, rgb), of an image (height, width, rgb).
+
+    Raises `TacpipeError` for an image with fewer pixels than cells.
+    """
+    height, width, _ = image.shape
+    if height < ROWS or width < COLUMNS:
+        raise TacpipeError(
+            f"The image has {width} x {height} pixels. The autoencoder needs {COLUMNS} x {ROWS} or more."
+        )
+    tops, lefts = np.arange(ROWS) * height // ROWS, np.arange(COLUMNS) * width // COLUMNS
+    sums = np.add.reduceat(np.add.reduceat(image, tops, axis=0, dtype=np.uint32), lefts, axis=1)
+    areas = np.outer(np.diff([*tops, height]), np.diff([*lefts, width]))
+    means: Bytes = np.rint(sums / areas[:, :, None]).astype(np.uint8)
+    return means
+
+
+def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path, components: int) -> bytes:
+    """Return the weights of an encoder with ``components`` features, as a safetensors file.
+
+    ``train`` and ``held_out`` are shrunk images, uint8 (image, row, column, rgb).
+    """
+
+    def part(images: Bytes) -> loop.WindowSet:
+        pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))).to(devices.kind())
+
+        def loss(model: nn.Module, indices: Tensor) -> Tensor:
+            batch = _scaled(pixels[indices])
+            return nn.functional.mse_loss(model(batch), batch)
+
+        return loop.WindowSet(len(pixels), loss)
+
+    training = loop.WindowTraining(part(train), part(held_out), schedule.batch)
+    trained = loop.train(lambda: _Network(components).to(devices.kind()), training, schedule, workspace)
+    encoder = {name: value.cpu().contiguous() for name, value in trained.weights.items() if name.startswith("encoder.")}
+    return save(encoder)
+
+
+def read_encoder(weights: bytes) -> Encode:
+    """Return the function that encodes images with the weights that `fit` returned.
+
+    Raises `TacpipeError` for weights that are none of such an encoder.
+    """
+    try:
+        tensors = load(weights)
+        components = int(tensors[max(tensors)].shape[0])
+        network = _Network(components)
+        network.load_state_dict({**network.state_dict(), **tensors})
+    except (SafetensorError, ValueError, IndexError, RuntimeError) as error:
+        raise TacpipeError(f"The weights are none of this autoencoder: {plain(str(error), 200)}.") from error
+    network.eval()
+
+    def encode(images: Bytes) -> Float32s:
+        shrunk = np.stack([shrink(image) for image in images]).transpose(0, 3, 1, 2)
+        with torch.inference_mode():
+            features: Float32s = network.encoder(_scaled(torch.from_numpy(np.ascontiguousarray(shrunk)))).numpy()
+        return features
+
+    return encode
+
+
+def load_encoder(path: Path) -> Encode:
+    """Return the encoder of the file `WEIGHTS` that `tacpipe extract autoencoder` wrote next to its result."""
+    return read_encoder(regular.content(path))
+
+
+def _scaled(pixels: Tensor) -> Tensor:
+    return pixels.float() / 127.5 - 1
+
+
+def select_images(images: Sequence[Bytes], held_out: float) -> tuple[Bytes, Bytes]:
+    """Return the images of all recordings but the last, and of the last ``held_out`` of them, at least one."""
+    count = max(1, round(held_out * len(images)))
+    return np.concatenate(images[:-count]), np.concatenate(images[-count:])
