@@ -1,8 +1,8 @@
 """Measure how uncertain a trained model is.
 
-Writes the model with what it needs to state that. A model of forecasts or of touch gets quantiles: fitted to its errors on
-training recordings, then corrected on calibration recordings, so that a band holds as often as it states. A classifier gets
-probabilities that are frequencies, and a threshold for the answer ``unknown``. The model's predictions stay as they are.
+Writes the model with its uncertainty. A model of forecasts or of touch gets quantiles. They are fitted to its errors on
+training recordings and corrected on calibration recordings, so that bands have their stated coverage. A classifier gets
+probabilities that are frequencies, and a threshold for the answer ``unknown``. The predictions do not change.
 
 Calibration recordings have the role calibration in the split, which `tacpipe split --calibration` gives; without any, those
 with the role val. Recordings that the model learned from are refused.
@@ -30,7 +30,7 @@ class Params:
     """How a model is to state its uncertainty."""
 
     quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50
-    # quantiles: widen bands until they hold in a new recording with at least their level; else they do on average
+    # quantiles: widen bands until their coverage in a new recording is at least their level; else on average
     promise: bool = False
     # classifiers: fraction of recordings of known classes that may be answered unknown
     false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05

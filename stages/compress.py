@@ -32,7 +32,7 @@ class Params:
     components: PositiveInt = 20  # latents to keep, at most the number of channels; the paper kept 20
     # keep as many latents as hold this fraction of the variance instead; 0: as many as components states
     variance: Annotated[float, Range(0, below=1)] = 0.0
-    # levels: counts above rest; increments: what each row adds to the one before
+    # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
     PANELS: ClassVar[Panels] = {"Model": ("components", "variance", "representation")}
 

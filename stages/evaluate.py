@@ -5,7 +5,7 @@ and to ``summary.json`` in few numbers, for DVC. Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
 predictions of each recording. Recordings that the model was trained on are reported apart, under ``seen``.
 
-With ``--live`` recordings of `tacpipe live -o` are evaluated, given as they were recorded: what was published is compared
+With ``--live`` recordings of `tacpipe live -o` are evaluated, given as they were recorded. Published values are compared
 with the offline chain on the same recordings (``live`` of ``metrics.json``, ``live.csv``), and bit for bit with
 `predict --causal`.
 

@@ -1,7 +1,6 @@
 """Write recordings in the formats of other tools.
 
-One command per format. Each states what a format does not carry, and the README of an export has the commands that read
-it.
+One command per format. Each lists what its format cannot hold, and the README of an export has the commands that read it.
 
 Example: tacpipe export csv data/recordings -o exports/csv
 """

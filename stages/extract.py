@@ -59,7 +59,7 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
     """Measure how the brightness of a gel changes on a grid.
 
     Each stream of frames becomes a stream of tactile channels with a row per frame: the mean of each cell and colour, in
-    grey levels of 0 to 255, less that of the untouched gel. The first frames of a recording show the untouched gel, so
+    grey levels of 0 to 255, minus that of the untouched gel. The first frames of a recording show the untouched gel, so
     start a recording before contact. Until there are as many frames as ``--reference-frames``, those so far are taken:
     no row looks ahead. Streams without frames stay as they are.
 

@@ -31,8 +31,8 @@ XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), Conta
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
-    Each bag is a recording, each topic a stream. Usual messages have names, quantities and units of their own; others
-    are read by their definition. The time of a row is its header's stamp, or the log time where there is none.
+    Each bag is a recording, each topic a stream. Common messages have names, quantities and units; others are read
+    by their definition. The time of a row is the stamp of its header, or the log time if there is none.
 
     Example: tacpipe ingest rosbag FOLDER -o data/recordings
     """
@@ -56,7 +56,7 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
     A group such as demo_0 is a recording, else the file is one. A group of arrays of one length is a stream, with the stamps
-    that lie next to them or a rate that an attribute states. ``--guess`` prints what the files declare as a layout file,
+    next to them or the rate in an attribute. ``--guess`` prints what the files declare as a layout file,
     to which rates, quantities and units can be added.
 
     Example: tacpipe ingest hdf5 demos -o data/recordings
@@ -68,7 +68,7 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 
-    Streams, channels and units are as the file declares them; a layout file replaces what is wrong. Stamps are on the
+    Streams, channels and units are as the file declares them; a layout file corrects them. Stamps are on the
     clock of the computer that recorded, and as they were sent in ``t_device_ns``.
 
     Example: tacpipe ingest xdf sessions -o data/recordings
@@ -83,7 +83,7 @@ def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
 
     An episode is a recording, a feature a stream, the task a label. Stamps are frame_index / fps where the timestamps agree
-    with it. Videos are named and not read. A dataset that tacpipe exported gives the streams back as they were.
+    with it. Exports of tacpipe give the original streams.
 
     Example: tacpipe ingest lerobot datasets/pusht -o data/recordings
     """
@@ -94,7 +94,7 @@ def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
 class ZarrParams(Params):
     """Settings that Zarr stores do not declare."""
 
-    fill_missing_chunks: bool = False  # read chunks that are not there as fill values, which zarr 3 does not write
+    fill_missing_chunks: bool = False  # read missing chunks as fill values, which zarr 3 does not write
 
 
 def preview_zarr(params: ZarrParams, source: Path) -> str:
@@ -107,7 +107,7 @@ def preview_zarr(params: ZarrParams, source: Path) -> str:
 
 @stage(version=2, discover=ZARR.discover, preview=preview_zarr, guess=ZARR.guess, why_unread=ZARR.why_unread)
 def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
-    """Read Zarr stores, as replay buffers of UMI.
+    """Read Zarr stores, such as replay buffers of UMI.
 
     Folders and .zarr.zip files, format 2 and 3. Where meta/episode_ends cuts the arrays into episodes each is a recording,
     else the store is one. The rate, which replay buffers do not hold, comes from a layout file; ``--guess`` prints one.

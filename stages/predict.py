@@ -1,7 +1,7 @@
 """Predict recordings with a trained model, row by row.
 
-`tacpipe evaluate` reports how good the predictions are. With ``--causal`` each prediction reads what had arrived by then
-and no more, from recordings as they were recorded: what a live session publishes, bit for bit; of a classifier the final
+`tacpipe evaluate` reports the errors of the predictions. With ``--causal`` each prediction reads only samples that had
+arrived by then, from original recordings. It equals that of a live session bit for bit. A classifier gives the final
 answer of each recording. ``--quantiles 10,50,90`` adds quantiles of a model that `tacpipe calibrate` made, also to causal
 forecasts.
 

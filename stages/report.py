@@ -1,7 +1,7 @@
 """Show results on one self-contained HTML page.
 
-Each task has a section: which method is best and by how much, a chart and a table, then everything else behind headings
-that fold. Results of the same task are compared, seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
+Each task has a section: the best method and its gain, a chart and a table, then details in sections that fold. Results
+of the same task are compared, with seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
 and grasps are drawn next to results of a task that uses them.
 
 Example: tacpipe report results/forward -o report.html

@@ -37,12 +37,12 @@ class Params(StreamSelection):
     plane_mm: Annotated[PositiveFloat, Unit("mm")] = 6.0
     # fraction of the scene's points that the table must hold
     plane_fraction: Annotated[Fraction, StoredAs("plane_share")] = 0.2
-    plane_trials: PositiveInt = 1000  # random samples by which a plane is looked for
+    plane_trials: PositiveInt = 1000  # random samples to find a plane
     seed: Seed = 0  # random seed of these samples
     # largest distance between neighbouring points of one object
     cluster_mm: Annotated[PositiveFloat, Unit("mm")] = 12.0
-    cluster_points: PositiveInt = 6  # points so near to one another, without which a point is stray
-    object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
+    cluster_points: PositiveInt = 6  # neighbours within that distance that a point must have; else it is stray
+    object_points: PositiveInt = 50  # points that an object must have; fewer are noise of the table
     # largest distance of the object from the line between the fingers, or from its sight line
     near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
     # nearest points whose mean distance identifies stray points at the object's rim

@@ -7,7 +7,7 @@ changes; where the arm was recorded, it lasts while the arm moves. Returns the s
 ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
 ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
 then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
-positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
+positions if nothing else gives its speed. Such a slide has no protocol to check.
 
 Example: tacpipe segment slides data/touched -o data/slides
 """
@@ -61,7 +61,7 @@ class Params(StreamSelection):
     pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
     # fraction of speed_m_s above which the arm slides; only where the arm was recorded
     moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
-    steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
+    steady_frames: PositiveInt = 5  # rows that the arm must move so fast, so that a single wrong reading does not count
     # frames to keep: middle ones; offset: those from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
     frames: PositiveInt = 400  # rows that are kept; recordings without static pressure are kept whole
@@ -71,13 +71,13 @@ class Params(StreamSelection):
     spike_frames: PositiveInt = 7
     # scaled median absolute deviations of these rows, beyond which it is a spike
     spike_deviations: NonNegativeFloat = 5.0
-    # least height of a spike; contact changes readings by 0 to 235
+    # smallest height of a spike; contact changes readings by 0 to 235
     spike_count: Annotated[NonNegativeFloat, Unit("count")] = 255.0
     speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the protocol
     # fraction by which the slide's median speed may differ; published ones do by 0.016
     speed_tolerance: NonNegativeFloat = 0.05
     min_s: Annotated[NonNegativeFloat, Unit("s")] = 5.5  # shortest slide within the protocol
-    # least mean pressure within the protocol; below, the finger hardly touched
+    # smallest mean pressure within the protocol; below, the finger hardly touched
     pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
     # largest mean pressure within the protocol; above, the finger was pressed too hard
     pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0

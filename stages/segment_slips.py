@@ -51,7 +51,7 @@ class Params(StreamSelection):
     off_sigma: PositiveFloat = 2.0  # times the rate's noise, below which it ends
     on_frames: PositiveInt = 3  # rows that it must be beyond
     off_frames: PositiveInt = 5  # rows that it must be below
-    # least noise of the rate: a reading's step of one count makes 10 of them
+    # least noise of the rate; one count of a reading gives 10
     noise_floor: Annotated[PositiveFloat, Unit("count/s")] = 3.0
     # largest change of readings that counts as no change of level
     level_count: Annotated[PositiveFloat, Unit("count")] = 0.75

@@ -34,10 +34,10 @@ class Params:
     duration_s: Annotated[float, Range(4), Unit("s")] = 12.0
     # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
     protocol: Literal["mixed", "controlled", "kinaesthetic"] = "mixed"
-    # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
+    # largest load of the plan as a fraction of the friction limit; above 1 the object slips; 0: random
     effort: NonNegativeFloat = 0.0
-    friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
-    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
+    friction_scale: PositiveFloat = 1.0  # factor of the drawn friction; with 4 nothing slips
+    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip weakens without warning
     grip_loss: Fraction = 0.2  # fraction of the grip force that is lost then
     # sideways distance from the grasp to the centre of mass; it twists the object
     lever_m: Annotated[NonNegativeFloat, Unit("m")] = 0.0
@@ -82,27 +82,27 @@ class MaterialParams:
     trials: PositiveInt = 200
     seed: Seed = 0  # random seed
     materials: PositiveInt = 20  # materials
-    sessions: PositiveInt = 1  # sessions a material, over which its trials are shared out by turns
-    identical_materials: bool = False  # all classes are one and the same material; only their sessions differ
+    sessions: PositiveInt = 1  # sessions per material, which take its trials in turn
+    identical_materials: bool = False  # all classes are the same material; only their sessions differ
     # shared: both sensors measure the same materials; independent: each has its own twenty
     spectra: Literal["shared", "independent"] = "shared"
-    # times the offsets, gains and drift that the trials of a session have in common
+    # factor of the offsets, gains and drift that the trials of a session share
     session_scale: NonNegativeFloat = 1.0
-    # times what differs from reading to reading: noise, drift, each trial's own offsets
+    # factor of noise, drift and the offsets of each trial
     noise_scale: NonNegativeFloat = 1.0
     force_n: Annotated[PositiveFloat, Unit("N")] = 1.0  # mean force of a slide; it varies by 5 % from trial to trial
     speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the arm that draws the BioTac
-    # mean speed of what slides over RoboSkin; it varies by 30 %
+    # mean speed of the material over RoboSkin; it varies by 30 %
     roboskin_speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.05
     pac: bool = True  # simulate the BioTac's vibration channels; they are zero otherwise
-    # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
+    # slides of a BioTac per material from one with the arm's streams to the next; 0: none
     arm_every: NonNegativeInt = 20
     jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.1  # mean and standard deviation of a reading's latency
 
 
 @stage(version=1)
 def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
-    """Simulate slides of two unlike sensors over materials.
+    """Simulate slides of two different sensors over materials.
 
     Each recording has the stream of its sensor, biotac or roboskin, and, with ground truth, truth.
 
@@ -126,8 +126,8 @@ class TouchParams:
     objects: PositiveInt = 5  # named objects of each family
     # stiffness of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
     stiffness: Literal["mixed", "rigid", "elastic", "foam"] = "mixed"
-    spheres: bool = False  # spheres that differ in size alone, seen from as much nearer, grasped through the centre
-    one_pose: bool = False  # each object always lies the same way, and is only shifted and turned about the vertical
+    spheres: bool = False  # spheres of different sizes, seen from distances in proportion, grasped through the centre
+    one_pose: bool = False  # each object lies in one pose, and is only shifted and rotated about the vertical
     shift: Fraction = 0.5  # largest fraction of half the cloud's length by which grasps lie off its middle
     # standard deviation of the logarithm of the closing effort, which no stream shows
     effort_spread: NonNegativeFloat = 0.15

@@ -27,15 +27,15 @@ class Split:
     """Params that all schemes have."""
 
     scheme: str
-    # fraction of the recordings to validate on; where the scheme picks the test ones, of the others
+    # fraction of the recordings to validate on; if the scheme selects the test recordings, of the others
     val: Annotated[float, Range(0, below=1)] = 0.15
     # fraction, as val, that only `tacpipe calibrate` uses; forward needs some for it
     calibration: Annotated[float, Range(0, below=1)] = added(0.0)
     seed: Seed = 0  # random seed of every draw
     stratify: Names = ""  # attributes whose values are spread evenly over the roles; empty for none
-    few: NonNegativeInt = 0  # maximum number of recordings to train on, those left over are unused; 0 for all
-    few_by: str = ""  # attribute of whose every value that many train, as sensor; empty for that many altogether
-    few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
+    few: NonNegativeInt = 0  # maximum number of recordings to train on; others are unused; 0 for all
+    few_by: str = ""  # attribute, such as sensor; few counts the recordings of each of its values; empty: of all
+    few_of: str = ""  # attribute=value of the recordings that few limits, such as sensor=roboskin; empty for all
 
     def check(self) -> None:
         """Refuse options that need few, and an attribute without a value."""

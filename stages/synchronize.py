@@ -45,9 +45,9 @@ class Params(StreamSelection):
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
     # longest time between samples without a gap, marked in a mask; without it 50, below 20 Hz 2.5 periods of the stream
     gap_ms: Annotated[PositiveFloat, Unit("ms")] | None = None
-    # time of a sample: arrival: when it came; device: its own stamp; auto: arrival for hold, else device where there is one
+    # time of a sample: arrival; device: its own stamp; auto: arrival for hold, else device if there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
-    unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
+    unwrap: bool = True  # undo the wrap-around of 16-bit tactile counts; other channels do not change
 
     def check(self) -> None:
         """Refuse clocks of devices for held values, because their fit reads the whole recording, and two kinds of rows."""

@@ -202,13 +202,28 @@ def _record(param: Any, ctx: Any) -> tuple[str, str]:
     if param.secondary_opts:
         names += f" / {', '.join(param.secondary_opts)}"
     takes_value = not (param.is_flag or getattr(param, "count", False))
-    text = plain(param.help or "")
+    text = _sentence(plain(param.help or ""))
     if takes_value and getattr(param, "multiple", False):
         text += " Can be repeated."
     default = param.default
     if takes_value and param.show_default and default not in (None, "", ()) and not callable(default):
         text += f" [default: {getattr(default, 'value', default)}]"
     return f"{names} {_metavar(param, ctx)}" if takes_value else names, text
+
+
+def _sentence(text: str) -> str:
+    """Return the help of an option as a sentence; the name of a choice at its start stays as it is typed.
+
+    >>> _sentence("rate of the rows (Hz) [default: 50]"), _sentence("hold: newest sample"), _sentence("")
+    ('Rate of the rows (Hz). [default: 50]', 'hold: newest sample.', '')
+    """
+    default = re.search(r" \[default: [^\]]+\]$", text)
+    sentence = text[: default.start()] if default else text
+    if sentence and not re.match(r"[\w-]+(?:, [\w-]+)*: ", sentence):
+        sentence = sentence[0].upper() + sentence[1:]
+    if sentence and not sentence.endswith("."):
+        sentence += "."
+    return sentence + (default[0] if default else "")
 
 
 def _brief_record(param: Any, ctx: Any) -> tuple[str, str]:

@@ -77,7 +77,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
         text = "A model to begin with."
         parameters.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
     if stage.trains:
-        text = "What to train on; auto: cuda where there is one, else cpu."
+        text = "Device to train on; auto: cuda if there is one, else cpu."
         option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
         parameters.append(_parameter("device", str | None, option))
     if stage.tracked:
@@ -130,7 +130,7 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
         (
             "print_params",
             bool,
-            typer.Option(False, PRINT_PARAMS, help="Print the params that would count, and stop."),
+            typer.Option(False, PRINT_PARAMS, help="Print the params that would be used, and stop."),
         ),
         ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one per core.")),
         (
@@ -149,13 +149,19 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
         (
             "compare",
             bool,
-            typer.Option(False, "--recompute-and-compare", help="Run again what is stored and name what differs."),
+            typer.Option(
+                False, "--recompute-and-compare", help="Compute stored results again and name the differences."
+            ),
         ),
-        ("rerun", bool, typer.Option(False, "--rerun", help="Compute what is stored too, and keep the new result.")),
+        (
+            "rerun",
+            bool,
+            typer.Option(False, "--rerun", help="Compute even if a result is stored, and keep the new one."),
+        ),
         (
             "replace",
             bool,
-            typer.Option(False, "--replace", help="Replace what -o holds: another dataset, recordings, labels."),
+            typer.Option(False, "--replace", help="Replace other content of -o: a dataset, recordings, labels."),
         ),
         ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
         ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
@@ -170,10 +176,10 @@ def _looks(stage: AnyStage) -> list[inspect.Parameter]:
         text = "Print a first layout file for this folder, and stop."
         parameters.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
     if stage.preview is not None:
-        text = "Describe what would be read, and stop."
+        text = "Describe the recordings, and stop."
         parameters.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
     if stage.requirements is not None:
-        text = "Print what recordings must hold, and stop."
+        text = "Print the required channels and labels, and stop."
         show = typer.Option(False, "--requirements", help=text, is_eager=True, callback=_shows(stage.requirements))
         parameters.append(_parameter("requirements", bool, show))
     return parameters

@@ -43,7 +43,7 @@ def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     """Read published videos of two GelSight Mini, with slip.
 
     Returns the streams gel0 and gel2, a row per frame, and the labels object and slip. A trial with a slip ends at the
-    slip, so the length of a recording gives the label away.
+    slip, so the length of a recording reveals the label.
     """
     from tacpipe.video.files import read_stream, scan
 

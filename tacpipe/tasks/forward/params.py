@@ -55,7 +55,7 @@ class ForwardModelParams(ABC):
     baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
-    # networks of random weights of their own that are trained, and whose forecasts are averaged
+    # networks with different random weights whose forecasts are averaged
     members: PositiveInt = added(1)
     arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
     PANELS: ClassVar[Panels] = {

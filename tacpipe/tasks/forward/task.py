@@ -31,8 +31,8 @@ class ForwardTask(Task):
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 
-        It reads past tactile signals, past motion and the planned motion. ``init`` is a model to begin with: its weights
-        and scalings are taken over.
+        It reads past tactile signals, past motion and the planned motion. ``--init`` gives a model to begin
+        with, including its weights and scalings.
 
         Example: tacpipe train forward data/segments --split data/split -o models/forward
         """

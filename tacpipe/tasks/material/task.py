@@ -93,8 +93,8 @@ class MaterialTask(Task):
     ) -> Result:
         """Train a classifier of materials on slides.
 
-        It learns for each sensor alone or for unlike sensors jointly. ``init`` is a model whose network of the sensor
-        ``--frozen-sensor`` stays as it is, while the latents of the others are aligned to its own.
+        It learns each sensor separately, or several sensors jointly. ``--init`` gives a model whose network for
+        ``--frozen-sensor`` does not change, while the latents of the other sensors are aligned to it.
 
         Example: tacpipe train material data/slides --split data/slides-split -o models/material
         """

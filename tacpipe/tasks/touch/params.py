@@ -92,15 +92,15 @@ class TouchModelParams(ABC):
 class Trees(TouchModelParams):
     """Forests over the geometry of a grasp: the best model that we know."""
 
-    # tree-ensemble: the mean of a forest a target and one forest of all targets; trees: a forest a target
+    # tree-ensemble: the mean of one forest per target and one of all targets; trees: one forest per target
     architecture: Annotated[
         Literal["tree-ensemble", "trees"], StoredAs("architecture", {"tree-ensemble": "strong"})
     ] = "tree-ensemble"
     inputs: Literal["rgb", "xyz"] = "rgb"  # columns of a cloud: places and colours, or only places
-    place: bool = False  # read where the grasp is before the camera too, not its shape alone
+    place: bool = False  # also read the position of the grasp relative to the camera
     trees: PositiveInt = 300  # trees of each target's forest
     leaf: NonNegativeInt = 0  # fewest training grasps of a leaf; 0: chosen of 2, 4 and 8 by out-of-bag error
-    # shrink predictions for objects not trained on towards the constant, as far as errs least on training objects left out
+    # shrink predictions for novel objects towards the constant, by the fraction with the least error on omitted objects
     shrink_novel: bool = added(False)
     PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
 
