@@ -29,7 +29,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
 from tacpipe.plugins.constraints import Rate
-from tacpipe.plugins.stage import Attribute
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class Share:
     """The files and values that an episode, and its key, depend on."""
 
     files: Mapping[str, Path]  # files by path in the container
-    values: Mapping[str, Any] = field(default_factory=dict)  # further JSON values that the episode depends on
+    values: Values = field(default_factory=dict)  # further JSON values that the episode depends on
 
 
 @runtime_checkable

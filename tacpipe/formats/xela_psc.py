@@ -7,7 +7,7 @@ Timestamps are the seconds in robot_state.csv. Trials start and end in the grasp
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params, trials
@@ -61,7 +61,7 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     planned = [
         schema.float_field(f"commanded_velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in schema.AXES[:2]
     ]
-    streams: dict[str, Any] = xela.tactile_streams(tactile, t_ns, None)
+    streams = xela.tactile_streams(tactile, t_ns, None)
     streams["robot"] = schema.stream(
         t_ns, [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T], [*angles, *speeds, *schema.pose_fields(), *planned]
     )

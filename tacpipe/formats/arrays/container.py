@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,8 @@ from tacpipe.formats.arrays import episodes, zarr
 from tacpipe.formats.arrays.episodes import Episode, StreamArrays
 from tacpipe.formats.arrays.tree import (
     MAX_TEXT,
+    StoredAttributes,
+    StoredValue,
     Tree,
     columns_of_array,
     encoded_size,
@@ -102,12 +104,8 @@ class ArrayContainer:
                 if chunks is None:
                     return None
                 files |= chunks
-            array_metadata: dict[str, Any] = {
-                array.path: [tree.encoding_metadata(array), dict(array.attributes)] for array in arrays
-            }
-            attributes: dict[str, Any] = {
-                group: dict(tree.attributes(group)) for group in episodes.parent_groups(array_episode.group)
-            }
+            array_metadata = {array.path: [tree.encoding_metadata(array), dict(array.attributes)] for array in arrays}
+            attributes = {group: dict(tree.attributes(group)) for group in episodes.parent_groups(array_episode.group)}
             rows = [array_episode.start, array_episode.stop]
             return Share(
                 files,
@@ -238,7 +236,7 @@ def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute]
     return attributes, long
 
 
-def _flatten_json(text: Any) -> dict[str, Any]:
+def _flatten_json(text: Any) -> StoredAttributes:
     """Return the values of a JSON object in a text, with dotted names; an empty dictionary for other text.
 
     >>> _flatten_json('{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}')
@@ -253,7 +251,7 @@ def _flatten_json(text: Any) -> dict[str, Any]:
     return dict(_leaves(content))
 
 
-def _leaves(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(value: StoredAttributes, before: str = "") -> Iterator[tuple[str, StoredValue]]:
     for name, inner in value.items():
         if isinstance(inner, dict) and before.count(".") < MAX_DEPTH:
             yield from _leaves(inner, f"{before}{name}.")

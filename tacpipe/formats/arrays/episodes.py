@@ -13,7 +13,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription, Tree, is_frames, reason_left_out, walk
+from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, Tree, is_frames, reason_left_out, walk
 from tacpipe.formats.container import Time, TimeUnit
 from tacpipe.io import memory
 from tacpipe.printable import plain
@@ -37,7 +37,7 @@ class Episode:
     count: int = 0
     total: int = 0  # number of rows of all recordings
     ends_group: str | None = None  # group of the array with the ends
-    labels: Mapping[str, Any] = field(default_factory=dict)
+    labels: StoredAttributes = field(default_factory=dict)
     name_is_stated: bool = False  # whether the file contains the name
 
     def inside(self, path: str) -> str:
@@ -122,7 +122,7 @@ def _episodes_from_ends(tree: Tree) -> list[Episode]:
     return []
 
 
-def _labels_of_episode(labels: Any, name: str) -> Mapping[str, Any]:
+def _labels_of_episode(labels: Any, name: str) -> StoredAttributes:
     values = labels.get(name) if isinstance(labels, dict) else None
     return values if isinstance(values, dict) else {}
 
@@ -346,7 +346,7 @@ def declared_rate_hz(tree: Tree, episode: Episode, part: StreamArrays | None) ->
     return next((rate for attributes in attribute_sets if (rate := _declared_rate(attributes)) is not None), None)
 
 
-def _declared_rate(attributes: Mapping[str, Any]) -> float | None:
+def _declared_rate(attributes: StoredAttributes) -> float | None:
     for name in RATES:
         value = attributes.get(name)
         if isinstance(value, int | float | np.number) and np.isfinite(value) and 0 < value <= 1e9:

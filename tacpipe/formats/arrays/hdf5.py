@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription, with_time_first
+from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, StoredValue, with_time_first
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
@@ -44,7 +44,7 @@ class Hdf5Tree:
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
         self.path, self._file, self._available = path, file, bytes_left
         self._members: dict[str, tuple[list[ArrayDescription], list[str]]] = {}  # members of each listed group
-        self._attributes_by_group: dict[str, dict[str, Any]] = {}  # attributes of groups
+        self._attributes_by_group: dict[str, StoredAttributes] = {}  # attributes of groups
 
     @property
     def notes(self) -> list[str]:
@@ -81,7 +81,7 @@ class Hdf5Tree:
             kind = self._file.get(path, getclass=True) if path else h5py.Group
             return kind is not None and issubclass(kind, h5py.Group)
 
-    def attributes(self, group: str) -> Mapping[str, Any]:
+    def attributes(self, group: str) -> StoredAttributes:
         """Return the readable attributes of a group."""
         with self._reading(group or "its root"):
             if group not in self._attributes_by_group:
@@ -269,8 +269,8 @@ def _filters(dataset: h5py.Dataset) -> Iterator[int]:
         yield about.get_filter(place)[0]
 
 
-def _read_attributes(owner: Any, file: Path) -> dict[str, Any]:
-    attributes = {}
+def _read_attributes(owner: Any, file: Path) -> StoredAttributes:
+    attributes: dict[str, StoredValue] = {}
     for name in owner.attrs:
         place = f"{file}, the attribute {plain(name)},"
         with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, place):  # numpy lacks some types

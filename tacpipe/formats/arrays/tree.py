@@ -28,6 +28,11 @@ IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
 COLOURS = (1, 3, 4)  # channels of a picture
 
 
+# value of an attribute: of HDF5 as h5py and numpy give it, of Zarr as JSON
+StoredValue = str | bytes | float | bool | None | np.generic | AnyArray | list[Any] | dict[str, Any]
+StoredAttributes = Mapping[str, StoredValue]
+
+
 @dataclass(frozen=True)
 class ArrayDescription:
     """The description of one array; ``dtype`` is that of numpy, object where elements have no fixed length."""
@@ -35,7 +40,7 @@ class ArrayDescription:
     path: str  # path within the file, as "data/demo_0/actions"
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    attributes: StoredAttributes = field(default_factory=dict)
     chunk_rows: int = 0  # rows of a chunk, or 0 if the file has none
     problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
     time_axis: int = 0  # axis of the file's array that becomes the first axis of ``shape``
@@ -76,7 +81,7 @@ class Tree(Protocol):
     def identity(self, group: str) -> Any:
         """Return a value that identifies a group; links can give one group several paths."""
 
-    def attributes(self, group: str) -> Mapping[str, Any]:
+    def attributes(self, group: str) -> StoredAttributes:
         """Return the attributes of a group."""
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
@@ -189,7 +194,7 @@ def is_text(array: ArrayDescription) -> bool:
     return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
 
 
-def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
+def plain_attributes(attributes: StoredAttributes) -> dict[str, str | int | float | bool]:
     """Return the attributes that are a short text, a number or a boolean, as plain Python values.
 
     >>> plain_attributes({"a": np.float32(0.5), "b": b"x", "c": np.array([1, 2]), "d": np.array([3])})

@@ -21,13 +21,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription
+from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
@@ -50,6 +50,30 @@ _filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether missi
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
+class ZarrMetadata(TypedDict, total=False):
+    """The metadata of an array or a group, which may be damaged."""
+
+    zarr_format: int
+    shape: list[int]
+    attributes: StoredAttributes  # since format 3
+    dtype: Any  # until format 2: a name, or a list of fields
+    chunks: list[int]
+    compressor: Any
+    filters: list[Any] | None
+    dimension_separator: str
+    data_type: str  # since format 3
+    codecs: list[Any]
+    chunk_grid: Any
+    chunk_key_encoding: Any
+
+
+class ZarrNode(NamedTuple):
+    """An array or a group."""
+
+    metadata: ZarrMetadata
+    attributes: StoredAttributes
+
+
 @dataclass(frozen=True)
 class ZarrTree:
     """A Zarr store. ``path`` is a folder or a zip file; ``names`` are the members of a zip file, None for a folder."""
@@ -57,7 +81,7 @@ class ZarrTree:
     path: Path
     names: frozenset[str] | None
     notes: Sequence[str] = ()
-    _nodes: dict[str, tuple[dict[str, Any], dict[str, Any]] | None] = field(default_factory=dict)  # metadata by path
+    _nodes: dict[str, ZarrNode | None] = field(default_factory=dict)  # metadata by path
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
@@ -65,7 +89,7 @@ class ZarrTree:
         for name in self._below(group):
             path = f"{group}/{name}" if group else name
             node = self._node(path)
-            if node is not None and "shape" in node[0]:
+            if node is not None and "shape" in node.metadata:
                 arrays.append(_parse_array(path, *node))
             elif node is not None:
                 below.append(path)
@@ -74,16 +98,16 @@ class ZarrTree:
     def is_group(self, path: str) -> bool:
         """Return whether a group has this path."""
         node = self._node(path)
-        return node is not None and "shape" not in node[0]
+        return node is not None and "shape" not in node.metadata
 
     def identity(self, group: str) -> str:
         """Return the path of a group, which is unique."""
         return group
 
-    def attributes(self, group: str) -> Mapping[str, Any]:
+    def attributes(self, group: str) -> StoredAttributes:
         """Return the attributes of a group."""
         node = self._node(group)
-        return node[1] if node is not None else {}
+        return node.attributes if node is not None else {}
 
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """Return the rows of an array. Raises `TacpipeError` for damaged and for missing chunks."""
@@ -167,13 +191,13 @@ class ZarrTree:
             }
         )
 
-    def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    def _node(self, path: str) -> ZarrNode | None:
         """Return metadata and attributes of a group or an array, or None if there is neither."""
         if path not in self._nodes:
             self._nodes[path] = self._read_node(path)
         return self._nodes[path]
 
-    def _read_node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    def _read_node(self, path: str) -> ZarrNode | None:
         for mark in MARKS:
             name = f"{path}/{mark}" if path else mark
             if self._has(name):
@@ -183,10 +207,10 @@ class ZarrTree:
                 else:
                     attributes_name = f"{path}/.zattrs" if path else ".zattrs"
                     attributes = self._json(attributes_name) if self._has(attributes_name) else {}
-                return about, attributes if isinstance(attributes, dict) else {}
+                return ZarrNode(about, attributes if isinstance(attributes, dict) else {})
         return None
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def _json(self, name: str) -> Any:
         try:
             content = json.loads(self._content(name))
         except (*BROKEN_ZIP, RecursionError) as error:
@@ -203,7 +227,8 @@ class ZarrTree:
         with _archive(self.path) as archive:
             if archive.getinfo(name).file_size > MAX_METADATA_BYTES:
                 raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MAX_METADATA_BYTES:,} bytes.")
-            return archive.read(name)
+            content: bytes = archive.read(name)
+            return content
 
     @contextlib.contextmanager
     def _store(self) -> Iterator[Any]:
@@ -285,7 +310,7 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error
 
 
-def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> ArrayDescription:
+def _parse_array(path: str, about: ZarrMetadata, attributes: StoredAttributes) -> ArrayDescription:
     problem = ""
     shape = about.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
@@ -314,7 +339,7 @@ def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, A
     return ArrayDescription(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
 
 
-def _parse_dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
+def _parse_dtype(about: ZarrMetadata) -> np.dtype[Any]:
     if about.get("zarr_format") == 3:
         called = about["data_type"]
         if called in ("string", "variable_length_utf8"):
@@ -330,7 +355,7 @@ def _parse_dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
     return dtype
 
 
-def _codec_names(about: Mapping[str, Any]) -> Iterator[Any]:
+def _codec_names(about: ZarrMetadata) -> Iterator[Any]:
     """Yield the codec names of an array, without the prefix of codecs from numcodecs."""
     if about.get("zarr_format") != 3:
         yield from (_entry(codec, "id") for codec in (about.get("compressor"), *(about.get("filters") or ())) if codec)
@@ -349,10 +374,10 @@ def _entry(codec: Any, key: str) -> Any:
     return codec.get(key) if isinstance(codec, dict) else codec
 
 
-def _chunk_grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
+def _chunk_grid(about: ZarrMetadata) -> tuple[Sequence[int], Any]:
     """Return the shape of a chunk, and a function from its grid position to its name in the array."""
     if about.get("zarr_format") == 3:
-        encoding = about.get("chunk_key_encoding", {"name": "default"})
+        encoding: Any = about.get("chunk_key_encoding", {"name": "default"})
         between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
         before = ["c"] if encoding["name"] == "default" else []
         shape = about["chunk_grid"]["configuration"]["chunk_shape"]

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, cast
 
 import pyarrow as pa
 
@@ -28,7 +28,7 @@ from tacpipe.io import config_text, regular
 from tacpipe.io import files as file_system
 from tacpipe.io.spill import Spill, unpack
 from tacpipe.plugins import extras
-from tacpipe.plugins.stage import Attribute
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import excerpt, listed, plain
 
 EXPORT_KEY = "tacpipe"  # key in a channel's metadata, and name of the metadata record
@@ -91,7 +91,7 @@ def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStre
     return SourceStream(stream.source, stream.name, Time(HEADER, "ns"), content, stream.rows)
 
 
-def _json_object(text: str) -> dict[str, Any]:
+def _json_object(text: str) -> Values:
     try:
         value = json.loads(text or "{}")
     except (ValueError, RecursionError):
@@ -99,7 +99,7 @@ def _json_object(text: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _texts(values: Mapping[str, Any]) -> dict[str, str]:
+def _texts(values: Values) -> dict[str, str]:
     return {str(key): str(value) for key, value in values.items()}
 
 
@@ -200,13 +200,19 @@ def _file_ending(path: Path) -> str:
     return (path.with_suffix("") if path.suffix.lower() in (ZSTD, ACTIVE) else path).suffix.lower()
 
 
-def _bag_description(path: Path) -> dict[str, Any]:
+class BagDescription(TypedDict, total=False):
+    """The description of a bag in ``metadata.yaml``, as far as it is read."""
+
+    relative_file_paths: list[str]
+
+
+def _bag_description(path: Path) -> BagDescription:
     try:
         value = config_text.load_yaml(
             regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode()
         )
         about = value["rosbag2_bagfile_information"]
-        return dict(about)
+        return cast("BagDescription", dict(about))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise TacpipeError(
             f"{path} does not describe a bag: {plain(str(error), 120)}. Without it the files next to it are read one by one."

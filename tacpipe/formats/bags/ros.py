@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -42,7 +42,7 @@ def parse_definitions(name: str, kind: Definition, text: str) -> Types:
     try:
         if kind == "idl":
             parts = text.split("=" * 80 + "\n")
-            definitions: dict[str, Any] = {}
+            definitions: dict[str, tuple[Any, Any]] = {}  # constants and fields by type
             for part in parts:
                 body = part.partition("\n")[2] if part.startswith("IDL: ") else part
                 definitions |= get_types_from_idl(body) if body.strip() else {}
@@ -188,7 +188,7 @@ def _column_type(column: PartColumn) -> pa.DataType:
     return pa.bool_() if leaf.kind == "bool" else pa.from_numpy_dtype(np.dtype(wire.NUMBERS[leaf.kind]))
 
 
-def _free_name(name: str, columns: Mapping[str, Any]) -> str:
+def _free_name(name: str, columns: Collection[str]) -> str:
     while name in columns:
         name = f"{name}_"
     return name

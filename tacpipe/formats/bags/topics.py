@@ -20,6 +20,7 @@ from tacpipe.arrays import Int64s
 from tacpipe.formats.container import Batched, Time
 from tacpipe.io import spill
 from tacpipe.io.spill import Piece, Spill
+from tacpipe.plugins.stage import Values
 from tacpipe.printable import plain
 
 LOG, HEADER, PUBLISH, FRAME = "t_log_ns", "t_header_ns", "t_publish_ns", "frame_id"
@@ -238,7 +239,10 @@ MAX_COLUMNS = 4096  # maximum number of values per message
 _STAMPS = ("header.stamp", "timestamp", "stamp")  # integers at these paths are nanoseconds
 
 
-def block_from_rows(rows: Sequence[Mapping[str, Any]], types: Mapping[str, pa.DataType]) -> Block:
+Leaf = str | bytes | float | bool | None  # a value of a message
+
+
+def block_from_rows(rows: Sequence[Mapping[str, Leaf]], types: Mapping[str, pa.DataType]) -> Block:
     """Return messages, given as values by path, as columns. ``types`` are the types of paths declared by a schema.
 
     Raises `TopicError` if there are too many paths.
@@ -279,7 +283,7 @@ class Json:
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages. Raises `TopicError` if one is not a JSON object."""
         encoded = self._encoded()
-        rows: list[dict[str, Any]] = []
+        rows: list[dict[str, Leaf]] = []
         for message in messages:
             try:
                 value = json.loads(message, object_pairs_hook=_refuse_repeated)
@@ -309,7 +313,7 @@ class Json:
             return set()
 
 
-def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> Values:
     """Return a JSON object. Raises `TopicError` if it repeats a name."""
     value = dict(pairs)
     if len(value) < len(pairs):
@@ -317,13 +321,13 @@ def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     return value
 
 
-def flatten_object(nested: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+def flatten_object(nested: Values, before: str = "") -> dict[str, Leaf]:
     """Return nested objects and lists as values by path; a time (``sec`` and ``nsec``) becomes one value in nanoseconds.
 
     >>> flatten_object({"stamp": {"sec": 1, "nsec": 5}, "a": {"x": 1.5}, "l": [1, 2], "n": None})
     {'stamp': 1000000005, 'a.x': 1.5, 'l.0': 1, 'l.1': 2, 'n': None}
     """
-    values: dict[str, Any] = {}
+    values: dict[str, Leaf] = {}
     for name, value in nested.items():
         path = f"{before}{name}"
         if isinstance(value, list):
@@ -389,9 +393,9 @@ class Protobuf:
             raise TopicError(f"the file has no definition of its type {plain(self.name)}") from error
 
 
-def flatten_message(message: Any, types: dict[str, pa.DataType], before: str = "") -> dict[str, Any]:
+def flatten_message(message: Any, types: dict[str, pa.DataType], before: str = "") -> dict[str, Leaf]:
     """Return a message as values by path, all fields without presence too; the types of numbers are added to ``types``."""
-    values: dict[str, Any] = {}
+    values: dict[str, Leaf] = {}
     for descriptor in message.DESCRIPTOR.fields:
         value = getattr(message, descriptor.name)
         path = f"{before}{descriptor.name}"

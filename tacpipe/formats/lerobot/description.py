@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import pyarrow.parquet as pq
 
@@ -17,7 +17,7 @@ from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, parquet, regular
 from tacpipe.io.parquet import BROKEN
-from tacpipe.plugins.stage import Attribute
+from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import excerpt, plain
 
 INFO = "meta/info.json"
@@ -80,6 +80,18 @@ class EpisodeDescription:
     )  # start time in the video by feature, 0 if missing
 
 
+class InfoFile(TypedDict, total=False):
+    """The file ``info.json``, which may be damaged, as far as it is read."""
+
+    codebase_version: str
+    fps: float
+    robot_type: str
+    chunks_size: int
+    data_path: str  # pattern of the paths of frames
+    video_path: str
+    features: dict[str, Any]  # dtype, shape and names
+
+
 @dataclass(frozen=True)
 class LeRobotDescription:
     """The description of a LeRobot dataset in its folder meta."""
@@ -89,7 +101,7 @@ class LeRobotDescription:
     fps: float
     robot: str
     features: Mapping[str, FeatureDescription]
-    info: Mapping[str, Any]
+    info: InfoFile
 
     def episodes(self) -> list[EpisodeDescription]:
         """Return all episodes by index. Raises `TacpipeError` with the file's name if one cannot be read."""
@@ -134,7 +146,7 @@ class LeRobotDescription:
             for row in _read_table(path, names).to_pylist():
                 yield self._episode_from_row(path, row)
 
-    def _episode_from_row(self, path: Path, row: Mapping[str, Any]) -> EpisodeDescription:
+    def _episode_from_row(self, path: Path, row: Values) -> EpisodeDescription:
         try:
             index, length = int(row["episode_index"]), int(row["length"])
             values = {"chunk_index": int(row["data/chunk_index"]), "file_index": int(row["data/file_index"])}
@@ -175,7 +187,7 @@ class LeRobotDescription:
     def _videos(self) -> list[str]:
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
-    def _place(self, key: str, usual: str, values: Mapping[str, object]) -> str:
+    def _place(self, key: str, usual: str, values: Mapping[str, str | int | None]) -> str:
         """Return a path in the dataset from a pattern in info.json."""
         pattern = str(self.info.get(key) or usual)
         try:
@@ -191,7 +203,7 @@ class LeRobotDescription:
 def read_description(root: Path) -> LeRobotDescription:
     """Return the description of a dataset. Raises `TacpipeError` with file and entry if it is invalid."""
     path = root / INFO
-    info = _read_json(root, INFO)
+    info: InfoFile = _read_json(root, INFO)
     version, fps = info.get("codebase_version"), info.get("fps")
     if version not in VERSIONS:
         raise TacpipeError(
@@ -264,11 +276,11 @@ def _leaves(names: Any) -> list[str]:
     return leaves
 
 
-def _episode_name(index: int, extra_values: Mapping[str, Any]) -> str:
+def _episode_name(index: int, extra_values: Values) -> str:
     return str(extra_values[NAME]) if extra_values.get(NAME) else f"episode_{index:06d}"
 
 
-def _plain_attributes(values: Mapping[str, Any]) -> dict[str, Attribute]:
+def _plain_attributes(values: Values) -> dict[str, Attribute]:
     extra_values = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
     return dict(plain_attributes(extra_values))
 
@@ -288,7 +300,7 @@ def _format_number(value: object, width: str | None) -> str:
     return f"{int(value):0{int(width)}d}" if width else str(value)  # type: ignore[call-overload]
 
 
-def _read_json(root: Path, name: str) -> dict[str, Any]:
+def _read_json(root: Path, name: str) -> Any:
     path = regular.inside(root, name)
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
@@ -301,7 +313,7 @@ def _read_json(root: Path, name: str) -> dict[str, Any]:
     return content_json
 
 
-def _read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
+def _read_json_lines(path: Path) -> Iterator[Values]:
     """Yield the objects in a JSON Lines file."""
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)

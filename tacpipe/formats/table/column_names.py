@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from tacpipe.formats.table.layout import UNKNOWN
+
+if TYPE_CHECKING:
+    from tacpipe.formats.arrays.tree import StoredAttributes
 
 _TIME_WORDS = r"(t|time|times|time_?stamps?|stamps?|clock|unix_?time|epoch|datetime|date[_ ]?time|date|uhrzeit|zeit)"
 TIME_NAME = re.compile(rf"{_TIME_WORDS}([_ ]?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
@@ -279,7 +283,7 @@ def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
     return ([joint] * 6 + [gripper]) * (width // 7)
 
 
-def declared_metadata(attributes: Mapping[str, object]) -> dict[str, str]:
+def declared_metadata(attributes: StoredAttributes) -> dict[str, str]:
     """Return what attributes of an array state of its columns, as metadata of fields.
 
     Where a quantity is among them all texts count, as in files that tacpipe writes.
@@ -296,7 +300,7 @@ def declared_metadata(attributes: Mapping[str, object]) -> dict[str, str]:
     return {"unit": unit} if unit else {}
 
 
-def declared_texts(attributes: Mapping[str, object], key: str, count: int) -> list[str]:
+def declared_texts(attributes: StoredAttributes, key: str, count: int) -> list[str]:
     """Return the text that an attribute states for each of ``count`` columns, or nothing if it states another number.
 
     >>> declared_texts({"columns": ["a", "b"]}, "columns", 2), declared_texts({"columns": ["a"]}, "columns", 2)

@@ -125,9 +125,9 @@ class _ContainerShares:
         self._layout, self._kind = layout, kind
         self._opened: dict[Path, object] = {}
 
-    def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], dict[str, object]]:
+    def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], Values]:
         files: dict[str, Path] = {}
-        values: dict[str, object] = {}
+        values: dict[str, Values] = {}  # by name of a file
         by_place: dict[Path, list[str]] = {}
         for name, place in recording.files.items():
             by_place.setdefault(place, []).append(name)

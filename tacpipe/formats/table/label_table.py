@@ -160,8 +160,11 @@ def read_label_table(
     return LabelTable(path, key, tuple(_checked_row(path, place, key, row, texts) for place, row in rows))
 
 
+Cell = Attribute | datetime.date  # a value of a table; others are refused
+
+
 def _find_key_column(
-    path: Path, columns: list[str], rows: list[tuple[str, dict[str, Any]]], recording_names: set[str]
+    path: Path, columns: list[str], rows: list[tuple[str, dict[str, Cell]]], recording_names: set[str]
 ) -> str:
     matching_columns = [name for name in columns if {cell_text(row.get(name)) for _, row in rows} <= recording_names]
     called = [name for name in columns if RECORDING.fullmatch(name)]
@@ -173,13 +176,13 @@ def _find_key_column(
     return (matching_columns + called)[0]
 
 
-def _checked_row(path: Path, place: str, key: str, row: Mapping[str, Any], texts: bool) -> LabelRow:
+def _checked_row(path: Path, place: str, key: str, row: Mapping[str, Cell], texts: bool) -> LabelRow:
     name = cell_text(row.get(key))
     if not name:
         raise TacpipeError(f"{path}, {place} has no {plain(key)}. Write the name of its recording, or remove the row.")
     values = {label: value for label, value in row.items() if label != key}
     if texts:
-        values = {label: plain_value(value) for label, value in values.items() if value}
+        values = {label: plain_value(str(value)) for label, value in values.items() if value}
     return LabelRow(place, name, {label: _label_value(path, place, label, value) for label, value in values.items()})
 
 
@@ -194,7 +197,7 @@ def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
     )
 
 
-def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     """Yield the cells of each row of a text table by the names of its header."""
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
@@ -202,7 +205,7 @@ def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         yield f"line {line}", dict(zip(header, cells, strict=True))
 
 
-def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     from tacpipe.io import parquet, regular
 
     with regular.failing(path):
@@ -215,7 +218,7 @@ def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         yield f"row {number}", {name: value for name, value in row.items() if value is not None}
 
 
-def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
     text = read_text(path)
     try:

@@ -125,9 +125,9 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
     return {plain(str(name)): _label_value(value, name, path) for name, value in _flatten(values).items()}
 
 
-def _flatten(values: Mapping[Any, Any], before: str = "") -> dict[str, Any]:
+def _flatten(values: Mapping[Any, Any], before: str = "") -> dict[str, Attribute | datetime.date]:
     """Return nested mappings as one, with dots between the names."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, Attribute | datetime.date] = {}
     for name, value in values.items():
         flat |= _flatten(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
     return flat

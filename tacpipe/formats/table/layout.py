@@ -20,6 +20,7 @@ from tacpipe.formats.table import pattern, stamps
 from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
+from tacpipe.plugins.stage import Values
 from tacpipe.printable import excerpt, plain
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS
 
@@ -248,7 +249,7 @@ def parse_layout(text: str, place: str = "The layout") -> Layout:
     return layout_from_tables(tables, place)
 
 
-def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", container: Format | None = None) -> Layout:
+def layout_from_tables(tables: Values, place: str = "The layout", container: Format | None = None) -> Layout:
     """Return the layout described by parsed TOML tables.
 
     With a ``container`` format, streams default to that format and need no files, time or columns, because the
@@ -273,9 +274,10 @@ def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", con
         tuple(_parse_stream(stream, value, place, container) for stream, value in streams.items()),
         name,
         tuple(_parse_labels(value, f"{place}, [[labels]] {number}") for number, value in enumerate(labels, 1)),
-        _parse_attributes(_expect_table(tables.get("attributes", {}), place, "attributes"), place),
+        _parse_attributes(tables.get("attributes", {}), place),
     )
-    _expect_known_words(layout, _expect_table(tables.get("vocabulary", {}), place, "vocabulary"), place)
+    words = _expect_table(tables.get("vocabulary", {}), place, "vocabulary")
+    _expect_known_words(layout, fields.filled(Vocabulary, words, f"{place}, [vocabulary]", "entry"), place)
     with_files = [value.name for value in layout.streams if value.files]
     if with_files and len(with_files) < len(layout.streams):
         raise UsageError(
@@ -286,9 +288,8 @@ def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", con
     return layout
 
 
-def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], place: str) -> None:
+def _expect_known_words(layout: Layout, local: Vocabulary, place: str) -> None:
     """Raise `UsageError` for a quantity or unit that is neither built in nor declared in the layout."""
-    local: Vocabulary = fields.filled(Vocabulary, vocabulary_table, f"{place}, [vocabulary]", "entry")
     for stream in layout.streams:
         for number, column in enumerate(stream.columns, 1):
             for kind, fault, word in (
@@ -336,7 +337,7 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
         values.setdefault("format", container)
     _expect_required(values, place, container)
     if "time" in values:
-        values["time"] = _parse_time(_expect_table(values["time"], place, "time"), f"{place}, time")
+        values["time"] = _parse_time(values["time"], place)
     columns = values.get("columns", [])
     if not isinstance(columns, list):
         raise UsageError(f"{place}: columns is {excerpt(columns)}; it must be a list of tables.")
@@ -373,7 +374,7 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
         ) from None
 
 
-def _expect_required(values: Mapping[str, Any], place: str, container: Format | None) -> None:
+def _expect_required(values: Values, place: str, container: Format | None) -> None:
     """Raise `UsageError` if a required entry is missing; containers require fewer, because they declare more."""
     if values.get("format") in KINDS:
         if not values.get("source"):
@@ -413,7 +414,7 @@ def camera_format(kind: object, files: object) -> str:
     return str(kind) if kind in CAMERA else ""
 
 
-def _expect_camera(values: Mapping[str, Any], place: str, camera: str) -> None:
+def _expect_camera(values: Values, place: str, camera: str) -> None:
     """Raise `UsageError` for a table entry in a stream of frames, and for images without a time."""
     table_entries = [name for name in ("columns", "recording", "long", "header", "separator") if values.get(name)]
     if table_entries:
@@ -432,8 +433,9 @@ def _expect_camera(values: Mapping[str, Any], place: str, camera: str) -> None:
         raise UsageError(f"{place}: time.column is {excerpt(column)}; a stream of {camera} takes {expected}.")
 
 
-def _parse_time(values: Mapping[str, Any], place: str) -> Time:
-    time: Time = fields.filled(Time, values, place, "entry")
+def _parse_time(table: Any, stream_place: str) -> Time:
+    place = f"{stream_place}, time"
+    time: Time = fields.filled(Time, _expect_table(table, stream_place, "time"), place, "entry")
     if bool(time.column or time.file) == (time.rate_hz is not None):
         raise UsageError(f"{place}: give either the column or the file with the stamps, or rate_hz.")
     if time.format:
@@ -475,7 +477,8 @@ def _parse_labels(value: Any, place: str) -> LabelSource:
     return labels
 
 
-def _parse_attributes(values: Mapping[str, Any], place: str) -> Mapping[str, str | int | float | bool]:
+def _parse_attributes(table: Any, place: str) -> Mapping[str, str | int | float | bool]:
+    values = _expect_table(table, place, "attributes")
     for key, value in values.items():
         if not isinstance(value, str | int | float | bool):
             raise UsageError(
@@ -484,7 +487,7 @@ def _parse_attributes(values: Mapping[str, Any], place: str) -> Mapping[str, str
     return dict(values)
 
 
-def _expect_table(value: Any, place: str, key: str) -> Mapping[str, Any]:
+def _expect_table(value: Any, place: str, key: str) -> Values:
     if not isinstance(value, dict):
         raise UsageError(f"{place}: {key or 'this'} is {excerpt(value)}; it must be a table.")
     return value

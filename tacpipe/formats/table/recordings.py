@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -165,7 +165,7 @@ def _matching_paths(stream: StreamLayout, candidates: list[Path]) -> list[tuple[
     return matches
 
 
-def _refuse_idle(layout: Layout, matched: Mapping[str, object], candidates: list[Path], folder: Path) -> None:
+def _refuse_idle(layout: Layout, matched: Mapping[str, Sized], candidates: list[Path], folder: Path) -> None:
     for stream in layout.streams:
         if not matched[stream.name] and not stream.optional:
             raise UsageError(

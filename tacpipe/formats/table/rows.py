@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypedDict, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -70,13 +70,20 @@ def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) 
     draft.write(len(index).to_bytes(_LENGTH, "little"))
 
 
+class CutIndex(TypedDict):
+    """The index at the end of a `cut`."""
+
+    places: dict[str, list[tuple[int, int]]]  # first byte and bytes of each block by recording
+    schema: str  # base64
+
+
 def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indices]]:
     """Yield the rows of one recording of a `cut`, block by block, and which rows of the file they were."""
     with regular.failing(path), regular.opened(path, follow=False) as file:
         file.seek(-_LENGTH, 2)
         length = int.from_bytes(file.read(_LENGTH), "little")
         file.seek(-_LENGTH - length, 2)
-        index: Mapping[str, Any] = json.loads(file.read(length))
+        index: CutIndex = json.loads(file.read(length))
         for place, size in index["places"].get(recording, ()):
             file.seek(place)
             schema = pa.ipc.read_schema(owned(base64.b64decode(index["schema"])))
