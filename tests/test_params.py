@@ -249,7 +249,7 @@ def test_help_of_a_field_stands_behind_it_or_above_it_and_is_joined_over_kinds()
 
 
 def test_params_that_count_are_those_of_the_kind_and_all_where_it_is_unknown() -> None:
-    stored = {"size": "large", "seed": 1, "cells": 3, "layers": 2, "gone": True}
+    stored: dict[str, Any] = {"size": "large", "seed": 1, "cells": 3, "layers": 2, "gone": True}
     assert params_of.counting(GROW, stored) == {"size": "large", "seed": 1, "layers": 2}
     assert params_of.counting(GROW, {**stored, "size": "vast"}) == {**stored, "size": "vast"}
 

@@ -12,6 +12,7 @@ from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.stage import ParamValue
 from tacpipe.store.location import locate
 
 EMPTY = "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
@@ -28,7 +29,7 @@ def read(content: bytes) -> list[Headline]:
     return [replace(entry, method=method(entry.task, entry.method)) for entry in headline.read(content)]
 
 
-def method(task: object, stored: object) -> str:
+def method(task: object, stored: ParamValue) -> str:
     """Return today's name of a method of a task, an architecture that may have been renamed since it was stored."""
     return str(params_of.with_current_names(f"train.{task}", {"architecture": stored})["architecture"])
 

@@ -17,7 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import Values
+from tacpipe.plugins.stage import StoredParams, Values
 from tacpipe.store.store import Store
 from tacpipe.training.following import Line
 
@@ -73,7 +73,7 @@ class ModelOverview(ModelDescription):
     parameters: int | None
     epochs: int | None
     validation: Values | BestEpoch | None
-    params: Values
+    params: StoredParams
     inputs: dict[str, list[str]]  # paths and digests by name of the argument
     chain: list[str]
 
@@ -88,7 +88,7 @@ class ResultOverview(ModelOrigin):
     fold: int | None
     role: str | None
     trained_on: TrainingCounts
-    params: Values
+    params: StoredParams
     inputs: dict[str, list[str]]  # paths and digests by name of the argument
 
 

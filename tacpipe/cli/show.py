@@ -20,7 +20,7 @@ from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ROLES, Attribute, Values
+from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
@@ -63,7 +63,7 @@ class ShownSplit(DatasetOverview):
     """A split of recordings."""
 
     kind: Literal["split"]
-    params: Values
+    params: StoredParams
     folds: dict[str, dict[str, int]]  # number of recordings by fold and role
 
 

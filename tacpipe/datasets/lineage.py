@@ -15,7 +15,7 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import Attribute, Values
+from tacpipe.plugins.stage import Attribute, StoredParams
 from tacpipe.printable import listed
 from tacpipe.store import records
 from tacpipe.store.location import locate
@@ -42,7 +42,7 @@ class LineageNode(TypedDict):
 
     stage: str
     version: int
-    params: Values
+    params: StoredParams
     digest: str
     manifest: str  # digest
     path: str | None  # present location
@@ -240,7 +240,7 @@ def to_text(tree: LineageNode) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
-def _nested(value: Any) -> Values | None:
+def _nested(value: Any) -> StoredParams | None:
     """Return a param with parts, such as a layout, which is stored as JSON, or None for a plain value."""
     if isinstance(value, str) and value.startswith("{"):
         try:
@@ -250,12 +250,12 @@ def _nested(value: Any) -> Values | None:
     return value if isinstance(value, Mapping) else None
 
 
-def _rows(value: Any) -> list[Values]:
+def _rows(value: Any) -> list[StoredParams]:
     """Return the rows of a list of mappings, or an empty list for other values."""
     return value if isinstance(value, list) and all(isinstance(row, Mapping) for row in value) else []
 
 
-def _leaves(params: Values) -> Values:
+def _leaves(params: StoredParams) -> StoredParams:
     """Return plain values by dotted name.
 
     >>> _leaves({"gap_ms": 50, "layout": '{"time": {"unit": "ns"}, "columns": [{"match": "x"}]}'})
@@ -268,7 +268,7 @@ def _leaves(params: Values) -> Values:
     return leaves
 
 
-def _nested_lines(name: str, tree: Values) -> list[str]:
+def _nested_lines(name: str, tree: StoredParams) -> list[str]:
     """Return the lines of a param with parts: plain values on one line, lists of columns as a table.
 
     >>> _nested_lines("layout", {"unit": "ns", "columns": [{"match": "x", "unit": "N"}, {"match": "dx"}]})

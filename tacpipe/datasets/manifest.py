@@ -18,7 +18,7 @@ from tacpipe.io import files as files_of
 from tacpipe.io import regular
 from tacpipe.io.files import unread
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
-from tacpipe.plugins.stage import Attribute, Values
+from tacpipe.plugins.stage import Attribute, StoredParams
 from tacpipe.printable import excerpt, plain
 from tacpipe.store.records import Content, RecordingEntry, Step
 from tacpipe.store.store import Object, Store
@@ -48,7 +48,7 @@ class ManifestJson(TypedDict):
     digest: str
     stage: str
     version: int
-    params: Values
+    params: StoredParams
     inputs: dict[str, list[InputDataset]]
     chain: list[Step]
     recordings: NotRequired[dict[str, RecordingEntry]]
@@ -65,7 +65,7 @@ class Manifest:
 
     stage: str
     version: int
-    params: Values = field(default_factory=dict)
+    params: StoredParams = field(default_factory=dict)
     inputs: Mapping[str, Sequence[InputDataset]] = field(default_factory=dict)  # by name of the argument
     chain: Sequence[Step] = ()
     recordings: Mapping[str, RecordingEntry] = field(default_factory=dict)
@@ -279,7 +279,7 @@ def _same_pages(view: Mapping[str, Mapping[str, Attribute]], pages: Pages, count
     return getattr(view, "pages", None) is pages or (not view and not pages.total(count))
 
 
-def _indented(value: Values) -> str:
+def _indented(value: StoredParams) -> str:
     return json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 

@@ -25,7 +25,7 @@ from tacpipe.datasets.paths import folded_name
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import files, regular
 from tacpipe.io.hashing import digest
-from tacpipe.plugins.stage import Attribute, Values
+from tacpipe.plugins.stage import Attribute, StoredParams
 from tacpipe.printable import listed, plain
 from tacpipe.store import layout
 from tacpipe.store.store import Store
@@ -52,7 +52,7 @@ class ResultPlan:
 
     stage: str
     version: int
-    params: Values = field(default_factory=dict)
+    params: StoredParams = field(default_factory=dict)
     sources: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # digests of raw files by recording
 
 
@@ -330,5 +330,5 @@ def _described(manifest: Manifest) -> str:
     return f"{recordings} written by {manifest.stage}{labels}"
 
 
-def _params(params: Values) -> str:
+def _params(params: StoredParams) -> str:
     return ", ".join(f"{name} {value}" for name, value in params.items()) or "no params"

@@ -12,7 +12,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import ALL, AnyStage, Source, Values
+from tacpipe.plugins.stage import ALL, AnyStage, Source, StoredParams, Values
 from tacpipe.store.records import ComputedResult, Content, GroupIdentity, RecordingEntry, StageIdentity, Step
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
@@ -56,7 +56,7 @@ class DatasetLineage(TypedDict):
 
     stage: str
     version: int
-    params: Values
+    params: StoredParams
     chain: Sequence[Step]
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tacpipe.errors import StorageError
 from tacpipe.exports.contents import Contents, stream_label
-from tacpipe.plugins.stage import Values
+from tacpipe.plugins.stage import StoredParams
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def _affected_recordings(names: Sequence[str], recordings: Dataset) -> str:
     return "" if is_everywhere else f" ({len(names)} of {len(recordings)} recordings: {listed(names, _SHOWN)})"
 
 
-def _params(params: Values) -> str:
+def _params(params: StoredParams) -> str:
     return _cell(", ".join(f"{name} {json.dumps(value)}" for name, value in params.items() if value not in ("", None)))
 
 

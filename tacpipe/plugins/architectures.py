@@ -29,7 +29,7 @@ from typing import Any
 from tacpipe.errors import ResultWarning, TacpipeError
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import Values
+from tacpipe.plugins.stage import StoredParams
 from tacpipe.printable import excerpt, plain
 
 PLUGIN = "plugin"  # key of a package's name and version in the stored params of its architecture
@@ -115,7 +115,7 @@ def plugin(kind: Kind) -> str | None:
     return None
 
 
-def check_installed(base: Any, values: Values, kind: Kind | None) -> None:
+def check_installed(base: Any, values: StoredParams, kind: Kind | None) -> None:
     """Raise `TacpipeError` if stored params belong to an architecture that is not installed or cannot be loaded.
 
     ``kind`` is the class that they name, if it exists.
@@ -129,7 +129,7 @@ def check_installed(base: Any, values: Values, kind: Kind | None) -> None:
             )
 
 
-def warn_of_version(values: Values, kind: Kind) -> None:
+def warn_of_version(values: StoredParams, kind: Kind) -> None:
     """Warn if a model was trained with another version of its architecture's package than the installed one."""
     before, now = values.get(PLUGIN), plugin(kind)
     if before != now:
@@ -140,7 +140,7 @@ def warn_of_version(values: Values, kind: Kind) -> None:
         warnings.warn(sentence, ResultWarning, stacklevel=2)
 
 
-def check_version(values: Values, kind: Kind) -> None:
+def check_version(values: StoredParams, kind: Kind) -> None:
     """Raise `TacpipeError` if stored params were computed with another version of the package than the installed one."""
     before, now = values.get(PLUGIN), plugin(kind)
     if before != now:

@@ -25,7 +25,7 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.constraints import StoredAs
 from tacpipe.plugins.fields import choices as choices
 from tacpipe.plugins.fields import filled as filled
-from tacpipe.plugins.stage import AnyStage, Presets, Values
+from tacpipe.plugins.stage import AnyStage, Presets, StoredParams
 from tacpipe.printable import excerpt
 
 Kind = type[Any]  # a dataclass of params
@@ -131,13 +131,13 @@ def to_json(params: Any) -> dict[str, Any]:
     return stored if package is None else {**stored, architectures.PLUGIN: package}
 
 
-def to_input(params: Any) -> Values:
+def to_input(params: Any) -> StoredParams:
     """Return the params with the names and choices used by options, ``params.yaml`` and ``--set``."""
     values = dataclasses.asdict(params)
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
-def from_json(stage: AnyStage, values: Values) -> Any:
+def from_json(stage: AnyStage, values: StoredParams) -> Any:
     """Return the params from the result of `to_json`, of this or an older version, without checking values.
 
     Fields of other kinds are ignored, and removed fields are ignored if the stage reads whole datasets. Raises
@@ -155,15 +155,15 @@ def from_json(stage: AnyStage, values: Values) -> Any:
             f"What is stored was computed by another version of {stage.function.__name__}, with the param {removed[0]}, "
             f"which this version does not have. Run the stage again, or use that version."
         )
-    return kind(**{k: tuple(v) if _is_tuple(annotations[k]) else v for k, v in current.items() if k in annotations})
+    return kind(**{name: _as_field(v, annotations[name]) for name, v in current.items() if name in annotations})
 
 
-def _is_tuple(annotation: fields_of.Annotation) -> bool:
+def _as_field(value: Any, annotation: fields_of.Annotation) -> Any:
     origin: Any = get_origin(annotation)
-    return origin is tuple
+    return tuple(value) if origin is tuple else value
 
 
-def counting(stage: AnyStage, values: Values) -> Values:
+def counting(stage: AnyStage, values: StoredParams) -> StoredParams:
     """Return the stored params that the chosen kind has, with current names; older versions stored those of all kinds.
 
     Returns all of them if the tag names no kind, such as an architecture that is not installed.
@@ -172,12 +172,12 @@ def counting(stage: AnyStage, values: Values) -> Values:
     return {name: value for name, value in current.items() if kind is None or name in fields_of.hints(kind)}
 
 
-def kind_of(stage: AnyStage, values: Values) -> Kind | None:
+def kind_of(stage: AnyStage, values: StoredParams) -> Kind | None:
     """Return the kind of stored params, or None if the tag names no kind, such as an architecture that is not installed."""
     return _current(kinds(stage), values)[0]
 
 
-def with_current_names(stage: str, values: Values) -> Values:
+def with_current_names(stage: str, values: StoredParams) -> StoredParams:
     """Return stored params with current names and choices, or unchanged if ``stage`` is not installed."""
     from tacpipe.plugins import registry
 
@@ -188,7 +188,7 @@ def with_current_names(stage: str, values: Values) -> Values:
     return _current(alternatives, values)[1]
 
 
-def read(union: Any, values: Values, place: str) -> Any:
+def read(union: Any, values: StoredParams, place: str) -> Any:
     """Return the params in a model's configuration, as a dataclass or one of a ``union``.
 
     The configuration may be of an older version: missing fields get their default, removed fields are ignored, and only
@@ -235,7 +235,7 @@ def _stored_name(kind: Kind, name: str) -> str:
     return _stored_as(kind, name).name
 
 
-def _stored(kind: Kind, values: Values) -> dict[str, Any]:
+def _stored(kind: Kind, values: StoredParams) -> dict[str, Any]:
     """Return params of ``kind`` with their stored names and choices."""
     stored = {}
     for name, value in values.items():
@@ -244,7 +244,7 @@ def _stored(kind: Kind, values: Values) -> dict[str, Any]:
     return stored
 
 
-def _current(alternatives: Sequence[Kind], values: Values) -> tuple[Kind | None, Values]:
+def _current(alternatives: Sequence[Kind], values: StoredParams) -> tuple[Kind | None, StoredParams]:
     """Return the kind of stored params, or None if there is no such kind, and the params with current names and choices.
 
     Names that the kind does not have are unchanged.
@@ -272,7 +272,7 @@ def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]
     return current
 
 
-def _tagged(kind: Kind, name: str, values: Values) -> bool:
+def _tagged(kind: Kind, name: str, values: StoredParams) -> bool:
     """Return whether stored params have a choice of the tag ``name`` that belongs to ``kind``."""
     mark = _stored_as(kind, name)
     stored = values.get(mark.name)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class ReportResult(Generic[Config]):
     @cached_property
     def params(self) -> Settings:
         """The training params that the model's architecture uses."""
-        return params_of.counting(registry.load(self.STAGE), self.given)
+        return cast("Settings", params_of.counting(registry.load(self.STAGE), self.given))
 
     @property
     def given(self) -> Settings:
@@ -75,7 +75,7 @@ class ReportResult(Generic[Config]):
 
         Otherwise "".
         """
-        tagged = {"architecture": self.config.get("architecture"), **self.given}
+        tagged = {"architecture": str(self.config.get("architecture")), **self.given}
         presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged))
         epochs, printed = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
         fewer = isinstance(epochs, int) and isinstance(printed, int) and 0 < epochs < printed

@@ -14,7 +14,7 @@ from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 
 if TYPE_CHECKING:
-    from tacpipe.plugins.stage import Attribute, Values
+    from tacpipe.plugins.stage import Attribute, StoredParams, Values
     from tacpipe.store.store import Store
 
 _RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest>[0-9a-f]{64})","identity":')
@@ -56,7 +56,7 @@ class Step(TypedDict):
 
     stage: str
     version: int
-    params: Values
+    params: StoredParams
     fitted: Mapping[str, str] | None  # digests of the files that the stage was fitted to
 
 
@@ -66,7 +66,7 @@ class StageIdentity(TypedDict):
 
     stage: str
     version: int
-    params: Values
+    params: StoredParams
     inputs: Values  # by name of the argument; its kind in `tacpipe.plugins.stage` decides the form
 
 
@@ -76,7 +76,7 @@ class RunIdentity(TypedDict):
 
     run: str  # name of the stage
     version: Sequence[int | None]  # of the stage and of its fit
-    params: Values
+    params: StoredParams
     datasets: Sequence[str]  # digests of manifests
     named: Mapping[str, str]  # digests of the manifests of models and splits, by name of the option
     sources: Mapping[str, Mapping[str, str]]  # digests of raw files by recording

@@ -15,6 +15,7 @@ from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
+from tacpipe.plugins.stage import ParamValue
 from tacpipe.printable import plain
 from tacpipe.signals import contact
 from tacpipe.traces import curves, spans, taxels
@@ -194,6 +195,10 @@ def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: Se
     return replace(contents, gaps=gaps)
 
 
+def _level(param: ParamValue) -> float:
+    return param if isinstance(param, int | float) else np.inf
+
+
 def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnContents:
     """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
     params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
@@ -208,8 +213,9 @@ def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnCont
         on, off = contents.attributes.get(f"{name}_on"), contents.attributes.get(f"{name}_off")
         if on is None or off is None:  # the stream has fixed thresholds in counts, or never leaves its level at rest
             fixed = params[-1] if fingers[0].unit == COUNT else {}
-            on, off = fixed.get("on_count", np.inf), fixed.get("off_count", np.inf)
-        limits.append((float(on), float(off)))
+            limits.append((_level(fixed.get("on_count")), _level(fixed.get("off_count"))))
+        else:
+            limits.append((float(on), float(off)))
     touching = contact.touching(np.array(loads), *np.array(limits).T)
     return replace(contents, spans=spans.split_padding(contents.spans, contents.taxels[0].t_ns, touching))
 

@@ -108,7 +108,8 @@ def _counted_slides(table: pa.Table, config: MaterialConfig, naming: Naming) -> 
     for sensor, held_out in config.get("held_out", {}).items():
         counted &= ~((sensors == sensor) & np.isin(materials, held_out))
     if settings.get("drop_last"):
-        batch = int(settings["batch"])
+        batch = settings["batch"]
+        assert isinstance(batch, int)
         for sensor in np.unique(sensors):
             rows = np.flatnonzero(sensors == sensor)
             counted[rows[len(rows) // batch * batch :]] = False
