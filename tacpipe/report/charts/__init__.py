@@ -4,7 +4,8 @@ A specification has no width, because the page draws it as wide as its column. P
 cursor, the legend shows and hides lines, and axes zoom with Shift and the wheel, or by dragging.
 """
 
-from tacpipe.report.charts.curves import POINTS, Curve, DataRow, Spec, bars, decimated, lines
+from tacpipe.report.blocks import DataRow, Spec
+from tacpipe.report.charts.curves import POINTS, Curve, bars, decimated, lines
 from tacpipe.report.charts.points import Dot, grid, joined, marked, matrix, plane, ranking, scatter
 
 __all__ = [

@@ -5,159 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.report.blocks import (
+    ChartAxis,
+    ChartChannel,
+    ChartEncoding,
+    ChartLegend,
+    ChartMark,
+    ChartParam,
+    ChartScale,
+    DataRow,
+    Spec,
+)
 
-DataRow = dict[str, str | float | None]  # a row of chart data, by field
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
 DIGITS = 5  # digits per number, as many as are visible
 FEW_STEPS = 12  # maximum number of integers on an axis that each have a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that no point is clipped
-
-
-class ChartScale(TypedDict, total=False):
-    """How values of a field map to positions or colours."""
-
-    type: str
-    zero: bool
-    nice: bool
-    padding: float
-    domain: Sequence[str | float | None]
-    range: Sequence[str] | Sequence[Sequence[int]]
-
-
-class ChartAxis(TypedDict, total=False):
-    """The ticks and labels of an axis, or the labels of panels."""
-
-    tickMinStep: float
-    values: Sequence[float]
-    format: str
-    ticks: bool
-    domain: bool
-    labelExpr: str
-    labelOverlap: bool
-    labelAngle: float
-    labelLimit: float
-    labelPadding: float
-    labelFontSize: float
-    labelFontWeight: int
-    labelOrient: str
-    labelAnchor: str
-
-
-class ChartLegend(TypedDict, total=False):
-    """The position and the symbols of a legend."""
-
-    title: str | None
-    orient: str
-    direction: str
-    columns: int
-    labelLimit: float
-    symbolStrokeWidth: float
-    symbolOpacity: float
-
-
-class Condition(TypedDict):
-    """A value that depends on the reader's selection."""
-
-    param: str
-    value: float
-    empty: bool  # whether everything counts as selected while nothing is
-
-
-class SortField(TypedDict):
-    """The field to sort by."""
-
-    field: str
-
-
-class ChartChannel(TypedDict, total=False):
-    """A field or a value that is mapped to a position, a colour or another property of a mark."""
-
-    field: str
-    type: str
-    title: str | None
-    sort: SortField | Sequence[str] | None
-    scale: ChartScale | None
-    axis: ChartAxis | None
-    header: ChartAxis
-    legend: ChartLegend | None
-    condition: Condition
-    value: float
-
-
-class ChartEncoding(TypedDict, total=False):
-    """The channels of a layer."""
-
-    x: ChartChannel
-    x2: ChartChannel
-    y: ChartChannel
-    y2: ChartChannel
-    color: ChartChannel
-    opacity: ChartChannel
-    shape: ChartChannel
-    strokeDash: ChartChannel
-    detail: ChartChannel
-    text: ChartChannel
-    row: ChartChannel
-    tooltip: Sequence[ChartChannel]
-
-
-class ChartMark(TypedDict, total=False):
-    """The shape and appearance of a row of data."""
-
-    type: str
-    clip: bool
-    filled: bool
-    size: float
-    shape: str | dict[str, str]
-    opacity: float
-    fill: str
-    stroke: str | None
-    strokeWidth: float
-    strokeDash: Sequence[int]
-    fontSize: float
-    fontWeight: int
-    tooltip: str | None
-
-
-class ChartSelection(TypedDict, total=False):
-    """A selection that a reader makes with the pointer."""
-
-    type: str
-    fields: Sequence[str]
-    zoom: str
-
-
-class ChartParam(TypedDict, total=False):
-    """A named selection."""
-
-    name: str
-    select: ChartSelection
-    bind: str
-
-
-class Spec(TypedDict, total=False):
-    """The Vega-Lite specification of a chart or of a layer, restricted to the parts that are used here."""
-
-    data: dict[str, list[DataRow]]
-    transform: Sequence[dict[str, str]]
-    params: Sequence[ChartParam]
-    mark: ChartMark
-    encoding: ChartEncoding
-    layer: list[Spec]
-    height: int | dict[str, int]
-    view: dict[str, str | None]
-    facet: ChartChannel | ChartEncoding
-    columns: int
-    spec: Spec
-    resolve: dict[str, dict[str, str]]
-    spacing: int
-    usermeta: dict[str, float | None]  # hints for the page's script
 
 
 def colour_of(number: int, count: int) -> str:

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Ints
-from tacpipe.report.charts.curves import (
-    BETTER,
-    INK,
-    MARGIN,
-    QUIET,
-    WORSE,
+from tacpipe.report.blocks import (
     ChartAxis,
     ChartChannel,
     ChartEncoding,
@@ -25,6 +20,13 @@ from tacpipe.report.charts.curves import (
     ChartScale,
     DataRow,
     Spec,
+)
+from tacpipe.report.charts.curves import (
+    BETTER,
+    INK,
+    MARGIN,
+    QUIET,
+    WORSE,
     colour_of,
     diagonal_of,
     legend_of,
