@@ -7,12 +7,12 @@ stay. Channels are those whose field metadata states ``quantity=tactile``; their
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, StoredAs
+from tacpipe.plugins.params import Panels
 from tacpipe.plugins.stage import Presets, stage
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Fitted, Result, Workspace
 
 Representation = Annotated[Literal["levels", "increments"], StoredAs("of")]
-Panels = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)

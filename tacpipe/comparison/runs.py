@@ -232,6 +232,7 @@ class TaskReport:
     """
 
     title: str = ""  # predicted quantity in a few words; empty for the name of the task
+    predictor_names: Mapping[str, str] = {}  # names in tables; others are written with spaces
     usual: Sequence[str | tuple[str, Any]] = ()  # settings, or settings with values, that are omitted from names
 
     def __init__(self, name: str) -> None:
@@ -249,7 +250,7 @@ class TaskReport:
 
     def predictor_name(self, predictor: str) -> str:
         """Return the name of a predictor in tables."""
-        return predictor.replace("_", " ")
+        return self.predictor_names.get(predictor, predictor.replace("_", " "))
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether the page can use a dataset that is not a result."""

@@ -182,6 +182,7 @@ NonNegativeInt = Annotated[int, Range(0)]
 PositiveFloat = Annotated[float, Range(above=0)]
 NonNegativeFloat = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
+Dropout = Annotated[float, Range(0, below=1)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]  # the range that numpy, torch and scikit-learn accept
 Rate = Annotated[float, Range(above=0, maximum=1_000_000_000), Unit("Hz")]  # timestamps are integer nanoseconds
 Names = Annotated[str, CommaList()]

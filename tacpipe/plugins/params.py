@@ -29,6 +29,7 @@ from tacpipe.plugins.stage import AnyStage, Presets, StoredParams
 from tacpipe.printable import excerpt
 
 Kind = type[Any]  # a dataclass of params
+Panels = Mapping[str, Sequence[str]]  # names of params by the panel of help that shows them
 
 
 def kinds(stage: AnyStage) -> tuple[Kind, ...]:

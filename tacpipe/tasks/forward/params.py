@@ -9,13 +9,12 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, ClassVar, Literal, NotRequired, TypedDict, cast
 
 from tacpipe.channels import arm
-from tacpipe.io import Scalar
-from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
-from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import Channels, Label, Requirements
+from tacpipe.plugins.constraints import Dropout, PositiveFloat, PositiveInt, Seed
+from tacpipe.plugins.params import Panels, added
+from tacpipe.plugins.stage import Channels, Label, Presets, Requirements
 from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
@@ -23,10 +22,6 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tacpipe.models.windows import ForecastShape
-
-Presets = Mapping[str, Mapping[str, Scalar]]
-Panels = Mapping[str, Sequence[str]]
-Dropout = Annotated[float, Range(0, below=1)]
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from tacpipe.plugins import architectures, fields
 from tacpipe.plugins.constraints import (
     Assignments,
     CommaList,
+    Dropout,
     Names,
     NonNegativeFloat,
     NonNegativeInt,
@@ -26,7 +27,8 @@ from tacpipe.plugins.constraints import (
     Seed,
     StoredAs,
 )
-from tacpipe.plugins.params import added
+from tacpipe.plugins.params import Panels, added
+from tacpipe.plugins.stage import Presets
 from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
@@ -43,9 +45,6 @@ if TYPE_CHECKING:
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of every architecture
 LEVEL_VIEWS: Mapping[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # baselines of statistics
 KEY = "material"  # the label that names classes, unless params name another
-Presets = Mapping[str, Mapping[str, Scalar]]
-Panels = Mapping[str, Sequence[str]]
-Dropout = Annotated[float, Range(0, below=1)]
 # the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
 _PAPER_TEXT: Mapping[str, Scalar] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
 _ALIGNED_RECONSTRUCTION = 0.05  # weight in networks that are aligned to a frozen one: that of the published script

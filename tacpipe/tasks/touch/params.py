@@ -6,13 +6,12 @@ Classes of other packages extend `Patches` or `Pointnet`, which choose what is r
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict
 
-from tacpipe.io import Scalar
 from tacpipe.plugins.constraints import (
     CommaList,
+    Dropout,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -22,7 +21,8 @@ from tacpipe.plugins.constraints import (
     StoredAs,
     Unit,
 )
-from tacpipe.plugins.params import added
+from tacpipe.plugins.params import Panels, added
+from tacpipe.plugins.stage import Presets
 from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from tacpipe.tasks.touch.inputs import CloudInputs, PatchOptions
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
-Presets = Mapping[str, Mapping[str, Scalar]]
-Panels = Mapping[str, Sequence[str]]
-Dropout = Annotated[float, Range(0, below=1)]
 Draws = Annotated[int, Range(1, 100_000)]
 Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], min_items=1)]
 

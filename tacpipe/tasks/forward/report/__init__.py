@@ -37,12 +37,26 @@ class ForwardReport(TaskReport):
         return methods.read_runs(results)
 
     def kind(self, predictor: str) -> Kind:
-        """Return what a predictor is."""
-        return methods.kind_of_predictor(predictor)
+        """Return what a predictor is.
+
+        >>> report = ForwardReport("forward")
+        >>> [report.kind(name) for name in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
+        ['model', 'variant', 'baseline', 'oracle', 'control']
+        """
+        if predictor.startswith("model"):
+            return "model" if predictor == "model" else "variant"
+        if predictor.split(" ")[0] in methods.ORACLES:
+            return "oracle"
+        return "control" if predictor.startswith("codec") else "baseline"
 
     def predictor_name(self, predictor: str) -> str:
-        """Return the name of a predictor in tables."""
-        return methods.predictor_name(predictor)
+        """Return the name of a predictor in tables.
+
+        >>> report = ForwardReport("forward")
+        >>> report.predictor_name("model_anchored"), report.predictor_name("codec_persistence PCA-20")
+        ('anchored', 'codec persistence PCA-20')
+        """
+        return super().predictor_name(predictor.removeprefix("model_"))
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset is of ``tacpipe compress``, whose losses are drawn next to the errors of forecasts."""

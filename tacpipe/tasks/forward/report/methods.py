@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.comparison.runs import ComparedRun, Kind, PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question, Settings
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
 from tacpipe.report.context import drop_duplicates
@@ -249,28 +249,6 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     steps = shown_steps(runs)
     usual = main_timeline(runs)
     return [_run(result, steps, usual) for result in runs]
-
-
-def kind_of_predictor(predictor: str) -> Kind:
-    """Return what a predictor is.
-
-    >>> [kind_of_predictor(one) for one in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
-    ['model', 'variant', 'baseline', 'oracle', 'control']
-    """
-    if predictor.startswith("model"):
-        return "model" if predictor == "model" else "variant"
-    return (
-        "oracle" if predictor.split(" ")[0] in ORACLES else "control" if predictor.startswith("codec") else "baseline"
-    )
-
-
-def predictor_name(predictor: str) -> str:
-    """Return what tables call a predictor: its name in ``metrics.json`` with spaces.
-
-    >>> predictor_name("model_anchored"), predictor_name("codec_persistence PCA-20")
-    ('anchored', 'codec persistence PCA-20')
-    """
-    return predictor.removeprefix("model_").replace("_", " ")
 
 
 def name_with_codec(predictor: str, codec: str) -> str:

@@ -24,6 +24,7 @@ class MaterialReport(TaskReport):
 
     title = "recognition of materials by touch"
     usual = methods.USUAL
+    predictor_names = methods.PREDICTOR_NAMES
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that hold predictions of slides which the model has not seen."""
@@ -31,11 +32,7 @@ class MaterialReport(TaskReport):
 
     def kind(self, predictor: str) -> Kind:
         """Return what a predictor is."""
-        return methods.kind_of_predictor(predictor)
-
-    def predictor_name(self, predictor: str) -> str:
-        """Return the name of a predictor in tables."""
-        return methods.predictor_name(predictor)
+        return methods.KINDS.get(predictor, "variant")
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset holds slides, which are drawn."""

@@ -290,16 +290,6 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     return [_run(*pair) for pair in zip(with_sensors, settings(with_sensors), strict=True)]
 
 
-def kind_of_predictor(predictor: str) -> Kind:
-    """Return what a predictor is."""
-    return KINDS.get(predictor, "variant")
-
-
-def predictor_name(predictor: str) -> str:
-    """Return what tables call a predictor."""
-    return PREDICTOR_NAMES.get(predictor, predictor.replace("_", " "))
-
-
 def question_on(run: ComparedRun, sensor: str) -> Question | None:
     """Return the question that a run answers on slides of a sensor."""
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)

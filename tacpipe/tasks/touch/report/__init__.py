@@ -34,14 +34,11 @@ class TouchReport(TaskReport):
 
     title = "prediction of fingertip readings from point clouds"
     usual = methods.USUAL
+    predictor_names = headlines.BASELINES
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return the runs of results that hold predictions of grasps which the model has not seen."""
         return methods.read_runs(results)
-
-    def predictor_name(self, predictor: str) -> str:
-        """Return the name of a predictor in tables."""
-        return methods.predictor_name(predictor)
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset holds grasps, which are drawn."""

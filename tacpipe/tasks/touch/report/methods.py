@@ -291,15 +291,6 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
     return [_run(*pair, splits) for pair in zip(with_unseen_grasps, method_names(with_unseen_grasps), strict=True)]
 
 
-def predictor_name(predictor: str) -> str:
-    """Return what tables call a predictor.
-
-    >>> predictor_name("object_mean"), predictor_name("nearest_neighbours")
-    ('mean of the object', 'nearest neighbours')
-    """
-    return headline.BASELINES.get(predictor, predictor.replace("_", " "))
-
-
 def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
     questions = {}
     for known_objects in (True, False):
