@@ -50,6 +50,8 @@ def test_what_people_type_is_understood_and_not_listed(lab: Lab, alias: str, com
         ("label data/r nobody --set a=1", 2, "no recording nobody"),
         ("label data/r trial-000", 2, "Nothing to change"),
         ("label data/s trial-000 --set a=1", 2, "next run would undo"),
+        ("evaluate data/s data/r -o x", 2, "data/s is not a model: scale made it. Give what `tacpipe train`"),
+        ("predict data/r data/s -o x", 2, "data/r is not a model: simulate.toy made it. Give what `tacpipe train`"),
         ("explain nowhere", 2, "nowhere"),
         ("store pull nowhere data/r", 2, "is not a store"),
     ],

@@ -310,8 +310,8 @@ class _RequestRun:
     def _whole_input(self, name: str, kind: str) -> Any:
         inputs, reads = self.inputs, self.stage.reads
         if kind == "Model" and name == "init":
-            init = inputs.named_datasets.get("init")
-            return keys.of_dataset(init.manifest, None, {}) if init else None
+            init = inputs.initial_model
+            return keys.of_dataset(init, None, {}) if init else None
         if kind == "Model":
             return keys.of_dataset(inputs.model, None, {})
         if kind == "Datasets":

@@ -35,6 +35,7 @@ OPTIONS = {
 
 
 DATASETS = ("model", "split", "codec", "extend", "init")  # options that name a dataset
+_MODEL, _RESULT = "config.json", "metrics.json"  # Files of a model; an evaluation has both
 PATHS = (*DATASETS, "source")
 
 
@@ -167,10 +168,15 @@ class RequestInputs:
 
     @property
     def model(self) -> Manifest:
-        """The manifest of the input model."""
+        """The manifest of the input model. Raises `UsageError` where the dataset holds no model."""
         if "model" not in self.named_datasets:
             raise UsageError(f"{self.request.name} needs a model to read.")
-        return self.named_datasets["model"].manifest
+        return _model_manifest(self.named_datasets["model"])
+
+    @property
+    def initial_model(self) -> Manifest | None:
+        """The manifest of the model to begin with, if any. Raises `UsageError` where the dataset holds no model."""
+        return _model_manifest(self.named_datasets["init"]) if "init" in self.named_datasets else None
 
     @cached_property
     def roles(self) -> dict[str, str]:
@@ -199,6 +205,17 @@ class RequestInputs:
                 f"Split this dataset, or give the split that was made for it."
             )
         return chosen
+
+
+def _model_manifest(dataset: Found) -> Manifest:
+    """Return the manifest of a model. Raises `UsageError` where the dataset holds none."""
+    manifest = dataset.manifest
+    if _MODEL not in manifest.files or _RESULT in manifest.files:
+        raise UsageError(
+            f"{dataset.directory} is not a model: {manifest.stage} made it. Give what `tacpipe train` or `tacpipe calibrate` "
+            f"wrote with -o."
+        )
+    return manifest
 
 
 def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:

@@ -9,7 +9,9 @@ import pytest
 
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
 from tacpipe.plugins import registry
+from tests.conftest import Lab
 from tests.fake_recordings import dataset
 from tests.stage_params import build_params
 from tests.stages.learning_fakes import motion
@@ -40,6 +42,26 @@ def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
     tuned = STAGE(params, training, watched, tmp_path / "b", init).files
     first, second = (json.loads(files["history.jsonl"])["val_loss"] for files in (init.files, tuned))
     assert second < first
+
+
+def test_a_dataset_without_a_model_is_no_model_to_begin_with(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("split data/r -o data/split --scheme random --val 0.25 --test 0.25")
+    failed = lab.call("train forward data/r --split data/split --init data/r -o models/m")
+    assert failed.code == 2
+    assert "data/r is not a model: simulate.toy made it." in failed.err
+
+
+def test_a_training_states_its_step_unless_quiet_was_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = dataset(motion(0))
+    params = build_params("train.forward", **{**SMALL, "epochs": 1})
+    for visible, sentence in ((True, "tacpipe: a step is 20 ms\n"), (False, "")):
+        with terminal.showing_progress(visible):
+            result = STAGE(params, training, training, tmp_path / str(visible))
+        assert capsys.readouterr().err == sentence
+        assert result.notes == []
 
 
 def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ class Rows:
     def recording_of(self, starts: Tensor) -> Tensor:
         """Return the number of the recording (window,) of the windows that begin at ``starts`` (window,)."""
         ends = torch.from_numpy(np.cumsum([len(track.t_ns) for track in self.tracks]))
-        return torch.searchsorted(ends, starts.cpu(), right=True)
+        return torch.searchsorted(ends, starts.cpu().contiguous(), right=True)
 
     def tactile(self, rows: Int64s) -> AnyFloats:
         """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""

@@ -22,6 +22,7 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
 from tacpipe.io.spill import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.forecasts import Shrunk, persistence_weights
@@ -101,6 +102,8 @@ def train(
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([track for part in parts for track in part])
+    if rate_hz:
+        terminal.report_progress(f"a step is {1e3 / rate_hz:.4g} ms")
     reference = start.orientation if start else _reference(track.arm[track.usable, 3:7] for track in parts[0])
     parts = [[_aligned(track, reference, mapped) for track in part] for part in parts]
     device = devices.kind()
@@ -373,10 +376,9 @@ def _take_over(model: nn.Module, start: Forecaster) -> None:
 
 
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
-    """Return notes on a trained model, from its ``files``: step, look-ahead, and an architecture that is not the best."""
+    """Return notes on a trained model, from its ``files``: look-ahead, and an architecture that is not the best."""
     config = json.loads(files[CONFIG])
-    rows = [f"A step is {1e3 / config['rate_hz']:.4g} ms."] if config["rate_hz"] else []
-    rows += look_ahead_notes(config)
+    rows = look_ahead_notes(config)
     raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
     if params.architecture == forecasts.AUTO and raw and config["architecture"] != forecasts.TAXELWISE:
         stated = sum("taxel" in channel for channel in channels)
