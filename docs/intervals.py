@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
@@ -188,18 +188,27 @@ def called_better(methods: int, recordings: int, repeats: int = REPEATS) -> tupl
     return float(alone), float(chosen)
 
 
-def rates(materials: int, slides: int = 16, repeats: int = REPEATS) -> tuple[float, float]:
-    """Return how often intervals over slides (Wilson) and over materials hold the rate of new materials, which differ."""
+class HeldRates(NamedTuple):
+    """How often intervals of a rate hold the truth; NaN where the program gives no interval."""
+
+    same_materials: float  # Wilson over slides, of the rate on new slides of the same materials
+    over_slides: float  # Wilson over slides, of the rate on new materials
+    over_materials: float  # the interval over materials, of the rate on new materials
+
+
+def rates(materials: int, slides: int = 16, repeats: int = REPEATS) -> HeldRates:
+    """Return how often intervals over slides (Wilson) and over materials hold the rate where materials differ."""
     rng, truth = np.random.default_rng(materials), 0.2
-    holds = np.zeros((repeats, 2), bool)
+    holds = np.zeros((repeats, 3), bool)
     whole = np.full((materials, 1), float(slides))
     for repeat in range(repeats):
-        accepted = rng.binomial(slides, rng.beta(1.0, 4.0, materials))
+        of_material = rng.beta(1.0, 4.0, materials)
+        accepted = rng.binomial(slides, of_material)
         low, high = wilson(int(accepted.sum()), materials * slides)
         found = intervals.share_interval(accepted[:, None].astype(float), whole).first
-        holds[repeat] = low <= truth <= high, found.low <= truth <= found.high
-    over_slides, over_materials = holds.mean(axis=0)
-    return float(over_slides), float(over_materials) if materials >= MIN_CLUSTERS else float("nan")
+        holds[repeat] = low <= of_material.mean() <= high, low <= truth <= high, found.low <= truth <= found.high
+    same, over_slides, over_materials = (float(share) for share in holds.mean(axis=0))
+    return HeldRates(same, over_slides, over_materials if materials >= MIN_CLUSTERS else float("nan"))
 
 
 def lines(repeats: int = REPEATS) -> Iterator[str]:
@@ -222,11 +231,12 @@ def lines(repeats: int = REPEATS) -> Iterator[str]:
         alone, chosen = called_better(methods, 20, repeats)
         yield f"| {methods} | 20 | {100 * alone:.1f} % | {100 * chosen:.1f} % |"
     yield ""
-    yield "| materials, 16 slides each | coverage of Wilson over slides | over materials |"
-    yield "| --- | --- | --- |"
+    yield "| materials, 16 slides each | same materials: Wilson over slides | new materials: Wilson | over materials |"
+    yield "| --- | --- | --- | --- |"
     for materials in (4, 10, 20, 40):
-        slides, by_material = rates(materials, repeats=repeats)
-        yield f"| {materials} | {slides:.3f} | {'no interval' if np.isnan(by_material) else f'{by_material:.3f}'} |"
+        same, slides, by_material = rates(materials, repeats=repeats)
+        shown = "no interval" if np.isnan(by_material) else f"{by_material:.3f}"
+        yield f"| {materials} | {same:.3f} | {slides:.3f} | {shown} |"
 
 
 if __name__ == "__main__":

@@ -212,8 +212,8 @@ def _model_manifest(dataset: Found) -> Manifest:
     manifest = dataset.manifest
     if _MODEL not in manifest.files or _RESULT in manifest.files:
         raise UsageError(
-            f"{dataset.directory} is not a model: {manifest.stage} made it. Give what `tacpipe train` or `tacpipe calibrate` "
-            f"wrote with -o."
+            f"{dataset.directory} is not a model: {manifest.stage} made it. Give what `tacpipe train` or "
+            f"`tacpipe calibrate` wrote with -o."
         )
     return manifest
 

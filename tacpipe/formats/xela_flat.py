@@ -4,7 +4,8 @@ Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV
 clock: only the mean rate is known, so timestamps are computed from it and marked as such. Robot and marker files may
 lack one row. The published columns ``ee_state_orientation_x`` to ``_w`` contain the quaternion as w, x, y, z: only in
 this order does the hand turn with the last link of the arm. The marker columns contain x, y, z, w as named: only in
-this order are the two markers rigid to each other, in 36 of 36 trials that show both.
+this order are the two markers rigid to each other, in 36 of 37 trials that show both. In the other, they turn by less
+than a degree.
 """
 
 from __future__ import annotations
