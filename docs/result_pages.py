@@ -60,7 +60,7 @@ def table(comparisons: Sequence[Comparison]) -> str:
         entries.sort(key=lambda entry: entry[1][0], reverse=True)
         for method, values, count in entries:
             writer.writerow([method, part, *(f"{value:.{DIGITS.get(task, 3)}f}" for value in values), count])
-    most = max(comparison.rows[0].n for comparison in first)
+    most = max(comparison.rows[0].recordings for comparison in first)
     if task == "material":
         materials = len(first[0].rows[0].method.details[0].config["materials"])
         writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, most])
@@ -101,7 +101,7 @@ def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
     if comparison.task == "touch":
         source = next((other.method for other in comparison.rows if other.predictor == CONSTANT), row.method)
         value = engine.difference(row.method, source, comparison.question, (row.predictor, CONSTANT))
-    return name, (value.mean, value.low, value.high), row.n
+    return name, (value.mean, value.low, value.high), row.recordings
 
 
 def label(row: ComparisonRow) -> str:
