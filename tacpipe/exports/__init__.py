@@ -1,1 +1,1 @@
-"""Datasets written for other tools: files of their formats, with a list of what a format cannot carry."""
+"""Export datasets to the file formats of other tools, with a list of what each format cannot represent."""

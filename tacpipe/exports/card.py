@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 NAME = "croissant.json"
 CONFORMS = "http://mlcommons.org/croissant/1.0"
 _TYPES = {"bool": "sc:Boolean", "string": "sc:Text", "float": "sc:Float", "double": "sc:Float", "halffloat": "sc:Float"}
-_TERMS = (  # terms of Croissant's own vocabulary
+_TERMS = (  # terms of Croissant's vocabulary
     *("citeAs", "column", "equivalentProperty", "extract", "field", "fileProperty", "fileObject", "fileSet", "format"),
     *("includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
     *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
@@ -54,7 +54,7 @@ CONTEXT: Mapping[str, str | dict[str, str]] = {
 
 @dataclass(frozen=True)
 class About:
-    """The publisher's statements about the data, or empty if unknown."""
+    """The publisher's information about the data; empty if unknown."""
 
     name: str
     description: str
@@ -67,7 +67,7 @@ class About:
 
 
 def croissant_json(about: About, described: Contents, patterns: Mapping[str, str]) -> bytes:
-    """Return ``croissant.json``; ``patterns`` are the paths of each stream's files."""
+    """Return ``croissant.json``; ``patterns`` are the path patterns of each stream's files."""
     value = {
         "@context": dict(CONTEXT),
         "@type": "sc:Dataset",
@@ -118,7 +118,7 @@ def _record_set(stream: str, columns: Sequence[Column]) -> dict[str, str | list[
 
 
 def column_ids(names: Sequence[str]) -> dict[str, str]:
-    """Return an identifier for each column, without spaces and brackets, which readers refuse; no two alike.
+    """Return a unique identifier for each column, without spaces and brackets, which readers reject.
 
     >>> column_ids(["taxel01_x", "Force X [N]", "Force X (N)"])
     {'taxel01_x': 'taxel01_x', 'Force X [N]': 'Force_X__N_', 'Force X (N)': 'Force_X__N__2'}
@@ -145,7 +145,7 @@ def _field(stream: str, column: Column, identifier: str) -> CroissantField:
 
 
 def describe_column(column: Column) -> str:
-    """Return what a column holds: quantity, unit, and whatever else its metadata state.
+    """Return a description of a column: quantity, unit, and its other metadata.
 
     >>> describe_column(Column("taxel01_x", "uint16", {"quantity": "tactile", "unit": "count", "taxel": "1", "axis": "x"}))
     'tactile (count), axis x, taxel 1'
@@ -156,19 +156,19 @@ def describe_column(column: Column) -> str:
 
 
 def croissant_type(arrow_type: str) -> str:
-    """Return the name of a type in Croissant; empty for one that it does not have."""
+    """Return the Croissant name of a type, or "" if it has none."""
     return "sc:Integer" if arrow_type.lstrip("u").startswith("int") else _TYPES.get(arrow_type, "")
 
 
 LABELS = "labels"
 RECORDING = "recording"
-UNKNOWN = "unknown"  # the Hub's name for a licence that is not stated
+UNKNOWN = "unknown"  # the Hub's name for an unknown licence
 TAGS = ("tactile", "robotics", "timeseries")
 
 
 @dataclass(frozen=True)
 class Params:
-    """The publisher's statements about the data."""
+    """The publisher's information about the data."""
 
     title: str = "Tactile recordings"  # heading of the card and name of the dataset
     description: str = ""  # a paragraph
@@ -227,7 +227,7 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
 
 def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
-    """Yield what of a stream the card does not hold."""
+    """Yield the losses of a stream in the card."""
     for field in schema:
         if not croissant_type(str(field.type)):
             reason = f"{NAME} has no type for {field.type}; the Parquet files have the column"
@@ -237,7 +237,7 @@ def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
 
 
 def _with_recording_column(table: pa.Table, name: str) -> pa.Table:
-    """Return a table after a first column with the recording's name, but where it has one."""
+    """Return a table with a first column for the recording's name, unless it already has one."""
     import pyarrow as pa
 
     if RECORDING in table.column_names:
@@ -246,7 +246,7 @@ def _with_recording_column(table: pa.Table, name: str) -> pa.Table:
 
 
 def _labels(recordings: Dataset) -> bytes:
-    """Return a table with one row per recording and a column an attribute."""
+    """Return a table with one row per recording and one column per attribute."""
     import pyarrow as pa
 
     from tacpipe.datasets import arrays
@@ -274,7 +274,7 @@ def _readme(params: Params, recordings: Dataset, described: Contents, patterns: 
 
 
 def _front_matter(params: Params, patterns: dict[str, str]) -> Iterator[str]:
-    """Yield the lines of the card's metadata, YAML: a configuration a stream."""
+    """Yield the lines of the card's YAML metadata, with one configuration per stream."""
     yield f"license: {json.dumps(params.license or UNKNOWN)}"
     yield f"pretty_name: {json.dumps(params.title)}"
     yield f"tags: {json.dumps(list(TAGS))}"

@@ -1,10 +1,10 @@
-"""Describe what the recordings of an export hold: streams, columns, rates, and what the format does not carry.
+"""Describe the recordings of an export: streams, columns, rates, and what the format cannot represent.
 
 Each part of an export returns the description of its recording as small tables, which are stored. `contents_from_parts`
 merges them, so an export is described without opening the recordings again.
 
-A writer states which columns it wrote, and `part` adds a `Loss` for every other column of the recording: a format that
-leaves something out cannot do so silently.
+A writer lists the columns that it wrote, and `part` adds a `Loss` for every other column of the recording, so that no
+format omits something silently.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
-TABLE = "data"  # how the only table of a recording is named where a name is needed
+TABLE = "data"  # name of a recording's only table where a name is required
 TIME = "t_ns"
 COLUMNS, STREAMS, LOSSES = "columns", "streams", "losses"  # tables of a part
 ColumnName = tuple[str, str]  # stream and column
@@ -30,10 +30,10 @@ ColumnName = tuple[str, str]  # stream and column
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss of a format: a column, a stream (``column`` is empty), or a property of the whole recording."""
+    """Something that a format cannot represent: a column, a stream (``column`` is empty), or a property of the recording."""
 
     reason: str
-    stream: str | None = None  # None: the loss concerns the whole recording
+    stream: str | None = None  # None if the loss concerns the whole recording
     column: str = ""
 
 
@@ -47,12 +47,12 @@ class Column:
 
     @property
     def quantity(self) -> str:
-        """The measured quantity, or empty if that is not stated."""
+        """The measured quantity, or "" if unknown."""
         return self.about.get("quantity", "")
 
     @property
     def unit(self) -> str:
-        """Its unit, or empty if that is not stated."""
+        """The unit, or "" if unknown."""
         return self.about.get("unit", "")
 
 
@@ -61,14 +61,14 @@ class ExportStream:
     """One stream over all recordings."""
 
     name: str
-    columns: Sequence[Column]  # columns in the first recording that has it
+    columns: Sequence[Column]  # columns in the first recording with this stream
     recordings: Sequence[str]
     rows: int
-    rates_hz: Sequence[float]  # lowest and highest; empty without stamps
+    rates_hz: Sequence[float]  # lowest and highest rate; empty without timestamps
     differing: Sequence[str] = ()  # recordings in which it has other columns
-    shared: Sequence[str] = ()  # columns that it has in all of its recordings, of one type
-    nan: bool = False  # True if a float is NaN somewhere
-    all_columns: Sequence[str] = ()  # those that it has in any of its recordings
+    shared: Sequence[str] = ()  # columns with the same type in all of its recordings
+    nan: bool = False  # whether any float is NaN
+    all_columns: Sequence[str] = ()  # columns in any of its recordings
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ class Contents:
     """The streams, duration and losses of all recordings together."""
 
     streams: Mapping[str, ExportStream]
-    seconds: float  # time between first and last stamp, summed over recordings
+    seconds: float  # time from first to last timestamp, summed over recordings
     first_ns: int | None
-    losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # sentence, names of the recordings that lose it
+    losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # names of the affected recordings by sentence
 
 
 def stream_label(stream: str) -> str:
-    """Return the name of a stream as files and groups are named by it."""
+    """Return the name of a stream used for files and groups."""
     return stream or TABLE
 
 
@@ -91,8 +91,8 @@ def part(
 ) -> dict[str, pa.Table]:
     """Return the tables that describe one recording.
 
-    ``losses`` is what the format does not carry, ``carried`` the columns that it does (None: all of them). Each column
-    that is in neither becomes a loss.
+    ``losses`` are known losses of the format, ``carried`` the columns that it represents (None for all). Each column in
+    neither becomes a loss.
     """
     import numpy as np
     import pyarrow as pa
@@ -152,10 +152,10 @@ def unwritten_losses(
 
 
 def loss_sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
-    """Return a sentence for each thing that is lost, with the recordings that lose it.
+    """Return the affected recordings by sentence about a loss.
 
-    ``losses`` are pairs of a recording and a loss. Columns of a stream that share a reason share a sentence, which names
-    all of them.
+    ``losses`` are pairs of a recording and a loss. Columns of a stream with the same reason share a sentence, which
+    names all of them.
 
     >>> loss_sentences([("a", Loss("no type", "cam", "x")), ("b", Loss("no type", "cam", "y")), ("b", Loss("rates"))])
     {'columns x, y of stream cam: no type': ['a', 'b'], 'rates': ['b']}
@@ -197,9 +197,9 @@ class ColumnRow(TypedDict):
 
 @dataclass
 class _StreamTotals:
-    """What the parts read so far hold of one stream."""
+    """The merged description of one stream in the parts read so far."""
 
-    columns: tuple[Column, ...]  # columns in the first recording that has it
+    columns: tuple[Column, ...]  # columns in the first recording with this stream
     shared: Sequence[Column]
     all_columns: dict[str, None]  # ordered set of names
     recordings: list[str] = field(default_factory=list)
@@ -231,11 +231,11 @@ class _StreamTotals:
 
 
 def contents_from_parts(parts: Dataset) -> Contents:
-    """Return the contents of all recordings together."""
+    """Return the merged contents of all recordings."""
     totals: dict[str, _StreamTotals] = {}
     losses: list[tuple[str, Loss]] = []
     seconds, starts = 0.0, []
-    tables: dict[str, dict[str, tuple[Column, ...]]] = {}  # columns by digest: most recordings have the same
+    tables: dict[str, dict[str, tuple[Column, ...]]] = {}  # columns by digest, because most recordings have the same
     for part in parts:
         key = part.digests[COLUMNS]
         if key not in tables:
@@ -255,7 +255,7 @@ def contents_from_parts(parts: Dataset) -> Contents:
 
 
 def field_metadata(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a field as text, without what Parquet adds."""
+    """Return the metadata of a field as text, without those that Parquet adds."""
     metadata = field.metadata or {}
     return {key.decode(): value.decode() for key, value in metadata.items() if not key.startswith(b"PARQUET:")}
 

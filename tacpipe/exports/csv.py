@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Parts = Dataset
 
 LAYOUT, LABELS = "layout.toml", "labels.json"
-TYPES = {"float": "float32", "double": "float64", "string": "text"}  # Arrow types with another name in a layout
+TYPES = {"float": "float32", "double": "float64", "string": "text"}  # Arrow types that have another name in a layout
 READ = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float", "double", "bool", "string")
 _OPENING = f"""
 One CSV file a stream, in a folder a recording. `{TIME}` is the time in nanoseconds of UTC. tacpipe reads them back with
@@ -79,7 +79,7 @@ def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
 
 def layout_text(described: Contents) -> str:
-    """Return the layout file that reads the files of an export back."""
+    """Return the layout file with which an export can be read back."""
     lines = ["# Reads these files back: tacpipe ingest table FOLDER --layout FOLDER/layout.toml -o data/recordings"]
     lines += ["", "[recordings]", 'name = "{recording}"']
     count = max((len(stream.recordings) for stream in described.streams.values()), default=0)
@@ -119,11 +119,11 @@ def _stream_lines(stream: ExportStream, *, optional: bool) -> Iterator[str]:
 
 
 def _quoted(value: str) -> str:
-    return json.dumps(value, ensure_ascii=True)  # a basic string of TOML is written alike
+    return json.dumps(value, ensure_ascii=True)  # the same syntax as a basic string in TOML
 
 
 def _write(stored: Columns, sink: Any) -> None:
-    """Write a stream as CSV: floats with the fewest digits that give the same bits back, NaN as ``nan``."""
+    """Write a stream as CSV: floats with the fewest digits that restore the same bits, NaN as ``nan``."""
     import pyarrow.csv as pc
 
     with pc.CSVWriter(sink, _writable_table(stored.schema.empty_table()).schema) as writer:
@@ -139,7 +139,7 @@ def _writable_table(table: pa.Table) -> pa.Table:
 
 
 def _writable_column(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a column as it can be written: bytes as hex digits, whatever else has no form in CSV as text."""
+    """Return a column in a writable form: bytes as hex digits, other unsupported types as text."""
     import pyarrow as pa
 
     if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
@@ -152,7 +152,7 @@ def _writable_column(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
-    """Yield what of a stream CSV and the layout do not give back."""
+    """Yield the losses of a stream in CSV and the layout."""
     import numpy as np
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -1,4 +1,4 @@
-"""Write the files of an export, with a README.md: contents, origin, how to open it, what the format does not carry."""
+"""Write the files of an export with a README.md: contents, provenance, how to open it, and the format's losses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Content = bytes | Callable[[], bytes]
 
 
 class Files(Mapping[str, bytes]):
-    """Files by name; the content of each is bytes or a function that returns them."""
+    """Files by name; the content of each is bytes, or a function that returns them."""
 
     def __init__(self, contents: Mapping[str, Content]) -> None:
         self._contents = contents
@@ -41,9 +41,9 @@ class Files(Mapping[str, bytes]):
 
 
 class Scratch(io.RawIOBase):
-    """A temporary file whose writes never fail: HDF5 crashes the process where one does, as on a full disk.
+    """A temporary file whose writes never raise, because a failing write, as on a full disk, would crash HDF5.
 
-    `check` raises what went wrong; nothing is written any more after that. The file is closed with the last reference to it.
+    `check` raises the first error, after which nothing is written. The file is closed with the last reference to it.
     """
 
     def __init__(self) -> None:
@@ -51,12 +51,12 @@ class Scratch(io.RawIOBase):
         self._error: OSError | None = None
 
     def write(self, content: Any) -> int:
-        """Write all of ``content`` unless a write failed before."""
+        """Write all of ``content``, unless an earlier write failed."""
         remaining = memoryview(content).cast("B")
         size = len(remaining)
         while remaining and self._error is None:
             try:
-                remaining = remaining[self._file.write(remaining) :]  # a disk that is nearly full takes a part
+                remaining = remaining[self._file.write(remaining) :]  # a nearly full disk accepts only a part
             except OSError as error:
                 self._error = error
         if remaining:
@@ -64,7 +64,7 @@ class Scratch(io.RawIOBase):
         return size
 
     def truncate(self, size: int | None = None) -> int:
-        """Cut or extend the file to ``size`` bytes."""
+        """Resize the file to ``size`` bytes."""
         try:
             return self._file.truncate(size)
         except OSError as error:
@@ -84,16 +84,16 @@ class Scratch(io.RawIOBase):
         return self._file.tell()
 
     def close(self) -> None:
-        """Close the file, which removes it."""
+        """Close the file, which deletes it."""
         self._file.close()
         super().close()
 
     def piece(self, offset: int, size: int) -> bytes:
-        """Return a part of what was written."""
+        """Return a part of the written content."""
         return os.pread(self._file.fileno(), size, offset)
 
     def check(self) -> Self:
-        """Return the file itself. Raises `StorageError` if a write failed."""
+        """Return the file. Raises `StorageError` if a write failed."""
         if self._error is not None:
             raise StorageError(
                 f"The folder of temporary files {tempfile.gettempdir()} cannot be written: {self._error.strerror}. Free "
@@ -103,7 +103,7 @@ class Scratch(io.RawIOBase):
 
 
 def copy_to_sink(file: Scratch) -> Callable[[Any], None]:
-    """Return a function that copies a file to the one that it is given, and closes it."""
+    """Return a function that copies a file to its argument, and closes it."""
 
     def write(sink: Any) -> None:
         with file:
@@ -114,27 +114,27 @@ def copy_to_sink(file: Scratch) -> Callable[[Any], None]:
 
 
 README_NAME = "README.md"
-_VALUES = 8  # listed values per attribute
-_SHOWN = 3  # recordings that a line names
+_VALUES = 8  # number of listed values per attribute
+_SHOWN = 3  # number of recordings named in a line
 
 
 def readme_text(title: str, opening: str, recordings: Dataset, contents: Contents) -> bytes:
-    """Return the README as Markdown: ``title``, how to open the export (Markdown), and the sections of `sections`."""
+    """Return the README as Markdown: ``title``, ``opening`` (how to open the export), and the sections of `sections`."""
     return "\n\n".join([f"# {title}", opening.strip(), *sections(recordings, contents)]).encode() + b"\n"
 
 
 def sections(recordings: Dataset, contents: Contents) -> list[str]:
-    """Return what any export describes: contents, streams with units, what is not carried, provenance."""
+    """Return the sections that every export has: contents, streams with units, losses, provenance."""
     return [_contents(recordings, contents), _streams(contents), _losses(recordings, contents), provenance(recordings)]
 
 
 def loss_notes(recordings: Dataset, contents: Contents) -> list[str]:
-    """Return what the format does not carry, a sentence each, for the command's output."""
+    """Return one sentence per loss of the format, for the command's output."""
     return [f"not carried: {loss}{_affected_recordings(names, recordings)}" for loss, names in contents.losses.items()]
 
 
 def provenance(recordings: Dataset) -> str:
-    """Return the section that names the stages behind the recordings and their digest."""
+    """Return the section with the stages that produced the recordings and their digest."""
     source = recordings.source
     stages = [
         (step["stage"], step["version"], step["params"]) for step in source.chain if step["stage"] != source.stage

@@ -1,4 +1,4 @@
-"""Read a synchronized recording as frames of arrays: which columns belong together, what state and actions are."""
+"""Read synchronized recordings as frames of arrays: group columns, and select state and actions."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 RATE = "grid_rate_hz"  # attribute of a synchronized recording
-LEFT_OUT = "not_synchronized"  # attribute: streams that `synchronize` left out
+LEFT_OUT = "not_synchronized"  # attribute with the streams that `synchronize` skipped
 SYNCHRONIZE = "synchronize"
-ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these is a robot's
-TARGETS = "target_"  # begins the quantities of what a robot was asked to do
-CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are no signals
+ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these quantities belongs to a robot
+TARGETS = "target_"  # prefix of the quantities of a robot's commands
+CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are not signals
 TACTILE, LATENT = "tactile", "latent"
 _NO_FRAMES = "it has no value in each frame, as images, text and single rows have none"
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A column of a synchronized table, with the stream that it came from; empty for what stages added."""
+    """A column of a synchronized table and its stream, which is empty for columns that stages added."""
 
     name: str
     stream: str
@@ -43,41 +43,41 @@ class Channel:
 
     @property
     def short(self) -> str:
-        """Its name as it was recorded, without the stream before it."""
+        """Its recorded name, without the stream."""
         return self.name.removeprefix(f"{self.stream}_") if self.stream and not self.truth else self.name
 
     @property
     def observed(self) -> bool:
-        """True for a signal and for what a codec computed of signals: inputs of a policy."""
+        """Whether it is a signal, or computed from signals by a codec, so that a policy may read it."""
         return self.signal or self.quantity == LATENT
 
     @property
     def number(self) -> bool:
-        """True for a type that arrays hold."""
+        """Whether arrays support its type."""
         return self.type.startswith(("int", "uint", "float", "double", "half", "bool"))
 
     @property
     def truth(self) -> bool:
-        """True for ground truth, which keeps its name."""
+        """Whether it is ground truth, which keeps its name."""
         return self.name.startswith(TRUTH)
 
     @property
     def signal(self) -> bool:
-        """True for a number that a sensor or a robot measured."""
+        """Whether it is a number measured by a sensor or a robot."""
         return (
             bool(self.stream) and self.number and self.type != "bool" and self.quantity not in CLOCKS and not self.truth
         )
 
 
 def synchronize_stage(rate_hz: float | None, master: str) -> dict[str, dict[str, str | float]]:
-    """Return the stage that gives recordings one rate, with its params; none without a rate."""
+    """Return the params of the stage that resamples recordings to one rate, by stage name; empty without a rate."""
     if rate_hz is None:
         return {}
     return {SYNCHRONIZE: {"rate_hz": rate_hz, **({"master": master} if master else {})}}
 
 
 def synchronized_columns(recording: Recording) -> Columns:
-    """Return the columns of a synchronized recording. Raises `UsageError` for one that is not."""
+    """Return the columns of a synchronized recording. Raises `UsageError` if it is not synchronized."""
     if set(recording.streams) != {""} or GRID not in recording.attributes:
         raise UsageError(
             f"Recording {recording.name} is not synchronized, and the format has one rate for all streams. Give "
@@ -87,9 +87,9 @@ def synchronized_columns(recording: Recording) -> Columns:
 
 
 def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
-    """Return the columns of the frames, and ``described`` with the columns that are left out among its losses.
+    """Return the columns of the frames, and ``described`` with the omitted columns added to its losses.
 
-    Recordings whose columns differ are refused, or, where ``common``, those that all have are kept. Raises `UsageError`.
+    If the columns of recordings differ, `UsageError` is raised, or if ``common``, only those that all have are kept.
     """
     (stream,) = described.streams.values()
     if not stream.differing:
@@ -108,14 +108,14 @@ def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Cont
 
 
 def add_frame_losses(described: Contents, recordings: Dataset, originals: Dataset, retained: str = "") -> Contents:
-    """Return ``described`` with the streams and columns that the frames lack among its losses.
+    """Return ``described`` with the streams and columns that the frames lack added to its losses.
 
     ``originals`` are the recordings before this export synchronized them; ``retained`` ends each sentence.
     """
     losses = []
     for recording in recordings:
         original = originals[recording.name]
-        if set(original.streams) == {""}:  # synchronized by the user
+        if set(original.streams) == {""}:  # the user synchronized it
             names = str(recording.attributes.get(LEFT_OUT) or "").split(", ")
             losses += [(recording.name, Loss(_NO_FRAMES, stream)) for stream in names if stream]
             continue
@@ -129,7 +129,7 @@ def add_frame_losses(described: Contents, recordings: Dataset, originals: Datase
 
 
 def channels(table: pa.Table | Columns) -> list[Channel]:
-    """Return the columns but the time."""
+    """Return all columns except the time."""
     result = []
     for field in table.schema:
         if field.name != TIME:
@@ -140,9 +140,9 @@ def channels(table: pa.Table | Columns) -> list[Channel]:
 
 
 def state_channels(all_channels: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:
-    """Return the channels of the robot's state: of these streams, or of all that have joints or a pose.
+    """Return the channels of the robot's state: those of ``streams``, or of all streams with joints or a pose.
 
-    Raises `UsageError` for a stream that is not there.
+    Raises `UsageError` if a stream does not exist.
     """
     streams_present = list(dict.fromkeys(channel.stream for channel in all_channels if channel.stream))
     for name in streams:
@@ -161,8 +161,8 @@ def state_channels(all_channels: Sequence[Channel], streams: Sequence[str]) -> l
 def action_channels(all_channels: Sequence[Channel], stream: str) -> tuple[list[Channel], bool]:
     """Return the channels of the actions, and whether an action is their value one frame later.
 
-    These are the targets that ``stream`` recorded, at the same frame; without targets its measured state one frame later,
-    where the last frame repeats its own. Raises `UsageError` for a stream that is not there.
+    These are the recorded targets of ``stream`` at the same frame, or without targets its measured state one frame
+    later; the last frame then repeats its own. Raises `UsageError` if the stream does not exist.
     """
     targets = [channel for channel in all_channels if channel.stream == stream and channel.quantity.startswith(TARGETS)]
     return targets or state_channels(all_channels, [stream]), not targets
@@ -182,7 +182,7 @@ def _channel_type(columns: Columns, channel: Channel) -> ArrayType:
 def value_blocks(
     columns: Columns, chosen: Sequence[Channel], kind: ArrayType, *, later: bool = False
 ) -> Iterator[AnyArray]:
-    """Yield the values of channels (time, channel) as ``kind``, some rows at a time.
+    """Yield the values of channels (time, channel) as ``kind`` in blocks of rows.
 
     With ``later``, each row has the values of the next one, and the last row its own.
     """
@@ -201,7 +201,7 @@ def value_blocks(
 
 
 def rounded_channels(columns: Columns, chosen: Sequence[Channel]) -> list[Channel]:
-    """Return the channels that float32 does not hold exactly."""
+    """Return the channels that float32 cannot represent exactly."""
     lossy = []
     for channel in chosen:
         values = columns.column(channel.name).to_numpy()
@@ -213,7 +213,7 @@ def rounded_channels(columns: Columns, chosen: Sequence[Channel]) -> list[Channe
 
 
 def common_rate_hz(recordings: Sequence[Recording]) -> float:
-    """Return the rate that all recordings share. Raises `UsageError` if they have several."""
+    """Return the common rate of all recordings. Raises `UsageError` if rates differ."""
     rates = sorted({_rate(recording) for recording in recordings})
     if len(rates) > 1:
         raise UsageError(
@@ -235,12 +235,12 @@ ACTIONS = "actions"
 
 @dataclass(frozen=True)
 class FrameArray:
-    """An array of frames (frame, channel), or (frame,) of a single channel."""
+    """An array of frames (frame, channel), or (frame,) for a single channel."""
 
     name: str
     channels: Sequence[Channel]
     actions: bool = False
-    later: bool = False  # True where a frame has the values of the next frame, as actions without targets have
+    later: bool = False  # whether a frame has the values of the next frame, as for actions without targets
 
     @property
     def columns(self) -> list[str]:
@@ -254,21 +254,21 @@ class FrameArray:
 
     @property
     def observed(self) -> bool:
-        """True for what was measured or is computed of that; no action, clock, mask, label or ground truth."""
+        """Whether it was measured or computed from measurements; not an action, clock, mask, label or ground truth."""
         return not self.actions and any(channel.observed for channel in self.channels)
 
     def type_in(self, columns: Columns) -> ArrayType:
-        """Return the type of the values of a recording: float32 for actions, else the widest of the columns."""
+        """Return the type of a recording's values: float32 for actions, otherwise the widest type of the columns."""
         import numpy as np
 
         return np.dtype(np.float32) if self.actions else common_type(columns, self.channels)
 
     def shape(self, rows: int) -> tuple[int, ...]:
-        """Return the shape of so many frames."""
+        """Return the shape for this number of frames."""
         return (rows,) if len(self.channels) == 1 else (rows, len(self.channels))
 
     def blocks(self, columns: Columns, kind: ArrayType) -> Iterator[AnyArray]:
-        """Yield the values of a recording as ``kind``, some frames at a time."""
+        """Yield the values of a recording as ``kind`` in blocks of frames."""
         for values in value_blocks(columns, self.channels, kind, later=self.later):
             yield values.reshape(self.shape(len(values)))
 
@@ -276,7 +276,7 @@ class FrameArray:
 def arrays_of_frames(columns: Columns, actions: str = "") -> list[FrameArray]:
     """Return the arrays of a synchronized recording: the time, one per stream and quantity, one per mask, and the actions.
 
-    Columns of other types than numbers are left out.
+    Columns that are not numbers are omitted.
     """
     signals = channels(columns)
     groups: dict[str, list[Channel]] = {TIME: [Channel(TIME, "", "time", "ns", "int64")]}
@@ -291,7 +291,7 @@ def arrays_of_frames(columns: Columns, actions: str = "") -> list[FrameArray]:
 
 
 def describe(recording: Recording) -> dict[str, pa.Table]:
-    """Return the tables that describe a synchronized recording and what these arrays do not hold of it."""
+    """Return the tables that describe a synchronized recording and the losses of these arrays."""
     columns = synchronized_columns(recording)
     losses = [
         Loss("rates of the streams and what happened between frames: one frame rate for all"),
@@ -310,7 +310,7 @@ def describe(recording: Recording) -> dict[str, pa.Table]:
 
 
 def _name(channel: Channel) -> str:
-    """Return the name of the array of a channel: its stream and quantity; masks and labels have arrays of their own."""
+    """Return the array name of a channel: its stream and quantity; each mask and label has its own array."""
     if channel.truth:
         return "truth"
     if not channel.signal:

@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     Parts = Dataset
 
 DEMOS = "demos.hdf5"
-MASKS = {"train": "train", "val": "valid", "test": "test"}  # role: name that robomimic has for it
-EXTRA = "tacpipe"  # group of a demonstration with what no policy may read
-VERSION = ("v110", "v110")  # HDF5 of 2016 stores many small columns in half the space of older versions
+MASKS = {"train": "train", "val": "valid", "test": "test"}  # robomimic's name by role
+EXTRA = "tacpipe"  # group of a demonstration with data that policies must not read
+VERSION = ("v110", "v110")  # HDF5 of 2016, which stores many small columns in half the space of older versions
 CHUNK_ROWS = 1 << 16
-LEVEL = 4  # gzip; higher levels take twice the time for 1 %
+LEVEL = 4  # gzip level; higher levels take twice the time for 1 %
 _STREAMS = f"""
 One HDF5 file a recording: the group `STREAM` has a dataset a column; `{TIME}` is the time in nanoseconds of UTC.
 Attributes of a dataset are its unit and quantity, attributes of the file the labels:
@@ -82,7 +82,7 @@ class Params:
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the stage that recordings go through first, where a rate is given."""
+    """Return the preceding stage if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
@@ -90,7 +90,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
 
 @stage(version=2, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
-    """Return the file of one recording, or nothing if all are in one."""
+    """Return the file of one recording, or no file if all recordings are in one."""
     if params.structure == "robomimic":
         from tacpipe.exports import frames
 
@@ -138,9 +138,9 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
 
 
 def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
-    """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes.
+    """Return a temporary file with a recording, because HDF5 does not write sequentially.
 
-    What it does not carry is added to ``losses``, what it carries to ``columns``.
+    Adds losses to ``losses`` and written columns to ``columns``.
     """
     import h5py
 
@@ -158,7 +158,7 @@ def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnNam
 
 
 def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:
-    """Set the attributes of a recording; yield those that HDF5 has no value for."""
+    """Set the attributes of a recording; yield those that HDF5 cannot represent as losses."""
     for name, value in values.items():
         if value is not None:
             group.attrs[name] = value
@@ -167,7 +167,7 @@ def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[
 
 
 def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[Loss]:
-    """Write a column; yield what of it is lost."""
+    """Write a column; yield its losses."""
     import h5py
     import numpy as np
     import pyarrow as pa
@@ -204,7 +204,7 @@ class Storage(TypedDict, total=False):
 
 
 def _storage(values: AnyArray) -> Storage:
-    """Return how an array is stored: in compressed chunks, but for one without rows, which has none."""
+    """Return the storage options of an array: compressed chunks, or none for an array without rows."""
     if not len(values):
         return {}
     chunks = (min(len(values), CHUNK_ROWS), *values.shape[1:])
@@ -212,14 +212,14 @@ def _storage(values: AnyArray) -> Storage:
 
 
 def _array_dataset(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.Dataset:
-    """Write an array of a demonstration chunk by chunk; the file is that of an array that is written at once."""
+    """Write an array of a demonstration chunk by chunk; the file equals that of an array written at once."""
     import h5py
 
     path, kind, shape = _demo_path(array), array.type_in(columns), array.shape(columns.num_rows)
     place, _, name = path.rpartition("/")
     group = demo.require_group(place) if place else demo
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    layout.set_obj_track_times(False)  # the same recording gives the same bytes
+    layout.set_obj_track_times(False)  # equal recordings give equal bytes
     if shape[0]:
         layout.set_chunk((min(shape[0], CHUNK_ROWS), *shape[1:]))
         layout.set_shuffle()
@@ -233,7 +233,7 @@ def _array_dataset(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5p
 
 
 def _chunks(blocks: Iterable[AnyArray]) -> Iterator[tuple[int, AnyArray]]:
-    """Yield the rows of blocks in whole chunks, each with the number of its first row; a chunk is so compressed once."""
+    """Yield the rows of blocks in whole chunks with the index of their first row, so that each chunk is compressed once."""
     import numpy as np
 
     waiting: list[AnyArray] = []
@@ -256,7 +256,7 @@ def _demos(
     roles: Mapping[str, str],
     losses: list[tuple[str, Loss]],
 ) -> Scratch:
-    """Return a temporary file with all demonstrations; what it does not carry of a recording is added to ``losses``."""
+    """Return a temporary file with all demonstrations; adds losses of recordings to ``losses``."""
     import h5py
 
     from tacpipe.exports import frames
@@ -288,7 +288,7 @@ def _demos(
 
 
 def _demo_path(array: FrameArray) -> str:
-    """Return the path of an array below its demonstration: robomimic reads actions next to obs, policies what is in it."""
+    """Return the path of an array in its demonstration: robomimic reads actions next to obs, and policies read obs."""
     if array.actions or array.name == TIME:
         return array.name
     return f"obs/{array.name}" if array.observed else f"{EXTRA}/{array.name}"

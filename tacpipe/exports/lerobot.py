@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     Parts = Dataset
 
 VERSION = "v3.0"
-RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
-INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that number frames
-GROUP_FRAMES = 1 << 17  # frames of an episode in memory at once; an episode of more has several row groups
-CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's own limits
+RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the attributes are JSON
+INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns with indices of frames
+GROUP_FRAMES = 1 << 17  # maximum number of frames of an episode in memory; a longer episode has several row groups
+CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's limits
 _PLACE = re.compile(r"\{([^{}]+)\}")
 _OPENING = """
 A LeRobot dataset, v3.0:
@@ -70,14 +70,14 @@ quantity of each column.
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the stage that recordings go through first, where a rate is given."""
+    """Return the preceding stage if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
 
 
 def shards(params: Params) -> str:
-    """Return the folder of the shards as they were given."""
+    """Return the folder for the input shards."""
     return ORIGINALS if params.originals else ""
 
 
@@ -150,7 +150,7 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
 
 
 def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
-    """Yield what the features do not hold of a synchronized recording."""
+    """Yield what the features cannot represent of a synchronized recording."""
     from tacpipe.exports import frames
 
     channels = frames.channels(columns)
@@ -169,12 +169,12 @@ def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
 
 
 def _without_feature(channels: Sequence[Channel]) -> list[Channel]:
-    """Return the channels whose type no feature has."""
+    """Return the channels whose type no feature supports."""
     return [channel for channel in channels if not channel.number and channel.type != "string"]
 
 
 def _shards_note(params: Params) -> str:
-    """Return the end of a loss where the recorded shards are part of the export."""
+    """Return the end of a sentence about a loss if the recorded shards are part of the export."""
     return f"; the shards under {ORIGINALS}/ keep it" if params.originals else ""
 
 
@@ -189,7 +189,7 @@ def _row_count(parts: Dataset, name: str) -> int:
 
 
 def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:
-    """Return the task of each recording. Raises `UsageError` for a label that a recording does not have."""
+    """Return the task of each recording. Raises `UsageError` for a label that a recording lacks."""
     tasks = {}
     for recording in recordings:
         for label in _PLACE.findall(params.task):
@@ -203,7 +203,7 @@ def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:
 
 
 def _fill_task(task: str, labels: Mapping[str, Attribute]) -> str:
-    """Return the text of a task with the values of its labels."""
+    """Return a task's text with the values of its labels inserted."""
     return _PLACE.sub(lambda match: str(labels[match[1]]), task)
 
 
@@ -236,7 +236,7 @@ class _Episodes:
     fps: float
 
     def write(self, sink: Any) -> None:
-        """Write the data file, one row group per episode, several for an episode of more than `GROUP_FRAMES`."""
+        """Write the data file with one row group per episode, or several for more than `GROUP_FRAMES` frames."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -265,7 +265,7 @@ class _Episodes:
 
 
 def _index_columns(first: int, rows: int, episode: int, start: int, task: int, fps: float) -> list[pa.Array]:
-    """Return the columns `INDICES` of frames from the frame ``first`` of an episode on."""
+    """Return the columns `INDICES` for frames of an episode, starting with the frame ``first``."""
     import numpy as np
     import pyarrow as pa
 
@@ -284,7 +284,7 @@ def _task_order(tasks: Mapping[str, str]) -> dict[str, int]:
 
 
 def _task_table(tasks: Mapping[str, str]) -> bytes:
-    """Return the tasks as LeRobot has them: a frame of pandas with the text as its index."""
+    """Return the tasks as LeRobot stores them: a pandas frame with the text as index."""
     import pandas as pd
 
     order = _task_order(tasks)
@@ -336,7 +336,7 @@ def _episodes(
 
 
 class FeatureJson(TypedDict):
-    """A feature of the frames, as LeRobot describes it."""
+    """A feature of the frames in LeRobot's format."""
 
     dtype: str
     shape: list[int]
@@ -344,7 +344,7 @@ class FeatureJson(TypedDict):
 
 
 class InfoJson(TypedDict):
-    """The description of a dataset, as LeRobot reads it."""
+    """The description of a dataset in LeRobot's format."""
 
     codebase_version: str
     robot_type: str | None
@@ -397,7 +397,7 @@ def _info(
 
 
 class FeatureMetadata(TypedDict):
-    """What LeRobot has no place for."""
+    """Metadata that LeRobot's format cannot represent."""
 
     features: dict[str, dict[str, list[str]]]  # columns, units and quantities of each feature
     columns: dict[str, dict[str, str]]  # type and metadata of each column of the synchronized table

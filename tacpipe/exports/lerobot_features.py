@@ -39,13 +39,13 @@ class Params:
 
 @dataclass(frozen=True)
 class FrameFeature:
-    """One feature of a frame: its channels, and their names next to each other."""
+    """One feature of a frame: its channels with their names."""
 
     name: str
     channels: Sequence[Channel]
     names: Sequence[str]
-    kind: ArrayType  # type of the values of a frame; object: text
-    later: bool = False  # True where a frame has the values of the next frame, as actions without targets have
+    kind: ArrayType  # type of a frame's values; object for text
+    later: bool = False  # whether a frame has the values of the next frame, as for actions without targets
 
     @property
     def columns(self) -> list[str]:
@@ -54,7 +54,7 @@ class FrameFeature:
 
     @property
     def dtype(self) -> str:
-        """The type, as info.json names it."""
+        """The type as named in info.json."""
         return "string" if self.kind.kind == "O" else str(self.kind)
 
     @property
@@ -64,11 +64,11 @@ class FrameFeature:
 
     @property
     def frame_bytes(self) -> int:
-        """The bytes of one frame, those of a reference for text."""
+        """The size of a frame in bytes; for text, that of a reference."""
         return self.kind.itemsize * len(self.channels)
 
     def put_aside(self, columns: Columns, scratch: Scratch) -> Callable[[int, int], pa.Array]:
-        """Write the values of a recording to a temporary file; return a function (first frame, frames) -> values.
+        """Write a recording's values to a temporary file; return a function (first frame, frames) -> values.
 
         Text stays in memory.
         """
@@ -141,11 +141,11 @@ def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
 STATISTICS_TABLE = "stats"  # table of a part
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
-Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
+Stats = dict[str, dict[str, list[Any]]]  # values by channel, by statistic, by feature
 
 
 def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield each column of a feature with its statistics; none of text, and NaN if nothing was measured."""
+    """Yield each column of a feature with its statistics: none for text, and NaN if nothing was measured."""
     import numpy as np
 
     if feature.dtype == "string":
@@ -169,7 +169,7 @@ def _statistics_of(values: Floats) -> tuple[float, ...]:
 
 
 def episode_statistics(features: Sequence[FrameFeature], part: Recording, rows: int) -> Stats:
-    """Return the statistics of an episode's features, as its part has them."""
+    """Return the statistics of an episode's features from its part."""
     rows_by_column = {(row[ACTION], row["column"]): row for row in part.table(STATISTICS_TABLE).to_pylist()}
     statistics: Stats = {}
     for feature in features:
@@ -180,7 +180,7 @@ def episode_statistics(features: Sequence[FrameFeature], part: Recording, rows: 
 
 
 def index_statistics(rows: int, episode: int, start: int, task: int, fps: float) -> Stats:
-    """Return the statistics of the columns that number frames, episodes and tasks."""
+    """Return the statistics of the index columns of frames, episodes and tasks."""
     import numpy as np
 
     frame = np.arange(rows, dtype=np.float64)
@@ -205,7 +205,7 @@ def dataset_statistics(
     tasks: Mapping[str, int],
     fps: float,
 ) -> Stats:
-    """Return the statistics over all episodes, put together as LeRobot does: of quantiles the mean over frames.
+    """Return the statistics over all episodes, combined as LeRobot does: quantiles are averaged over frames.
 
     ``tasks`` is the index of each recording's task.
     """

@@ -80,16 +80,16 @@ def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
 @dataclass(frozen=True)
 class _Stream:
-    """A stream that becomes topics: the function that makes them of its rows, which come in blocks."""
+    """A stream that becomes topics, and the function that converts its blocks of rows."""
 
     topics: Callable[[pa.Table], Sequence[Topic]]
     name: str
-    columns: Sequence[ColumnName]  # carried by the messages
-    ordered: bool  # True: the rows are in the order of time
+    columns: Sequence[ColumnName]  # columns that the messages represent
+    ordered: bool  # whether the rows are ordered by time
 
 
 def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: Any) -> None:
-    """Write the MCAP file of a recording: some rows of each stream are in memory."""
+    """Write the MCAP file of a recording with only some rows of each stream in memory."""
     from mcap.writer import CompressionType, Writer
 
     writer = Writer(sink, compression=CompressionType.ZSTD)
@@ -103,7 +103,7 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
 
 
 def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterator[_Stream]:
-    """Yield the streams that become topics; add to ``losses`` what the messages do not carry."""
+    """Yield the streams that become topics; add what the messages cannot represent to ``losses``."""
     import numpy as np
 
     from tacpipe.exports import ros
@@ -133,7 +133,7 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
 
 
 def _holds_images(table: Columns, name: str) -> bool:
-    """Return whether the first entry of a column of bytes is an encoded image."""
+    """Return whether the first value of a binary column is an encoded image."""
     import pyarrow as pa
 
     from tacpipe.formats.arrays.tree import picture_encoding
@@ -145,14 +145,14 @@ def _holds_images(table: Columns, name: str) -> bool:
 
 
 def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[Topic]:
-    """Return the topic of a cloud of points, whose one message has all rows."""
+    """Return the topic of a point cloud with one message for all rows."""
     from tacpipe.exports import ros
 
     return [ros.cloud_topic(stream, table, start_ns)]
 
 
 def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table) -> list[Topic]:
-    """Return the topics of some rows of a stream."""
+    """Return the topics for a block of rows of a stream."""
     from tacpipe.exports import ros
 
     usual = ros.usual_topics(stream, table, images) if params.usual_messages else []
@@ -160,7 +160,7 @@ def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table)
 
 
 def _start(recording: Recording, stream: str) -> int | None:
-    """Return the first stamp of a stream, or None if it has none."""
+    """Return the first timestamp of a stream, or None if it has none."""
     columns = recording.columns(stream)
     if TIME not in columns.column_names or not columns.num_rows:
         return None
@@ -168,9 +168,9 @@ def _start(recording: Recording, stream: str) -> int | None:
 
 
 def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Iterator[tuple[int, int, bytes]]]:
-    """Register the topics of a stream, and return log time, channel and content of the messages of each, by time.
+    """Register the topics of a stream; return log time, channel and content of each topic's messages, ordered by time.
 
-    Topics have the same stamps, so they are asked for the same rows at about the same time.
+    Topics of a stream have the same timestamps, so they consume the same rows at about the same time.
     """
     stored = recording.columns(stream.name)
     tables = stored.batches() if stream.ordered else iter([recording.table(stream.name)])
@@ -189,7 +189,7 @@ def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Ite
 
 
 def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
-    """Return iterators over the same values: one stays until all have had it (that of itertools keeps 57 together)."""
+    """Return iterators over the same values, each kept until all have read it (itertools.tee keeps 57 together)."""
     waiting: list[deque[Any]] = [deque() for _ in range(readers)]
 
     def read(mine: deque[Any]) -> Iterator[Any]:
@@ -208,7 +208,7 @@ def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
 
 
 def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield log time, channel and content of the messages of the topic of this number."""
+    """Yield log time, channel and content of the messages of the topic with this index."""
     import numpy as np
 
     from tacpipe.exports import ros
@@ -218,7 +218,7 @@ def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]
         t_ns = topic.t_ns
         stamps, messages = t_ns.tolist(), ros.pack_messages(topic.parts, len(t_ns))
         del topics, topic
-        if np.any(np.diff(t_ns) < 0):  # events come stream by stream
+        if np.any(np.diff(t_ns) < 0):  # events are ordered by stream
             all_messages = list(messages)
             yield from ((stamps[row], channel, all_messages[row]) for row in np.argsort(t_ns, kind="stable").tolist())
         else:
@@ -226,7 +226,7 @@ def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]
 
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
-    """Yield what of a stream its messages do not hold."""
+    """Yield the losses of a stream in its messages."""
     import pyarrow as pa
 
     from tacpipe.exports import ros

@@ -1,12 +1,12 @@
-"""Write streams as ROS 2 messages: one type per stream with all columns, and the usual types where columns fit.
+"""Write streams as ROS 2 messages: one type per stream with all columns, and standard types for columns that fit.
 
-The message of a stream has one field per column, so values keep their bits. Where columns make up a usual message (joint
-states, a pose, a wrench, a twist, tactile states, an encoded image), that is written too, for programs that read nothing
-else.
+The message of a stream has one field per column, so values keep their bits. Columns that form a standard message (joint
+states, a pose, a wrench, a twist, tactile states, an encoded image) are written as that too, for programs that read
+nothing else.
 
-Messages are packed in CDR, little endian, for all rows of a stream at once. A message is a sequence of parts: `Constant`
-bytes of each message, `Values` with one number per message, `Texts` of any length. A message without `Texts` has the same
-size in every row, so numpy lays out all of them as one array.
+Messages are packed in CDR, little endian, for all rows of a stream at once. A message is a sequence of parts:
+`Constant` bytes, `Values` with one number per message, `Texts` of any length. A message without `Texts` has the same
+size in every row, so numpy packs all of them as one array.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from tacpipe.formats.arrays.tree import picture_encoding
 if TYPE_CHECKING:
     import pyarrow as pa
 
-HEADER = b"\x00\x01\x00\x00"  # start of each message: CDR, little endian; positions are counted after it
+HEADER = b"\x00\x01\x00\x00"  # start of each message: CDR, little endian; alignment is relative to its end
 NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class Constant:
-    """Bytes that each message has, at a multiple of ``align`` bytes."""
+    """Bytes that are equal in each message, aligned to ``align`` bytes."""
 
     content: bytes
     align: int = 1
@@ -42,14 +42,14 @@ class Constant:
 
 @dataclass(frozen=True)
 class Values:
-    """A number of each message, (time,), in the type that it is written in."""
+    """A number per message (time,), in the type in which it is written."""
 
     values: AnyArray
 
 
 @dataclass(frozen=True)
 class Texts:
-    """A text or bytes of each message; texts end with a zero byte."""
+    """A text or bytes per message; texts end with a zero byte."""
 
     values: Sequence[str] | Sequence[bytes]
 
@@ -58,7 +58,7 @@ Part = Constant | Values | Texts
 
 
 def text_part(value: str) -> Constant:
-    """Return a text that each message has."""
+    """Return a text that is equal in each message."""
     content = value.encode() + b"\0"
     return Constant(struct.pack("<I", len(content)) + content, 4)
 
@@ -69,13 +69,13 @@ def count_part(number: int) -> Constant:
 
 
 def header_parts(t_ns: Int64s, frame: str) -> list[Part]:
-    """Return the parts of a std_msgs/Header: the stamp in seconds and nanoseconds, and the frame's name."""
+    """Return the parts of a std_msgs/Header: the timestamp in seconds and nanoseconds, and the frame's name."""
     seconds, rest_ns = np.divmod(t_ns, NS)
     return [Values(seconds.astype("<i4")), Values(rest_ns.astype("<u4")), text_part(frame)]
 
 
 def sequence_parts(columns: Iterable[AnyArray], kind: str = "<f8") -> list[Part]:
-    """Return the parts of a sequence of numbers, one a column; ``kind`` is the numpy type of its items."""
+    """Return the parts of a sequence with one number per column; ``kind`` is the numpy type of its items."""
     values = [Values(column.astype(kind)) for column in columns]
     return [count_part(len(values)), *values]
 
@@ -112,7 +112,7 @@ def _pack_fixed(parts: Sequence[Part], rows: int) -> AnyArray:
 
 
 def _shape(part: Part) -> tuple[int, int]:
-    """Return alignment and size of a part in bytes."""
+    """Return the alignment and size of a part in bytes."""
     if isinstance(part, Constant):
         return part.align, len(part.content)
     assert isinstance(part, Values)
@@ -144,10 +144,10 @@ def _align_up(position: int, to: int) -> int:
 
 
 PACKAGE = "tacpipe_msgs"
-POINT, COLOURS = ("x_m", "y_m", "z_m"), ("red", "green", "blue")  # columns of a cloud
+POINT, COLOURS = ("x_m", "y_m", "z_m"), ("red", "green", "blue")  # columns of a point cloud
 _FLOAT32 = 7  # a constant of sensor_msgs/PointField
-MAX_STAMP_S = 2**31 - 1  # largest int32, the type of a stamp's seconds
-TYPES = {  # arrow type to type of a message's field
+MAX_STAMP_S = 2**31 - 1  # largest int32, the type of a timestamp's seconds
+TYPES = {  # message field type by arrow type
     **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
     **{"float": "float32", "double": "float64", "bool": "bool", "string": "string", "binary": "uint8[]"},
 }
@@ -178,7 +178,7 @@ _DEFINITIONS = {
 
 
 class TopicColumn(TypedDict):
-    """The column of a stream that a field of a message holds."""
+    """The column of a stream in a message field."""
 
     field: str
     name: str
@@ -187,7 +187,7 @@ class TopicColumn(TypedDict):
 
 
 class TopicMetadata(TypedDict, total=False):
-    """Where the messages of a topic come from."""
+    """The origin of a topic's messages."""
 
     stream: str
     columns: list[TopicColumn]
@@ -197,7 +197,7 @@ class TopicMetadata(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a recording: the type of its messages, their stamps (message,) and their parts."""
+    """One topic of a recording: its message type, timestamps (message,) and parts."""
 
     name: str
     type: str  # package/msg/Name
@@ -208,10 +208,10 @@ class Topic:
 
 
 def stream_topic(stream: str, table: pa.Table) -> Topic:
-    """Return the topic of a stream with all columns in their own types; the header has the stamps.
+    """Return the topic of a stream with all columns in their own types; the header has the timestamps.
 
-    Its metadata name stream and columns as they were, with their own metadata. Columns of types that no message has are
-    left out; a missing integer is 0, a missing float NaN, a missing text empty.
+    Its metadata contain the original names and metadata of stream and columns. Columns of types that no message
+    supports are omitted; a missing integer becomes 0, a missing float NaN, a missing text empty.
     """
     import pyarrow as pa
 
@@ -240,7 +240,7 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
 
 
 def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> list[Topic]:
-    """Return the topics of usual messages that the columns of a stream make up.
+    """Return the topics of standard messages formed by the columns of a stream.
 
     ``images`` are the columns of encoded images. Rows without an image have no message.
     """
@@ -290,12 +290,12 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
 
 
 def cloud_columns(schema: pa.Schema) -> list[str]:
-    """Return the columns of a cloud of points that its message carries."""
+    """Return the columns of a point cloud that its message represents."""
     return [*POINT, *(COLOURS if set(COLOURS) <= set(schema.names) else ())]
 
 
 def cloud_topic(stream: str, table: pa.Table, t_ns: int) -> Topic:
-    """Return the topic of a cloud of points: one message with x, y, z and, where there are colours, rgb, as float32."""
+    """Return the topic of a point cloud: one message with x, y, z and, if there are colours, rgb, as float32."""
     coloured = len(cloud_columns(table.schema)) > len(POINT)
     names = ["x", "y", "z", *(["rgb"] if coloured else [])]
     points = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
@@ -331,7 +331,7 @@ def cloud_topic(stream: str, table: pa.Table, t_ns: int) -> Topic:
 
 
 def vector_parts(table: pa.Table, quantity: str, components: Sequence[str]) -> list[Part]:
-    """Return the components of a quantity as float64 in their order; empty unless each is there once."""
+    """Return the components of a quantity as float64 in order; an empty list unless each occurs once."""
     by_component: dict[str, list[str]] = {}
     for name in columns_of_quantity(table, quantity):
         by_component.setdefault(field_metadata(table.schema.field(name)).get("component", ""), []).append(name)
@@ -341,7 +341,7 @@ def vector_parts(table: pa.Table, quantity: str, components: Sequence[str]) -> l
 
 
 def columns_of_quantity(table: pa.Table, quantity: str) -> list[str]:
-    """Return the columns of numbers that hold a quantity."""
+    """Return the numeric columns of a quantity."""
     return [
         field_.name
         for field_ in table.schema
@@ -350,7 +350,7 @@ def columns_of_quantity(table: pa.Table, quantity: str) -> list[str]:
 
 
 def column_numbers(column: pa.ChunkedArray) -> AnyArray:
-    """Return a column as numbers, little endian (time,); where one is missing NaN, or 0 in integers."""
+    """Return a column as little-endian numbers (time,); missing values are NaN, or 0 for integers."""
     import pyarrow as pa
 
     if column.null_count:
@@ -360,7 +360,7 @@ def column_numbers(column: pa.ChunkedArray) -> AnyArray:
 
 
 def field_names(columns: Sequence[str]) -> dict[str, str]:
-    """Return a name of a message's field for each column: lower case letters, digits, single underscores, no two alike.
+    """Return a unique message field name for each column: lower case letters, digits, single underscores.
 
     >>> field_names(["taxel01_x", "Force X [N]", "header"])
     {'taxel01_x': 'taxel01_x', 'Force X [N]': 'force_x_n', 'header': 'header_2'}
@@ -378,7 +378,7 @@ def field_names(columns: Sequence[str]) -> dict[str, str]:
 
 
 def topic_part(stream: str) -> str:
-    """Return the name of a stream as a part of a topic's name."""
+    """Return the name of a stream in topic names."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", stream)
     return name if name[:1].isalpha() else f"stream_{name}"
 
@@ -404,7 +404,7 @@ def _full_type(name: str) -> str:
 
 
 def _definition(name: str, definitions: Mapping[str, str]) -> str:
-    """Return the definition of a message with those of all that it is made of, as ROS concatenates them."""
+    """Return the definition of a message with those of all types in it, concatenated as in ROS."""
     needed: list[str] = []
     pending = [name]
     while pending:

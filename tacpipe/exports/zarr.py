@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     Parts = Dataset
 
-STORE = "replay.zarr"  # the folder of the store
+STORE = "replay.zarr"  # folder of the store
 ENDS = "meta/episode_ends"
 CHUNK_BYTES = 1 << 20  # size of a chunk before compression
 _OPENING = f"""
@@ -57,7 +57,7 @@ class Params:
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the stage that recordings go through first, where a rate is given."""
+    """Return the preceding stage if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
@@ -65,7 +65,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
 
 @stage(version=2, reads=("grid", "grid_rate_hz"))
 def part(params: Params, recording: Recording) -> RecordingOutput:
-    """Return what one recording holds."""
+    """Return the description of one recording."""
     from tacpipe.exports import frames
 
     return RecordingOutput(frames.describe(recording))
@@ -127,7 +127,7 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
 
 
 class _ArrayWriter:
-    """Takes the rows of an array in order and puts its chunks, compressed as zarr's own, into a temporary file."""
+    """Writes the rows of an array in order as chunks, compressed like zarr's own, to a temporary file."""
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class _ArrayWriter:
         row_bytes = kind.itemsize * math.prod(shape[1:])
         self._chunk_rows = max(1, min(shape[0], CHUNK_BYTES // row_bytes))
         self._waiting: list[AnyArray] = []
-        self._rows = self._first_row = 0  # rows that wait, and the number of the first of them
+        self._rows = self._first_row = 0  # number of buffered rows, and the index of the first of them
         self._encoded: dict[str, Buffer] = {}  # metadata, and the chunks of the last write
         self._array = zarr.create_array(
             MemoryStore(self._encoded),
@@ -157,10 +157,10 @@ class _ArrayWriter:
             config={"write_empty_chunks": True},
         )
         self._metadata = {name: content.to_bytes() for name, content in self._encoded.items()}
-        self._places: dict[str, tuple[int, int]] = {}  # offset and bytes of each chunk in the temporary file
+        self._places: dict[str, tuple[int, int]] = {}  # offset and size of each chunk in the temporary file
 
     def append(self, values: AnyArray) -> None:
-        """Add rows, and write the chunks that are complete."""
+        """Add rows, and write complete chunks."""
         import numpy as np
 
         self._waiting.append(values)

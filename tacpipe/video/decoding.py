@@ -1,4 +1,4 @@
-"""Decode the frames of a stream into arrays, one after another; PyAV (FFmpeg) decodes them."""
+"""Decode the frames of a stream to arrays one after another with PyAV (FFmpeg)."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
     from tacpipe.io.columns import Columns
 
-NEEDED_BY = "Reading video"  # begins the error of a missing extra
-MAX_DELAY = 16  # frames that a decoder may hold back
-DECODERS = {"av1": "libdav1d"}  # FFmpeg's own decoder of AV1 needs a graphics card
+NEEDED_BY = "Reading video"  # start of the error about a missing extra
+MAX_DELAY = 16  # maximum number of frames that a decoder delays
+DECODERS = {"av1": "libdav1d"}  # FFmpeg's own AV1 decoder needs a graphics card
 GREY = "gray"  # FFmpeg's name
 
 
@@ -38,9 +38,10 @@ def decode_frames(
 ) -> Iterator[tuple[int, Bytes]]:
     """Yield row number and image of each frame, uint8 (height, width, rgb), or (height, width) for ``grey``.
 
-    ``batches`` are rows of a stream in presentation order, from a key frame on; rows are counted from the first of them.
-    Frames come in the order of rows. A row that has no picture, as an empty packet, is left out. Few frames are in memory
-    at once. Raises `TacpipeError` if a frame cannot be decoded or has another size, `MissingModuleError` without PyAV.
+    ``batches`` are rows of a stream in presentation order that start at a key frame; rows are counted from the first of
+    them. Frames are yielded in row order. A row without an image, such as an empty packet, is skipped. Few frames are
+    in memory at once. Raises `TacpipeError` if a frame cannot be decoded or has another size, and `MissingModuleError`
+    if PyAV is not installed.
     """
     for row, frame in _decode(video_format, batches):
         image: Bytes = frame.to_ndarray(format=GREY if grey else RGB)
@@ -58,7 +59,7 @@ def decode_samples(video_format: VideoFormat, batches: Iterable[pa.Table]) -> It
 
 
 def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, bytes]]:
-    """Yield row number and JPEG of each frame as `decode_frames` does, for viewers: decoded, and encoded with some loss."""
+    """Yield row number and JPEG of each frame, in the order of `decode_frames`, re-encoded with some loss for viewers."""
     encoder = JpegEncoder(video_format.width_px, video_format.height_px, "yuvj420p")
     for row, frame in _decode(video_format, batches):
         yield row, encoder.encode(frame)
@@ -80,7 +81,7 @@ def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> I
 def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) -> dict[int, Bytes]:
     """Return the images of some rows of a stream of frames by row, as `decode_frames` yields them.
 
-    Only what each needs is decoded: the rows from the key frame before it.
+    For each row, decoding starts at the preceding key frame.
     """
     video_format = read_format(columns)
     if video_format is None:
@@ -117,7 +118,7 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
                 continue
             packet = av.Packet(columns[PACKET])
             packet.pts = packet.dts = row
-            packet.is_keyframe = bool(columns[KEY_FRAME])  # FFmpeg adds other PNG images to the one before
+            packet.is_keyframe = bool(columns[KEY_FRAME])  # FFmpeg would add other PNG images to the previous one
             for frame in context.decode(packet):
                 yield _numbered(video_format, frame)
         for frame in context.decode(None) if started else ():
@@ -131,16 +132,16 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
 
 
 def open_decoder(video_format: VideoFormat) -> Any:
-    """Return a decoder of PyAV, on one thread. Raises `TacpipeError` if FFmpeg has none for the codec."""
+    """Return a single-threaded PyAV decoder. Raises `TacpipeError` if FFmpeg has none for the codec."""
     with extras.explain_missing(NEEDED_BY):
         import av
     try:
         context: Any = av.CodecContext.create(DECODERS.get(video_format.codec, video_format.codec), "r")
-    except ValueError as error:  # UnknownCodecError is one
+    except ValueError as error:  # UnknownCodecError is a ValueError
         raise TacpipeError(
             f"There is no decoder for the codec {plain(video_format.codec)}. Convert the video to H.264 first."
         ) from error
-    context.thread_count = 1  # a stage runs on one core per recording
+    context.thread_count = 1  # a stage uses one core per recording
     context.width, context.height = video_format.width_px, video_format.height_px
     if video_format.pixel_format:
         context.pix_fmt = video_format.pixel_format

@@ -10,9 +10,9 @@ from tacpipe.arrays import Bytes
 from tacpipe.plugins import extras
 from tacpipe.video.stream import VideoFormat
 
-ENCODED_BY = "Encoding video"  # begins the error of a missing extra
+ENCODED_BY = "Encoding video"  # start of the error about a missing extra
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
-JPEG_QUALITY = 2  # FFmpeg's scale of the quantizer; 2 is the best quality
+JPEG_QUALITY = 2  # FFmpeg's quantizer scale, on which 2 is the best quality
 RGB = "rgb24"  # FFmpeg's name
 
 
@@ -31,7 +31,7 @@ def encode_images(video_format: VideoFormat, images: Iterable[Bytes]) -> Iterato
 
 
 class JpegEncoder:
-    """Encodes frames of PyAV as JPEG images of one size, on one thread."""
+    """Encodes PyAV frames as JPEG images of one size, on one thread."""
 
     def __init__(self, width_px: int, height_px: int, pixel_format: str) -> None:
         with extras.explain_missing(ENCODED_BY):
@@ -39,7 +39,7 @@ class JpegEncoder:
         encoder: Any = av.CodecContext.create("mjpeg", "w")
         encoder.width, encoder.height, encoder.pix_fmt = width_px, height_px, pixel_format
         encoder.time_base = MICROSECOND
-        encoder.thread_count = 1  # a stage runs on one core per recording
+        encoder.thread_count = 1  # a stage uses one core per recording
         encoder.options = {"qmin": str(JPEG_QUALITY), "qmax": str(JPEG_QUALITY)}
         self._encoder, self._count = encoder, 0
 

@@ -1,4 +1,4 @@
-"""Read video files into streams of frames and write streams as video files: packets are copied, never encoded again."""
+"""Read video files as streams of frames and write streams as video files; packets are copied, never re-encoded."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, PACKET, PTS, VideoF
 if TYPE_CHECKING:
     import pyarrow as pa
 
-DEMUXERS = {  # FFmpeg's names by extension: what a file contains does not choose, as a playlist would open other files
+DEMUXERS = {  # FFmpeg's demuxer by extension; the content does not choose it, because a playlist could open other files
     ".avi": "avi",
     ".m4v": "mp4",
     ".mjpeg": "mjpeg",
@@ -34,13 +34,15 @@ DEMUXERS = {  # FFmpeg's names by extension: what a file contains does not choos
     ".mp4": "mp4",
     ".webm": "matroska",
 }
-IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # FFmpeg's names by extension
+IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # FFmpeg's codec by extension
 IMAGE_DEMUXERS = {"mjpeg": "jpeg_pipe", "png": "png_pipe", "webp": "webp_pipe"}
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
-WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files that do not state when a frame is presented
-NOMINAL = "from nominal rate"  # origin of stamps that a file's frame rate gave
-FROM_PTS = "from presentation times"  # origin of stamps that a file's own presentation times gave
-FRAME_TOLERANCE = 1e-6  # frames by which a time may differ from the grid of the nominal rate, besides one tick
+WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files without presentation times
+NOMINAL = "from nominal rate"  # origin of timestamps computed from a file's frame rate
+FROM_PTS = "from presentation times"  # origin of timestamps computed from a file's presentation times
+FRAME_TOLERANCE = (
+    1e-6  # tolerance of times relative to the grid of the nominal rate, in frames, in addition to one tick
+)
 
 
 @dataclass(frozen=True)
@@ -66,23 +68,23 @@ class VideoScan:
         return np.array([(tick * numerator * 2 + denominator) // (2 * denominator) for tick in ticks], np.int64)
 
     def counter(self) -> Int64s | None:
-        """Return the number of each frame, shape (frame,), with gaps where frames are missing.
+        """Return the number of each frame, shape (frame,), with gaps for missing frames.
 
-        None if frames have no common rate.
+        Returns None if frames have no common rate.
         """
         rate = self.video_format.nominal_rate_hz
         return None if rate is None else _grid(self.pts, self.video_format.time_base, rate)
 
     def stamp_origin(self) -> str:
-        """Return how the stamps of frames came about: from the nominal rate, or from times in the file."""
+        """Return the origin of the timestamps: the nominal rate, or times in the file."""
         return NOMINAL if self.video_format.nominal_rate_hz is not None else FROM_PTS
 
 
 def scan(path: Path) -> VideoScan:
-    """Return the frames of the first video of a file. Raises `TacpipeError`, naming the file, where it cannot be read.
+    """Return the frames of a file's first video stream. Raises `TacpipeError` with the file's name if it cannot be read.
 
-    Where a file does not state when frames are presented, and its codec may order them in another way than they lie in
-    the file, the frames are decoded once to find their order.
+    If a file has no presentation times and its codec may reorder frames, the frames are decoded once to find their
+    order.
     """
     with _open_input(path) as container:
         video = _video_stream(path, container)
@@ -126,7 +128,7 @@ def scan(path: Path) -> VideoScan:
 def scan_images(paths: Sequence[Path]) -> VideoFormat:
     """Return the format of a stream whose packets are image files, each a key frame.
 
-    Raises `TacpipeError`, naming the file, for one that is no image and one of another kind or size than the first.
+    Raises `TacpipeError` with the file's name if it is not an image or differs from the first in kind or size.
     """
     first: VideoFormat | None = None
     for path in paths:
@@ -149,9 +151,9 @@ def scan_images(paths: Sequence[Path]) -> VideoFormat:
 
 
 def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
-    """Return a stream of frames of image files, read as it is taken; ``t_ns`` (frame,) are the stamps.
+    """Return a stream of frames from image files, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    Presentation times are microseconds since the first frame, and differ. Raises `TacpipeError` as `scan_images` does.
+    Presentation times are distinct microseconds since the first frame. Raises `TacpipeError` as `scan_images` does.
     """
     video_format = scan_images(paths)
     index = np.arange(len(paths))
@@ -161,7 +163,7 @@ def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) ->
 
 
 def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
-    """Yield the packets of a file in presentation order, given its `scan`; at most ``reorder_frames`` and one wait."""
+    """Yield the packets of a file in presentation order, given its `scan`; at most ``reorder_frames`` + 1 are buffered."""
     rows = np.argsort(frames.packet_index).tolist()  # rows in the order of the file
     waiting: list[tuple[int, bytes]] = []
     following = 0
@@ -177,9 +179,9 @@ def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
 
 
 def read_stream(path: Path, frames: VideoScan, t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
-    """Return the stream of frames of a file, read as it is taken; ``t_ns`` (frame,) are the stamps.
+    """Return the stream of frames of a file, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    Raises `TacpipeError`, also while it is taken, where the file cannot be read.
+    Raises `TacpipeError` if the file cannot be read, also while the stream is read.
     """
     return packet_stream(
         frames.video_format,
@@ -199,7 +201,7 @@ def packet_stream(
     seq: Int64s | None,
     stamp_origin: str | None,
 ) -> pa.RecordBatchReader:
-    """Return a stream of frames of packets in presentation order.
+    """Return a stream of frames from packets in presentation order.
 
     ``clocks`` are ``pts``, ``dts`` and ``key_frame`` of each packet (frame,).
     """
@@ -226,9 +228,9 @@ def packet_stream(
 
 
 def write_file(path: Path, video_format: VideoFormat, batches: Iterable[pa.Table]) -> None:
-    """Write rows of a stream of frames, from a key frame on, as the video file ``path``, whose ending states its kind.
+    """Write rows of a stream of frames, starting at a key frame, to the video file ``path`` of any supported extension.
 
-    Packets are copied. Times begin at 0. Raises `TacpipeError` if the kind of file cannot hold the codec.
+    Packets are copied. Times start at 0. Raises `TacpipeError` if the kind of file does not support the codec.
     """
     with extras.explain_missing("Writing video"):
         import av
@@ -249,7 +251,7 @@ def write_file(path: Path, video_format: VideoFormat, batches: Iterable[pa.Table
 
 
 def add_stream(container: Any, video_format: VideoFormat) -> Any:
-    """Return a stream of an output file of PyAV that takes packets of this format as they are."""
+    """Return a stream of a PyAV output file that accepts packets of this format unchanged."""
     import av
 
     with av.open("/dev/null", "w", format="nut") as scratch:
@@ -268,7 +270,7 @@ def add_stream(container: Any, video_format: VideoFormat) -> Any:
 def decode_order_packets(
     video_format: VideoFormat, batches: Iterable[pa.Table]
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Yield packets of PyAV with their times, and the columns of their rows, in the order of decoding."""
+    """Yield PyAV packets with their times, and the columns of their rows, in decoding order."""
     import av
 
     step = 1
@@ -286,7 +288,7 @@ def decode_order_packets(
 
 @contextmanager
 def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
-    """Yield a video file that PyAV opened; errors of FFmpeg name the file."""
+    """Yield a video file opened by PyAV; errors of FFmpeg name the file."""
     with extras.explain_missing(NEEDED_BY):
         import av
     with regular.failing(path), regular.opened(path) as file:
@@ -323,7 +325,7 @@ def _format(path: Path, video: Any) -> VideoFormat:
 
 
 def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
-    """Return the positions in the file of frames in the order in which a decoder presents them; others follow."""
+    """Return the file positions of frames in presentation order; frames that are not presented follow."""
     order: list[int] = []
     position = 0
     with _open_input(path) as container:
@@ -338,7 +340,7 @@ def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
 
 
 def _strict(dts: Sequence[int | None]) -> list[int]:
-    """Return decoding times that grow with each frame: those of the file, or numbers where it does not state them."""
+    """Return strictly increasing decoding times: those of the file, or indices if it has none."""
     stamps = [stamp for stamp in dts if stamp is not None]
     return stamps if len(stamps) == len(dts) and _grows(stamps) else list(range(len(dts)))
 
@@ -350,7 +352,7 @@ def _grows(stamps: Sequence[int | None]) -> bool:
 def _grid(pts: Int64s, time_base: Fraction, rate: Fraction) -> Int64s | None:
     """Return the number of each frame at a common rate, (frame,), from 0, or None if the times do not fit the rate.
 
-    They do not fit either where most frames would be missing: FFmpeg guesses such rates for frames at irregular times.
+    They do not fit either if most frames would be missing, because FFmpeg guesses such rates for irregular times.
     """
     per_tick = Fraction(rate) * time_base
     frames = (pts - pts[0]).astype(np.float64) * float(per_tick)

@@ -17,36 +17,36 @@ import numpy as np
 from tacpipe.arrays import Bools, Bytes, Floats, Int64s
 from tacpipe.plugins import extras
 
-NEEDED_BY = "Tracking markers"  # begins the error of a missing extra
-MIN_DARKNESS = 0.12  # fraction by which a marker is darker than the gel around it
-MIN_AREA_PX = 12  # smallest area of a marker
-AREA_RATIO = 3.0  # largest ratio of a marker's area to the median area
+NEEDED_BY = "Tracking markers"  # start of the error about a missing extra
+MIN_DARKNESS = 0.12  # minimum fraction by which a marker is darker than the surrounding gel
+MIN_AREA_PX = 12  # minimum area of a marker
+AREA_RATIO = 3.0  # maximum ratio of a marker's area to the median area
 NEIGHBOURHOOD = 8  # the gel around a marker is a square of the image's width divided by this
-NEXT = 0.4  # distance from an expected place, in pitches, within which a detection is that marker
-CONFIRMED_PX = 0.5  # largest distance after tracking a marker forwards and back
-UNCONFIRMED_FRAMES = 5  # frames that a marker is tracked without a detection
-WINDOW_PX, LEVELS = 21, 3  # of Lucas-Kanade: side of the window, and levels of the pyramid
+NEXT = 0.4  # maximum distance in pitches between a detection and a marker's expected position
+CONFIRMED_PX = 0.5  # maximum distance after tracking a marker forwards and backwards
+UNCONFIRMED_FRAMES = 5  # number of frames for which a marker is tracked without a detection
+WINDOW_PX, LEVELS = 21, 3  # Lucas-Kanade: side of the window, and pyramid levels
 
 
 @dataclass(frozen=True)
 class MarkerGrid:
-    """Markers of a gel that are not displaced: a grid of rows and columns, row by row."""
+    """Undisplaced markers of a gel: a grid of rows and columns, row by row."""
 
     rows: int
     columns: int
     positions_px: Floats  # (marker, xy), or NaN if no marker was detected
-    pitch_px: float  # distance of neighbours
+    pitch_px: float  # distance between neighbours
 
 
 def use_one_thread() -> None:
-    """Have OpenCV compute in the calling thread, in this process."""
+    """Make OpenCV compute in the calling thread in this process."""
     with extras.explain_missing(NEEDED_BY):
         import cv2
     cv2.setNumThreads(1)
 
 
 def detect(grey: Bytes) -> Floats:
-    """Return the centroids of dark dots in an image (height, width), px (marker, xy). Dots at the border are left out."""
+    """Return the centroids of dark dots in an image (height, width) in px (marker, xy), except dots at the border."""
     with extras.explain_missing(NEEDED_BY):
         import cv2
     side = max(3, grey.shape[1] // NEIGHBOURHOOD | 1)
@@ -71,10 +71,10 @@ def detect(grey: Bytes) -> Floats:
 
 
 def find_grid(grey: Bytes, rows: int, columns: int) -> MarkerGrid | None:
-    """Return the markers of an image in a grid of ``rows`` and ``columns``; None for an image without neighbouring dots.
+    """Return the markers of an image as a grid of ``rows`` and ``columns``, or None if no dots are neighbours.
 
-    Of a larger grid, the part with the most markers is taken, and of several the one nearest to the centre of the image.
-    Rows follow the direction of x within 30 degrees.
+    For a larger grid, the part with the most markers is used, and of several the one nearest to the image's centre.
+    Rows are within 30 degrees of the x axis.
     """
     detections = detect(grey)
     if len(detections) < 4:
@@ -111,19 +111,19 @@ def find_grid(grey: Bytes, rows: int, columns: int) -> MarkerGrid | None:
 
 @dataclass
 class MarkerTracker:
-    """Positions of the markers of a grid, frame by frame. A position depends on no later frame."""
+    """Tracks the markers of a grid frame by frame. A position does not depend on later frames."""
 
     grid: MarkerGrid
-    previous: Bytes  # the image of which `positions_px` are known
-    positions_px: Floats = field(init=False)  # (marker, xy); NaN: missing
-    unconfirmed: Int64s = field(init=False)  # (marker,), frames since the last detection
+    previous: Bytes  # image for which `positions_px` are valid
+    positions_px: Floats = field(init=False)  # (marker, xy); NaN if missing
+    unconfirmed: Int64s = field(init=False)  # (marker,), number of frames since the last detection
 
     def __post_init__(self) -> None:
         self.positions_px = self.grid.positions_px.copy()
         self.unconfirmed = np.zeros(len(self.positions_px), np.int64)
 
     def step(self, grey: Bytes) -> tuple[Floats, Bools]:
-        """Return the positions in the next image, px (marker, xy), or NaN if missing, and which were detected (marker,)."""
+        """Return positions in the next image in px (marker, xy), NaN if missing, and whether each was detected (marker,)."""
         expected, is_confirmed = self._predict(grey)
         detections = detect(grey)
         detected = self._match(expected, detections, np.full(len(expected), -1))
@@ -139,7 +139,7 @@ class MarkerTracker:
         return positions, is_detected
 
     def _predict(self, grey: Bytes) -> tuple[Floats, Bools]:
-        """Return where Lucas-Kanade finds the markers (marker, xy), and where tracking back agrees (marker,)."""
+        """Return the positions predicted by Lucas-Kanade (marker, xy), and whether backward tracking agrees (marker,)."""
         import cv2
 
         expected, is_confirmed = np.full_like(self.positions_px, np.nan), np.zeros(len(self.positions_px), bool)
@@ -157,7 +157,7 @@ class MarkerTracker:
         return expected, is_confirmed
 
     def _match(self, expected: Floats, detections: Floats, detected: Int64s) -> Int64s:
-        """Return the detection of each marker (marker,), -1 for none; those ``detected`` before keep theirs."""
+        """Return the detection of each marker (marker,), -1 for none; markers in ``detected`` keep theirs."""
         detected = detected.copy()
         free = np.setdiff1d(np.arange(len(detections)), detected)
         wanting = np.flatnonzero((detected < 0) & ~np.isnan(expected[:, 0]))
@@ -170,7 +170,10 @@ class MarkerTracker:
         return detected
 
     def _suggest(self, detected: Int64s, detections: Floats) -> Floats:
-        """Return where markers should be (marker, xy) by the displacement of detected neighbours; NaN without any."""
+        """Return positions of markers (marker, xy) estimated from the displacement of detected neighbours.
+
+        NaN without any.
+        """
         shape = (self.grid.rows, self.grid.columns, 2)
         displacements = np.full_like(self.grid.positions_px, np.nan)
         is_detected = detected >= 0
@@ -190,7 +193,7 @@ class MarkerTracker:
 
 
 def _steps(detections: Floats) -> Floats | None:
-    """Return the usual steps to the next column and the next row, px (2, xy); None without neighbours."""
+    """Return the median offsets to the next column and row in px (2, xy), or None if no markers are neighbours."""
     offsets = detections[None] - detections[:, None]  # (marker, other, xy)
     distances = np.linalg.norm(offsets, axis=2) + np.diag(np.full(len(detections), np.inf))
     steps = []
@@ -206,7 +209,7 @@ def _steps(detections: Floats) -> Floats | None:
 
 
 def _cells(detections: Floats, steps: Floats, first: int) -> dict[tuple[int, int], int]:
-    """Return the marker in each cell, (row, column) to its number, spreading from the marker ``first``."""
+    """Return the index of the marker in each cell (row, column), spreading from the marker ``first``."""
     pitch = float(np.linalg.norm(steps, axis=1).mean())
     cells = {(0, 0): first}
     taken = {first}

@@ -1,7 +1,7 @@
-"""Describe streams of frames: one row per frame with its encoded packet, the codec in the metadata of the packet column.
+"""Describe streams of frames: one row per frame with its encoded packet; the packet column's metadata name the codec.
 
-Rows are in presentation order. `DTS` gives the order of decoding, which differs where a codec has B-frames. Rows whose
-`KEY_FRAME` is true can be decoded without the rows before them. pyarrow is imported when fields are built.
+Rows are in presentation order. `DTS` gives the decoding order, which differs if a codec has B-frames. Rows whose
+`KEY_FRAME` is true can be decoded without earlier rows. pyarrow is imported when fields are built.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 PACKET, PTS, DTS, KEY_FRAME = "packet", "pts", "dts", "key_frame"
-BATCH_ROWS = 64  # frames that are in memory at once, encoded
-MAX_SIDE_PX = 1 << 14  # largest width and height of a frame
-MAX_REORDER = 1 << 10  # largest number of frames between decoding and presentation that is plausible
+BATCH_ROWS = 64  # number of encoded frames in memory at once
+MAX_SIDE_PX = 1 << 14  # maximum width and height of a frame
+MAX_REORDER = 1 << 10  # maximum plausible number of frames between decoding and presentation
 _CODEC, _WIDTH, _HEIGHT, _PIXELS = "codec", "width_px", "height_px", "pixel_format"
 _TIME_BASE, _RATE, _EXTRADATA, _REORDER = "time_base_s", "nominal_rate_hz", "extradata", "reorder_frames"
 
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """The codec of a stream of frames, and all that a decoder or a file needs besides the packets."""
+    """The codec of a stream of frames, and everything else that a decoder or a file needs besides the packets."""
 
     codec: str  # FFmpeg's name, such as mjpeg, mpeg4, h264, hevc, av1, png
     width_px: int
     height_px: int
     pixel_format: str  # FFmpeg's name, such as yuv420p
     time_base: Fraction  # seconds per unit of pts and dts
-    nominal_rate_hz: Fraction | None = None  # frames per second that the source states; None: no common rate
-    extradata: bytes = b""  # the codec's headers that are not part of a packet
-    reorder_frames: int = 0  # largest number of rows by which a frame is decoded earlier than it is presented
+    nominal_rate_hz: Fraction | None = None  # frames per second according to the source; None without a common rate
+    extradata: bytes = b""  # codec headers that are not part of a packet
+    reorder_frames: int = 0  # maximum number of rows by which a frame is decoded before it is presented
 
     def __post_init__(self) -> None:
         sides_fit = 0 < self.width_px <= MAX_SIDE_PX and 0 < self.height_px <= MAX_SIDE_PX
@@ -56,7 +56,7 @@ class VideoFormat:
             )
 
     def describe(self) -> str:
-        """Return codec, size and rate in words, as ``mpeg4, 320 x 240 pixels, 25 frames/s``."""
+        """Return codec, size and rate as text, such as ``mpeg4, 320 x 240 pixels, 25 frames/s``."""
         rate = "" if self.nominal_rate_hz is None else f", {float(self.nominal_rate_hz):.6g} frames/s"
         return f"{plain(self.codec)}, {self.width_px} x {self.height_px} pixels{rate}"
 
@@ -78,7 +78,7 @@ class VideoFormat:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[bytes, bytes]) -> VideoFormat:
-        """Return the format that the metadata of a packet column states. Raises `TacpipeError` if it states none."""
+        """Return the format in the metadata of a packet column. Raises `TacpipeError` if there is none."""
         texts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
         try:
             return cls(
@@ -109,9 +109,9 @@ class VideoFormat:
         ]
 
     def schema(self, stamp_origin: str | None = None, *, counted: bool = True) -> pa.Schema:
-        """Return the schema of a stream: ``t_ns``, ``seq`` where frames are ``counted``, and `fields`.
+        """Return the schema of a stream: ``t_ns``, ``seq`` if frames are ``counted``, and `fields`.
 
-        ``stamp_origin`` states how stamps were computed that no clock gave.
+        ``stamp_origin`` is the origin of timestamps that do not come from a clock.
         """
         import pyarrow as pa
 
@@ -122,7 +122,10 @@ class VideoFormat:
 
 
 def read_format(source: pa.Table | pa.Schema | Columns) -> VideoFormat | None:
-    """Return the format of a stream of frames; None for a stream of another kind. Raises as `VideoFormat.from_metadata`."""
+    """Return the format of a stream of frames, or None for other streams.
+
+    Raises the errors of `VideoFormat.from_metadata`.
+    """
     schema: pa.Schema = getattr(source, "schema", source)
     if not {PACKET, DTS, KEY_FRAME} <= set(schema.names):
         return None
@@ -131,7 +134,7 @@ def read_format(source: pa.Table | pa.Schema | Columns) -> VideoFormat | None:
 
 
 def reorder_frames(dts: Int64s) -> int:
-    """Return the largest number of rows by which a frame is decoded earlier than it is presented.
+    """Return the maximum number of rows by which a frame is decoded before it is presented.
 
     >>> reorder_frames(np.array([0, 2, 3, 1, 4]))  # presented I B B P P, decoded I P B B P
     2
@@ -145,9 +148,9 @@ def reorder_frames(dts: Int64s) -> int:
 def in_decode_order(
     video_format: VideoFormat, batches: Iterable[pa.Table]
 ) -> Iterator[tuple[int, dict[str, int | bool | bytes]]]:
-    """Yield row number and columns of each frame in the order of decoding, given batches of rows in presentation order.
+    """Yield row number and columns of each frame in decoding order, given batches of rows in presentation order.
 
-    At most ``reorder_frames`` frames wait.
+    At most ``reorder_frames`` frames are buffered.
     """
     waiting: list[tuple[int, int, dict[str, int | bool | bytes]]] = []  # dts, row, columns
     row = 0
@@ -165,9 +168,9 @@ def in_decode_order(
 
 
 def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int, int]:
-    """Return the smallest range of rows that contains rows ``start`` to ``stop`` (exclusive) and can be decoded alone.
+    """Return the smallest range of rows that contains rows ``start`` to ``stop`` (exclusive) and can be decoded by itself.
 
-    It begins at a key frame, and no frame in it needs one that is presented after it. Raises `TacpipeError` if no key
+    It starts at a key frame, and no frame in it needs one that is presented later. Raises `TacpipeError` if no key
     frame precedes ``start``.
     """
     if not 0 <= start < stop <= len(dts):
@@ -178,6 +181,6 @@ def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int,
             f"Frame {start} cannot be decoded: no key frame precedes it. Record or export the video from a key frame on."
         )
     latest = np.maximum.accumulate(dts)  # (row,)
-    earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), of this row and all after it
+    earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), of this row and all later ones
     is_boundary = np.append(latest[:-1] < earliest[1:], True)  # whether a cut may follow each row
     return int(keys[-1]), stop + int(np.argmax(is_boundary[stop - 1 :]))

@@ -1,4 +1,4 @@
-"""Tables that are not text: Parquet, arrays of numpy (NPY, NPZ), and JSON lines; blocks of columns as they hold them."""
+"""Read tables that are not text: Parquet, numpy arrays (NPY, NPZ) and JSON Lines, in blocks of columns."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
 from tacpipe.printable import plain
 
-BATCH_ROWS = 1 << 18  # largest batch of a Parquet file
+BATCH_ROWS = 1 << 18  # maximum number of rows in a batch of a Parquet file
 BLOCK_BYTES = 1 << 24  # size of a block of JSON lines or arrays
-READ_BYTES = 1 << 20  # bytes read at once per Parquet column, whatever its row groups' size
-MAX_COLUMNS = 1 << 20  # columns per array
-MAX_LINE_BYTES = 1 << 26  # bytes of one JSON object
+READ_BYTES = 1 << 20  # bytes read at once per Parquet column, whatever the size of row groups
+MAX_COLUMNS = 1 << 20  # maximum number of columns per array
+MAX_LINE_BYTES = 1 << 26  # maximum size of a JSON object
 _NOT_BLANK = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
 
 
 @dataclass(frozen=True)
 class ParquetFile:
-    """A Parquet file, whoever wrote it; nested columns are refused where they are asked for."""
+    """A Parquet file from any source; reading a nested column raises an error."""
 
     path: Path
 
@@ -53,7 +53,7 @@ class ParquetFile:
             raise TacpipeError(f"{self.path} is not a Parquet file: {plain(str(error), 200)}.") from error
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns that ``types`` names, some rows at a time, with the types that the file has."""
+        """Yield the columns in ``types`` in blocks of rows, with the types of the file."""
         try:
             require_claims(self.path, list(types), rows=min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types))))
             with regular.opened(self.path) as file:
@@ -65,23 +65,23 @@ class ParquetFile:
             raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
 
     def place(self, index: int) -> str:
-        """Return how the data row ``index`` (from 0) is named in errors."""
+        """Return the name of the data row ``index`` (from 0) in errors."""
         return f"row {index + 1}"
 
 
 @dataclass(frozen=True)
 class NumpyArchive:
-    """An NPZ archive: arrays (time,) are columns, one (time, n, …) is n columns NAME_0, NAME_1, …; pickles are refused."""
+    """An NPZ archive: arrays (time,) are columns; an array (time, n, …) is n columns NAME_0, NAME_1, …."""
 
     path: Path
-    time_axis: int = 0  # the dimension of each array along which its rows follow one another
+    time_axis: int = 0  # axis of the rows in each array
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
         return list(self._places)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns that ``types`` names, some rows at a time."""
+        """Yield the columns in ``types`` in blocks of rows."""
         array_names = {self._places[name][0] for name in types}
         arrays = {name: array for name, array in self._arrays.items() if name in array_names}
         rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
@@ -95,12 +95,12 @@ class NumpyArchive:
                 yield pa.table({name: _column(blocks, *self._places[name]) for name in types})
 
     def place(self, index: int) -> str:
-        """Return how the data row ``index`` (from 0) is named in errors."""
+        """Return the name of the data row ``index`` (from 0) in errors."""
         return f"row {index + 1}"
 
     @functools.cached_property
     def _places(self) -> dict[str, tuple[str, int | None]]:
-        """The array that each column is of, and its position within a row of that."""
+        """The array of each column, and the column's position in a row of it."""
         places: list[tuple[str, tuple[str, int | None]]] = []
         for name, array in self._arrays.items():
             if array.width is None:
@@ -110,7 +110,7 @@ class NumpyArchive:
         return container.parts_by_name(places, self.path, "column")
 
     def arrays(self) -> Mapping[str, ArrayMember]:
-        """Return the arrays that have rows, by name."""
+        """Return the arrays with rows by name."""
         return self._arrays
 
     @functools.cached_property
@@ -145,7 +145,7 @@ class NumpyArchive:
 
 
 class NumpyFile(NumpyArchive):
-    """An .npy file: as an archive that holds its array alone, called as the file."""
+    """An .npy file, treated as an archive with one array that has the file's name."""
 
     def _archive(self) -> contextlib.AbstractContextManager[Archive]:
         return contextlib.nullcontext(_LoneArray(self.path))
@@ -177,18 +177,18 @@ class _LoneArray:
 
 @dataclass(frozen=True)
 class ArrayMember:
-    """An array within an archive: what its header declares."""
+    """An array in an archive, as declared by its header."""
 
     name: str
     member: str  # name of the file in the archive
     shape: tuple[int, ...]
-    columnwise: bool  # Fortran's order: its rows are not one after another
+    columnwise: bool  # Fortran order: rows are not contiguous
     dtype: np.dtype[Any]
     time_axis: int = 0
 
     @classmethod
     def from_archive(cls, archive: Archive, member: zipfile.ZipInfo, time_axis: int = 0) -> ArrayMember:
-        """Return what the header declares. Raises `ValueError` for what is not an array, or holds Python objects."""
+        """Return the array declared by a header. Raises `ValueError` if it is not an array, or contains Python objects."""
         with archive.open(member.filename) as file:
             shape, columnwise, dtype = _read_header(file)
         if dtype.hasobject:
@@ -205,7 +205,7 @@ class ArrayMember:
 
     @property
     def rows(self) -> int:
-        """How many rows it has."""
+        """The number of rows."""
         return self.shape[self.time_axis]
 
     @property
@@ -215,12 +215,12 @@ class ArrayMember:
 
     @property
     def width(self) -> int | None:
-        """How many values a row has, or None if it is one value and no list of one."""
+        """The number of values per row, or None if a row is a scalar."""
         return math.prod(self.row_shape) if self.row_shape else None
 
     @property
     def row_bytes(self) -> int:
-        """How many bytes a row takes."""
+        """The size of a row in bytes."""
         return math.prod(self.row_shape) * self.dtype.itemsize
 
     @contextlib.contextmanager
@@ -266,19 +266,19 @@ def _column(blocks: Mapping[str, np.ndarray], array: str, position: int | None) 
 
 @dataclass(frozen=True)
 class JsonLines:
-    """A file with one JSON object per line; lists within it are columns NAME_0, NAME_1, …."""
+    """A file with one JSON object per line; lists in it become columns NAME_0, NAME_1, …."""
 
     path: Path
 
     def names(self) -> list[str]:
-        """Return the names of the columns: all that any line has."""
+        """Return the names of the columns in any line."""
         return list(self._kinds)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns that ``types`` names, some lines at a time; of the same types in each block."""
+        """Yield the columns in ``types`` in blocks of lines, with the same types in each block."""
         for block in map(self._unfolded, self._blocks()):
             columns = {
-                name: block.column(name).cast(self._kinds[name], safe=False)  # whole numbers of a column of floats too
+                name: block.column(name).cast(self._kinds[name], safe=False)  # includes integers in a column of floats
                 if name in block.column_names
                 else pa.nulls(block.num_rows, self._kinds[name])
                 for name in types
@@ -290,12 +290,12 @@ class JsonLines:
         return self._unfolded(next(self._blocks(), pa.table({})))
 
     def place(self, index: int) -> str:
-        """Return how the data row ``index`` (from 0) is named in errors."""
+        """Return the name of the data row ``index`` (from 0) in errors."""
         return f"line {index + 1}"
 
     @functools.cached_property
     def _kinds(self) -> dict[str, pa.DataType]:
-        """The type of each column that holds the values of all lines, in the order of their first coming."""
+        """The type of each column that represents the values of all lines, in order of first appearance."""
         schemas: list[pa.Schema] = []
         widths: dict[str, int] = {}
         for block in self._blocks():
@@ -343,7 +343,7 @@ class JsonLines:
                 (widths[field.name],) = lengths
 
     def _unfolded(self, block: pa.Table) -> pa.Table:
-        """Return a table whose columns of lists of one length are columns of their own."""
+        """Return a table whose list columns of constant length are split into columns."""
         columns: list[tuple[str, pa.ChunkedArray]] = []
         widths: dict[str, int] = {}
         self._widths(block, widths)

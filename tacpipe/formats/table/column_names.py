@@ -1,7 +1,8 @@
-"""Read quantity, unit and component from the names of columns and arrays.
+"""Infer quantity, unit and component from the names of columns and arrays.
 
-Names of arrays follow the conventions of robot learning: lengths are metres, angles radians, quaternions without unit, as
-robosuite, ALOHA, UMI, DROID and LeRobot write them. What a name does not show is left empty: a layout file states it.
+Array names follow the conventions of robot learning: lengths in metres, angles in radians, quaternions without unit, as
+in robosuite, ALOHA, UMI, DROID and LeRobot. Anything that a name does not show is left empty, for a layout file to
+state.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _TIME_WORDS = r"(t|time|times|time_?stamps?|stamps?|clock|unix_?time|epoch|datet
 TIME_NAME = re.compile(rf"{_TIME_WORDS}([_ ]?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
 TIME_ENDING = re.compile(rf"\w+_{_TIME_WORDS}(_(s|sec|ms|us|ns))?", re.IGNORECASE)
 UNIT_IN_NAME = re.compile(r"(?P<base>.*?)[ _]*[\[(](?P<unit>[^\])]*)[\])]\s*")
-_MEANINGS = (  # endings of names and their quantities; the first match counts
+_MEANINGS = (  # name endings and their quantities; the first match counts
     (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w*", "tactile"),
     (r"(quat|quaternion|orientation|ori|rot|q)_?[xyzw]", "orientation"),
     (
@@ -38,8 +39,8 @@ _MEANINGS = (  # endings of names and their quantities; the first match counts
     (r"temp\w*", "temperature"),
     (r"(press|druck)\w*", "static_pressure"),
 )
-_UNITS = {"orientation": "1"}  # quantities that have one unit only
-_SUFFIXES = (  # endings that state a unit, the unit, and its quantities
+_UNITS = {"orientation": "1"}  # quantities with only one unit
+_SUFFIXES = (  # endings that indicate a unit, the unit, and its quantities
     (r"_(m)", "m", ("position",)),
     (r"_(mm)", "mm", ("position",)),
     (r"_(rad)", "rad", ("joint_position",)),
@@ -50,7 +51,7 @@ _SUFFIXES = (  # endings that state a unit, the unit, and its quantities
 
 
 def meaning(name: str, kind: str) -> tuple[str, str]:
-    """Return the quantity and the unit that a name shows.
+    """Return the quantity and unit indicated by a name.
 
     >>> meaning("force_x_n", "float64"), meaning("fx", "float64"), meaning("taxel3", "uint16")
     (('force', 'N'), ('force', '?'), ('tactile', 'count'))
@@ -74,7 +75,7 @@ def meaning(name: str, kind: str) -> tuple[str, str]:
 
 
 def is_label(name: str) -> bool:
-    """Return whether a name is that of labels rather than readings; the name may begin with a sensor.
+    """Return whether a name is that of labels rather than readings; it may start with a sensor's name.
 
     >>> is_label("tactile_slips_label"), is_label("skin_mask"), is_label("label_free_force")
     (True, True, False)
@@ -87,7 +88,7 @@ def is_label(name: str) -> bool:
 
 
 def is_clock(name: str) -> bool:
-    """Return whether a name is that of stamps; the name may begin with a sensor.
+    """Return whether a name is that of timestamps; it may start with a sensor's name.
 
     >>> is_clock("tactile_timestamps"), is_clock("obs/time_ns"), is_clock("contact_time_constant")
     (True, True, False)
@@ -97,7 +98,7 @@ def is_clock(name: str) -> bool:
 
 
 def without_unit(name: str) -> str:
-    """Return a column's name without the unit that it states in brackets.
+    """Return a column's name without a unit in brackets.
 
     >>> without_unit("Fx [N]"), without_unit("time (ms)"), without_unit("pad[3]")
     ('Fx', 'time', 'pad[3]')
@@ -123,13 +124,13 @@ def lower_name(name: str) -> str:
 
 
 def component(name: str) -> str:
-    """Return the component that the name of a quaternion or position column states, as x for qx, or ""."""
+    """Return the component in the name of a quaternion or position column, such as x for qx, or ""."""
     match = re.fullmatch(r"(?:(?:quat|quaternion|orientation|ori|rot|q)_?)?([xyzw])", lower_name(name))
     return match[1] if match else ""
 
 
 def taxel_pattern(match: str, quantity: str, kind: str) -> str:
-    """Return the pattern of numbered columns, with {taxel} for the number where they may be taxels.
+    """Return the pattern of numbered columns, with {taxel} for the number if they may be taxels.
 
     >>> taxel_pattern("pad{pad}", "tactile", "float64"), taxel_pattern("q{number}", "joint_position", "float64")
     ('pad{taxel}', 'q{number}')
@@ -170,7 +171,7 @@ XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Quantity, unit and component of one column, or empty if a name does not show them."""
+    """Quantity, unit and component of a column; empty if its name does not show them."""
 
     quantity: str = ""
     unit: str = ""
@@ -180,7 +181,7 @@ class ColumnMeaning:
 NO_MEANING = ColumnMeaning()
 _HAND = r"(?:.*[_./])?(?:eef?|ee|tcp|end_effector|hand|wrist|tool|robot|arm)[_./]?"
 _ANY = r"(?:.*[_./])?"
-_VECTORS: Sequence[tuple[str, int, Sequence[ColumnMeaning]]] = (  # a name, a width, and what each column is
+_VECTORS: Sequence[tuple[str, int, Sequence[ColumnMeaning]]] = (  # name, width, and the meaning of each column
     (rf"{_HAND}(?:pos|position|translation|xyz|trans)", 3, [ColumnMeaning("position", "m", axis) for axis in XYZ]),
     (rf"{_ANY}robot\d+_eef_quat", 4, [ColumnMeaning("orientation", "1", part) for part in QUATERNION]),
     (rf"{_ANY}(?:quat|quaternion|orientation|ori)", 4, [ColumnMeaning("orientation", "1")] * 4),
@@ -213,7 +214,7 @@ _VECTORS: Sequence[tuple[str, int, Sequence[ColumnMeaning]]] = (  # a name, a wi
         [ColumnMeaning("force", "N", axis) for axis in XYZ] + [ColumnMeaning("torque", "N m", axis) for axis in XYZ],
     ),
 )
-_ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # a name, whatever its width
+_ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # name, and the meaning for any width
     (rf"{_ANY}gripper[_./](?:qpos|qvel|pos|position|state|command|action)s?", ColumnMeaning("state")),
     (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|joint_states?|qpos)", ColumnMeaning("joint_position", "rad")),
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", ColumnMeaning("joint_velocity", "rad/s")),
@@ -223,11 +224,13 @@ _ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # a name, whatever its widt
     (rf"{_ANY}(?:dones?|terminals?|terminated|truncated|success|timeouts?)", ColumnMeaning("label", "1")),
     (rf"{_ANY}(?:rewards?)", ColumnMeaning("score", "1")),
 )
-_UNREAL = ("sin", "cos")  # sine and cosine of an angle are no angles
+_UNREAL = ("sin", "cos")  # sine and cosine of an angle are not angles
 
 
 def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeaning]:
-    """Return what each of ``width`` columns of an array called ``name`` holds; ``integers``: its values are whole numbers.
+    """Return the meaning of each of ``width`` columns of the array ``name``.
+
+    ``integers``: whether its values are integers.
 
     >>> meanings("robot0_eef_pos", 3)[0], meanings("obs/joint_pos", 7)[6].unit
     (ColumnMeaning(quantity='position', unit='m', component='x'), 'rad')
@@ -256,7 +259,7 @@ def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeanin
 
 
 def meaning_from_name(name: str, kind: str) -> ColumnMeaning:
-    """Return what a column of one value holds where its name states both quantity and unit.
+    """Return the meaning of a scalar column whose name shows both quantity and unit.
 
     >>> meaning_from_name("joint1_rad", "float32"), meaning_from_name("fx", "float64")
     (ColumnMeaning(quantity='joint_position', unit='rad', component=''), ColumnMeaning(quantity='', unit='', component=''))
@@ -266,9 +269,9 @@ def meaning_from_name(name: str, kind: str) -> ColumnMeaning:
 
 
 def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
-    """Return what the columns of an array of ALOHA are: arms of six joints and a gripper that is open at 1; else None.
+    """Return the column meanings of an ALOHA array: arms of six joints and a gripper that is open at 1; None for others.
 
-    ``effort`` is the current of the motors in a unit of theirs.
+    ``effort`` is the motor current in a unit of ALOHA's.
 
     >>> [one.quantity for one in aloha_meanings("observations/qpos", 14)][5:8]
     ['joint_position', 'state', 'joint_position']
@@ -284,9 +287,9 @@ def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
 
 
 def declared_metadata(attributes: StoredAttributes) -> dict[str, str]:
-    """Return what attributes of an array state of its columns, as metadata of fields.
+    """Return the field metadata declared by an array's attributes.
 
-    Where a quantity is among them all texts count, as in files that tacpipe writes.
+    If a quantity is among them, all texts are included, as in files that tacpipe writes.
 
     >>> declared_metadata({"units": "N", "comment": "x"})
     {'unit': 'N'}
@@ -301,7 +304,7 @@ def declared_metadata(attributes: StoredAttributes) -> dict[str, str]:
 
 
 def declared_texts(attributes: StoredAttributes, key: str, count: int) -> list[str]:
-    """Return the text that an attribute states for each of ``count`` columns, or nothing if it states another number.
+    """Return an attribute's text for each of ``count`` columns, or an empty list if its length differs.
 
     >>> declared_texts({"columns": ["a", "b"]}, "columns", 2), declared_texts({"columns": ["a"]}, "columns", 2)
     (['a', 'b'], [])

@@ -1,4 +1,4 @@
-"""Read the first rows of a file, and guess how it is written, its stamps and what its columns measure."""
+"""Read the first rows of a file, and guess its dialect, its timestamps and the quantities of its columns."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from tacpipe.formats.table.columns import TYPES
 from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, StreamLayout, extension, quoted
 from tacpipe.formats.table.text import Workbook
 
-SAMPLE_LINES = 200  # lines sampled per file
-HEAD_BYTES = 1 << 20  # bytes sampled per file, at most
+SAMPLE_LINES = 200  # number of lines sampled per file
+HEAD_BYTES = 1 << 20  # maximum number of bytes sampled per file
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -43,12 +43,12 @@ class Dialect:
     skip_lines: int
     header: bool
     names: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...] = field(repr=False)  # below the header
-    missing: tuple[str, ...] = ()  # cells of MISSING that are there
-    units: tuple[str, ...] = ()  # units of the columns, if the row below the header holds them
+    rows: tuple[tuple[str, ...], ...] = field(repr=False)  # cells below the header
+    missing: tuple[str, ...] = ()  # values of MISSING that occur
+    units: tuple[str, ...] = ()  # units of the columns, if the row below the header contains them
 
     def number(self, cell: str) -> float | None:
-        """Return the number that a cell holds, an int where it is written as one, or None if it holds none.
+        """Return the number in a cell, an int if it is written as one, or None if it is not a number.
 
         >>> detect_dialect(["a;b", "1,5;x"]).number("1,5"), detect_dialect(["1,2.0"]).number("2.0")
         (1.5, 2.0)
@@ -62,7 +62,7 @@ class Dialect:
 
 
 def detect_encoding(path: Path) -> str:
-    """Return the encoding of a text file, from its first bytes: UTF-16 by its mark, UTF-8, or else that of Windows."""
+    """Return the encoding of a text file from its first bytes: UTF-16 by its mark, UTF-8, or else that of Windows."""
     with text.open_text(path) as file:
         content = file.read(HEAD_BYTES)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -75,7 +75,7 @@ def detect_encoding(path: Path) -> str:
 
 
 def first_lines(path: Path, encoding: str = "utf-8") -> list[str]:
-    """Return the first lines of a text file, without one that is cut."""
+    """Return the first lines of a text file, without an incomplete last one."""
     with text.open_text(path, encoding) as file:
         content = file.read(HEAD_BYTES)
     lines = content.decode(errors="replace").splitlines(keepends=True)
@@ -108,20 +108,20 @@ def detect_dialect(lines: Sequence[str]) -> Dialect:
     below = rows[1:] if header else rows
     missing = sorted({cell for row in below for cell in row if cell in MISSING})
     before = 0
-    if units:  # the first row below them
+    if units:  # the first row after the units
         before = next(number for number, text in enumerate(texts) if text == data_lines[skip + 1]) + 1
-    elif skip:  # lines of the file before the header, comments and blank ones among them
+    elif skip:  # number of lines before the header, including comments and blank lines
         before = next(number for number, text in enumerate(texts) if text == data_lines[skip])
     return Dialect(separator, decimal, comment, before, header, tuple(names), tuple(below), tuple(missing), units)
 
 
 def _is_text(row: Sequence[str], probe: Dialect) -> bool:
-    """Return whether no cell of a row holds a number."""
+    """Return whether no cell of a row is a number."""
     return all(probe.number(cell) is None for cell in row)
 
 
 def _guess_separator(data_lines: Sequence[str]) -> tuple[str, int]:
-    """Return the separator that gives most lines the same number of cells, and that number."""
+    """Return the separator with which most lines have the same number of cells, and that number."""
     best = (0.0, 0, ",", 1)
     for rank, separator in enumerate(SEPARATORS):
         widths = Counter(len(next(csv.reader([text], delimiter=separator), [])) for text in data_lines)
@@ -131,7 +131,7 @@ def _guess_separator(data_lines: Sequence[str]) -> tuple[str, int]:
         width, count = wide.most_common(1)[0]
         score = count / len(data_lines)
         if separator == "," and score < 1 and any(";" in text for text in data_lines):
-            score /= 2  # commas may be decimal ones
+            score /= 2  # commas may be decimal signs
         best = max(best, (score, -rank, separator, width))
     return best[2], best[3]
 
@@ -144,7 +144,7 @@ def _guess_decimal(rows: Sequence[tuple[str, ...]], separator: str) -> Literal["
 
 
 def _is_header(rows: Sequence[tuple[str, ...]], probe: Dialect) -> bool:
-    """Return whether the first row holds names: fewer numbers than the rows below it."""
+    """Return whether the first row contains names: fewer numbers than the rows below it."""
     first = [probe.number(cell) is not None for cell in rows[0]]
     if not any(not number and cell not in MISSING for number, cell in zip(first, rows[0], strict=True)):
         return False
@@ -159,20 +159,20 @@ class FileSample:
     """The columns and first rows of a file."""
 
     names: tuple[str, ...]
-    values: Mapping[str, tuple[Any, ...]]  # the first rows by column
-    text: Dialect | None = None  # None: not a text file
+    values: Mapping[str, tuple[Any, ...]]  # first rows by column
+    text: Dialect | None = None  # None if it is not a text file
     encoding: str = "utf-8"
-    arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # files of arrays only
-    units: Mapping[str, str] = field(default_factory=dict)  # units by column, as a row below the header states them
+    arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # only for files of arrays
+    units: Mapping[str, str] = field(default_factory=dict)  # units by column, from a row below the header
     frames: int | None = None  # number of frames of a video or a folder of images
 
     @property
     def row_count(self) -> int | None:
-        """Return the number of rows of the arrays, or of frames; None for other files."""
+        """Return the number of rows of the arrays, or of frames, or None for other files."""
         return next((array.rows for array in self.arrays.values()), self.frames)
 
     def stated_unit(self, column: str) -> str:
-        """Return the unit that the header or the row below it states for a column, '' where neither does."""
+        """Return a column's unit from the header or the row below it, or "" if neither contains one."""
         match = column_names.UNIT_IN_NAME.fullmatch(column.strip())
         text = self.units.get(column, "") or (match["unit"] if match and match["base"] else "")
         return schema.unit_from_text(text.strip().strip("[]()"))
@@ -221,9 +221,9 @@ def _first_rows(file: binary.ParquetFile | binary.NumpyArchive | binary.JsonLine
 
 
 def _time_axis(arrays: Mapping[str, ArrayMember]) -> int:
-    """Return the dimension along which the rows of arrays follow one another.
+    """Return the axis of the rows of arrays.
 
-    It is the first, unless the only array has another one that is so much longer that the first is a part of the sensor.
+    It is the first axis, unless the only array has another one so much longer that the first must belong to the sensor.
     """
     shape = next(iter(arrays.values())).shape if len(arrays) == 1 else ()
     longest = shape.index(max(shape)) if shape else 0
@@ -231,7 +231,7 @@ def _time_axis(arrays: Mapping[str, ArrayMember]) -> int:
 
 
 def belongs_to(column: str, array: str) -> bool:
-    """Return whether a column is one of an array's."""
+    """Return whether a column belongs to an array."""
     return column == array or (column.startswith(f"{array}_") and column[len(array) + 1 :].isdigit())
 
 
@@ -244,7 +244,7 @@ _INTEGERS = (("uint16", 0, 2**16 - 1), ("int16", -(2**15), 2**15 - 1), ("int32",
 
 
 def column_entries(sample: FileSample, reserved: set[str]) -> list[str]:
-    """Return the entries for the columns of a file that are not in ``reserved``, those of arrays first."""
+    """Return the layout entries for the columns of a file that are not in ``reserved``, those of arrays first."""
     rules, array_columns = _array_entries(sample)
     names = [name for name in sample.names if name not in reserved | array_columns]
     return [*rules, *_column_entries(sample, names)]
@@ -276,7 +276,7 @@ def _array_entries(sample: FileSample) -> tuple[list[str], set[str]]:
 
 
 def _shape(name: str, array: ArrayMember) -> tuple[int, ...]:
-    """Return the shape of an array's rows where it places values in a sensor or a vector, else nothing."""
+    """Return the shape of an array's rows if it places values in a sensor or a vector, else an empty tuple."""
     vector = array.row_shape == (3,)
     return (
         array.row_shape
@@ -286,7 +286,7 @@ def _shape(name: str, array: ArrayMember) -> tuple[int, ...]:
 
 
 def _column_entries(sample: FileSample, names: Sequence[str]) -> list[str]:
-    """Return one entry per set of columns whose names differ only in numbers and whose values are alike."""
+    """Return one entry per set of columns whose names differ only in numbers and whose values have the same type."""
     by_rule: dict[tuple[str, ...], list[str]] = {}
     bases = {name: column_names.without_unit(name) for name in names}
     matches = {column_names.numbered_pattern(base) for base in bases.values()}
@@ -320,14 +320,14 @@ def _column_entries(sample: FileSample, names: Sequence[str]) -> list[str]:
 
 
 def _kind(values: Sequence[float | str]) -> str:
-    """Return the type of a column, by the values of its first rows."""
+    """Return the type of a column, inferred from its first rows."""
     if not values or any(isinstance(value, str) for value in values):
         return "text" if values else "float64"
     if any(isinstance(value, bool) for value in values):
         return "bool"
     if not all(isinstance(value, int | float) for value in values):
         return "text"
-    if any(isinstance(value, float) for value in values):  # also for 2.0: a later cell may hold 2.5
+    if any(isinstance(value, float) for value in values):  # also if all are like 2.0, because a later cell may be 2.5
         return "float64"
     numbers = [int(value) for value in values]
     return next(
@@ -345,7 +345,7 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 
 
 def time_column(sample: FileSample) -> str | None:
-    """Return the column whose name is that of stamps, else the first column if its numbers rise, else None."""
+    """Return the column named like timestamps, else the first column if its numbers increase, else None."""
     rising = [name for name in sample.names if rises(sample.values[name]) and not label_table.RECORDING.fullmatch(name)]
     stamped = {
         name
@@ -361,7 +361,7 @@ def time_column(sample: FileSample) -> str | None:
 
 
 def rises(values: Sequence[float | str | None]) -> bool:
-    """Return whether all values are numbers that never fall, the last above the first."""
+    """Return whether all values are numbers that never decrease, with the last above the first."""
     numbers = [value for value in values if isinstance(value, int | float)]
     return (
         len(numbers) == len(values) > 1
@@ -371,7 +371,7 @@ def rises(values: Sequence[float | str | None]) -> bool:
 
 
 def time_entry(sample: FileSample, column: str | None, file: str = "") -> str:
-    """Return the entry ``time`` for stamps in a column; ``file`` is the entry of the file of stamps, if there is one."""
+    """Return the entry ``time`` for timestamps in a column; ``file`` is the entry of a separate timestamp file."""
     if column is None:
         return f'{{ rate_hz = "{UNKNOWN}" }}  # no column rises as stamps do; write the rate'
     source = file or f"column = {quoted(column)}"
@@ -391,13 +391,13 @@ def time_entry(sample: FileSample, column: str | None, file: str = "") -> str:
     unit_text = sample.stated_unit(column) or schema.unit_from_text(suffix[1] if suffix else "")
     steps = np.diff([value for value in values if isinstance(value, float)])
     if not unit_text and len(steps) and 0 < float(np.median(steps)) < 0.5:
-        unit_text = "s"  # steps this small in ms would be thousands of rows per second
+        unit_text = "s"  # in ms, steps this small would mean thousands of rows per second
     unit = unit_text if unit_text in stamps.DIGITS else UNKNOWN
     return f'{{ {source}, unit = "{unit}", origin = "start" }}  # counts from the start of the recording'
 
 
 def _text_stamp_entry(texts: Sequence[str], source: str) -> str:
-    """Return the entry ``time`` for stamps that are text, in the formats that read all of them with days in order."""
+    """Return the entry ``time`` for text timestamps, in formats that parse all of them with dates in order."""
     fitting = []
     for stamp_format in _STAMP_FORMATS:
         t_ns, valid = stamps.parse_stamps(pa.array(texts), stamp_format)

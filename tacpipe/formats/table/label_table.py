@@ -1,4 +1,4 @@
-"""Files of labels as text: rows of a CSV, cells as the values that they are written as."""
+"""Read label files: the rows of a CSV file, and the values of its cells."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tacpipe.io import config_text, regular
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-MAX_LABEL_BYTES = 1 << 26  # largest file of labels
+MAX_LABEL_BYTES = 1 << 26  # maximum size of a label file
 
 
 def plain_value(text: str) -> Attribute:
-    """Return what a cell's text means: true, false, a number where it is written as one, else text.
+    """Return the value of a cell's text: true, false, a number if it is written as one, else the text.
 
-    A number with leading zeros is text, as it is most often a name.
+    A number with leading zeros is text, because it is usually a name.
 
     >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
     [3, 0.5, '007', True, 'cork', None, 'nan']
@@ -46,7 +46,7 @@ def plain_value(text: str) -> Attribute:
 
 
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of each line that holds some, the header first; all are as wide as it."""
+    """Yield number and cells of each non-empty line, the header first; all lines must be as wide as the header."""
     text = read_text(path)
     separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
@@ -63,7 +63,7 @@ def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file of labels. Raises `TacpipeError` for one that is too large or not UTF-8."""
+    """Return the text of a label file. Raises `TacpipeError` if it is too large or not UTF-8."""
     with regular.failing(path):
         content = regular.content(path, MAX_LABEL_BYTES)
     try:
@@ -81,7 +81,7 @@ NAME = "recording"  # column for the names of a YAML or JSON mapping
 
 @dataclass(frozen=True)
 class LabelRow:
-    """A row: its place in the file, the name of its recording, and its labels without those of empty cells."""
+    """A row: its position in the file, the name of its recording, and the labels of its non-empty cells."""
 
     place: str
     recording: str
@@ -90,7 +90,7 @@ class LabelRow:
 
 @dataclass(frozen=True)
 class LabelTable:
-    """The rows of a table of labels, and the column that names their recordings."""
+    """The rows of a label table, and the column with the recordings' names."""
 
     path: Path
     key: str
@@ -101,8 +101,8 @@ class LabelTable:
     ) -> dict[str, dict[str, Attribute]]:
         """Return the labels of each row by recording, given the attributes of the recordings by name.
 
-        A row names its recording, or else the attribute called as the key column, as ``trial``. Raises `UsageError` for
-        rows of unknown recordings, and for two rows of one.
+        A row refers to a recording by name, or by the attribute named like the key column, such as ``trial``. Raises
+        `UsageError` for rows of unknown recordings, and for two rows of one recording.
         """
         by_attribute: dict[str, list[str]] = {}
         for name, attributes in attributes_by_name.items():
@@ -127,7 +127,7 @@ class LabelTable:
 
 
 def cell_text(value: Any) -> str:
-    """Return the name of a recording as a cell has it: text, '' where the cell is empty.
+    """Return a recording's name as cell text, or "" for an empty cell.
 
     >>> cell_text("trial-01"), cell_text(7), cell_text(None)
     ('trial-01', '7', '')
@@ -138,11 +138,11 @@ def cell_text(value: Any) -> str:
 def read_label_table(
     path: Path, key: str = "", attributes_by_name: Mapping[str, Mapping[str, Attribute]] | None = None
 ) -> LabelTable:
-    """Return the table of labels in a file; ``key`` names the column of the recordings' names, found where it is empty.
+    """Return the label table in a file. ``key`` is the column with the recordings' names; if empty, it is inferred.
 
-    It is the column whose values are all in ``attributes_by_name``, else the first named recording, trial, episode …
-    Numbers, true and false keep their types. Raises `UsageError` for another kind of file and where no column can be the
-    key, `TacpipeError` naming file and row for what cannot be a label.
+    The inferred column is the one whose values are all in ``attributes_by_name``, else the first named recording,
+    trial, episode …. Numbers, true and false keep their types. Raises `UsageError` for another kind of file and if no
+    column can be the key, and `TacpipeError` with file and row for an invalid label.
     """
     suffix = path.suffix.lower()
     if suffix not in EXTENSIONS:

@@ -18,14 +18,14 @@ from tacpipe.io import config_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-RECORDING = "recording"  # the placeholder of a recording's name
+RECORDING = "recording"  # placeholder for a recording's name
 
 
 def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles]) -> dict[str, dict[str, Attribute]]:
-    """Return the labels of each recording: of the layout, of its files' names, then of each source of labels.
+    """Return the labels of each recording: from the layout, from its files' names, then from each label source.
 
-    Values are read as numbers, true and false where they are written so. Raises `TacpipeError`, naming file and row, for
-    a recording without a row or a file, two rows of one recording, a missing column, and a value that is not plain.
+    Numbers, true and false are parsed. Raises `TacpipeError` with file and row for a recording without a row or a file,
+    two rows of one recording, a missing column, and a value that is not plain.
     """
     labels_by_name: dict[str, dict[str, Attribute]] = {
         source.name: {**layout.attributes, **{name: plain_value(value) for name, value in _placeholder_values(source)}}
@@ -46,14 +46,14 @@ def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles])
 
 
 def _placeholder_values(source: RecordingFiles) -> Iterator[tuple[str, str]]:
-    """Yield the placeholders of a recording's files with their text; one that is the recording's name is no label."""
+    """Yield the placeholders of a recording's files with their text; the recording's name itself is not a label."""
     for name, value in source.values.items():
         if (name, value) != (RECORDING, source.name):
             yield name, value
 
 
 def _read_single_row(path: Path) -> dict[str, Attribute]:
-    """Return the one row of a table that describes one recording."""
+    """Return the single row of a table that describes one recording."""
     rows = list(read_rows(path))
     if len(rows) != 2:
         raise TacpipeError(
@@ -63,7 +63,7 @@ def _read_single_row(path: Path) -> dict[str, Attribute]:
 
 
 def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attribute]]:
-    """Return the rows of a table of labels by the value of its key; a mapping of YAML or JSON has its names for keys."""
+    """Return the rows of a label table by key; the keys of a YAML or JSON mapping are its names."""
     if path.suffix.lower() in TREES:
         label_rows = label_table.read_label_table(path, labels.key)
         doubled = [name for name, count in Counter(row.recording for row in label_rows.rows).items() if count > 1]
@@ -85,9 +85,10 @@ def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attri
 
 
 def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
-    """Return other names of a recording in a table: the folders and files that its placeholders are part of.
+    """Return other names of a recording in a table: the folders and files that contain its placeholders.
 
-    ``run_07/skin.csv`` of the pattern ``run_{trial}/skin.csv`` is run_07 too, whose trial is 07.
+    With the pattern ``run_{trial}/skin.csv``, the recording of ``run_07/skin.csv``, whose trial is 07, is also called
+    run_07.
     """
     segments = {segment for stream in layout.streams for segment in stream.files.split("/")}
     return sorted(
@@ -126,7 +127,7 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
 
 
 def _flatten(values: Mapping[Any, Any], before: str = "") -> dict[str, Attribute | datetime.date]:
-    """Return nested mappings as one, with dots between the names."""
+    """Return nested mappings as one mapping with dotted names."""
     flat: dict[str, Attribute | datetime.date] = {}
     for name, value in values.items():
         flat |= _flatten(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}

@@ -1,7 +1,7 @@
 """Match paths with patterns such as ``{trial}/skin_{hand}.csv`` and return the text of their placeholders.
 
-``{name}`` is any text without a slash, at least one character; ``*`` is any text without a slash, ``**`` any folders. A
-placeholder that comes twice has the same text both times.
+``{name}`` matches one or more characters except slashes; ``*`` any text without a slash, ``**`` any folders. A
+placeholder that occurs twice must match the same text.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import PurePath
 from tacpipe.errors import UsageError
 from tacpipe.printable import plain
 
-TRIAL = "trial"  # the placeholder that distinguishes the recordings of a folder
+TRIAL = "trial"  # placeholder that distinguishes the recordings in a folder
 _ISO_DATE = r"(?:19|20)\d\d(?P<mark>[-_.]?)[01]\d(?P=mark)[0-3]\d"
 _DATE = rf"(?<!\d)(?:{_ISO_DATE}|[0-3]\d(?P<point>[-_.])[01]\d(?P=point)(?:19|20)\d\d)"
 _CLOCK = r"(?:[-_ T]{1,3}[0-2]\d(?P<colon>[-_.h]?)[0-5]\d(?:(?P=colon)[0-5]\d)?(?!\d))?"
@@ -25,8 +25,8 @@ _COUNTED = (  # words before numbers that count recordings rather than parts of 
     "experiment|test|rep|repetition|set|series|recording|rec|sample|demo|sequence|seq|log|measurement|file|cycle"
 )
 _COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
-_Token = tuple[str, str]  # its kind (a letter of a name is of its own kind), and its text
-MAX_STEPS = 10_000_000  # limit of steps for matching a text
+_Token = tuple[str, str]  # kind (each letter of a name is its own kind) and text
+MAX_STEPS = 10_000_000  # maximum number of steps for matching a text
 _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 
@@ -53,7 +53,7 @@ def compile_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def match(pattern: str, text: str) -> dict[str, str] | None:
-    """Return the text of each placeholder where the whole of ``text`` matches, else None.
+    """Return the text of each placeholder if the pattern matches all of ``text``, else None.
 
     >>> match("{trial}/skin_{hand}.csv", "t-07/skin_left.csv")
     {'trial': 't-07', 'hand': 'left'}
@@ -70,7 +70,7 @@ def match(pattern: str, text: str) -> dict[str, str] | None:
 
 
 def _max_steps(pattern: str, text: str) -> int:
-    """Return how many ways there are, at most, to divide a text among the placeholders of a pattern."""
+    """Return the maximum number of ways to divide a text among the placeholders of a pattern."""
     parts = _PART.findall(pattern)
     wild = sum(not literal for *_, literal, _ in parts)
     between = [literal for *_, literal, _ in parts[1:-1] if literal]
@@ -138,7 +138,7 @@ def _tokens(name: str) -> list[_Token]:
 def _level_pattern(
     names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool
 ) -> str:
-    """Return the pattern of one level of paths; ``in_use`` maps placeholders to their texts and grows by this level's."""
+    """Return the pattern of one level of paths; adds its placeholders with their texts to ``in_use``."""
     parts = _common_parts(names)
     differing = [index for index, (_, texts) in enumerate(parts) if len(set(texts)) > 1]
     pattern = ""
@@ -172,14 +172,14 @@ def _level_pattern(
 
 
 def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return what names have in common, with the texts of each part: what is not in common is one part, ``text``."""
+    """Return the common parts of names with their texts; everything that differs is one part, ``text``."""
     kinds = [[kind for kind, _ in tokens] for tokens in names]
     before = _count_common_start(kinds)
     after = 0
     if any(tokens != kinds[0] for tokens in kinds):
         before = _without_slots(kinds[0], before)
         after = _without_slots(kinds[0][::-1], _count_common_start([tokens[before:][::-1] for tokens in kinds]))
-        while any(len(tokens) == before + after for tokens in kinds):  # a placeholder is at least one character
+        while any(len(tokens) == before + after for tokens in kinds):  # a placeholder has at least one character
             if before:
                 before = _without_slots(kinds[0], before - 1)
             else:
@@ -193,14 +193,14 @@ def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, .
 
 
 def _count_common_start(sequences: Sequence[Sequence[str]]) -> int:
-    """Return how many of their first elements all sequences share."""
+    """Return the length of the common prefix of all sequences."""
     return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))
 
 
 def _without_slots(kinds: Sequence[str], count: int) -> int:
-    """Return how many of the first ``count`` elements stay without the dates and numbers at their end.
+    """Return how many of the first ``count`` elements remain without dates and numbers at their end.
 
-    Next to text that differs nothing would show where these end.
+    Next to differing text, the end of a date or number would be ambiguous.
     """
     while count and kinds[count - 1] in ("date", "number"):
         count -= 1

@@ -32,7 +32,7 @@ from tacpipe.formats.table.recordings import CONTAINER, RecordingFiles
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 
-MAX_DIFFERENT = 1 << 18  # different steps that are counted each by itself
+MAX_DIFFERENT = 1 << 18  # maximum number of distinct steps that are counted separately
 
 
 class Steps:
@@ -46,10 +46,10 @@ class Steps:
 
     def __init__(self) -> None:
         self._waiting: list[Int64s] = []
-        self._steps: Int64s = np.zeros(0, np.int64)  # (step,), rising
+        self._steps: Int64s = np.zeros(0, np.int64)  # (step,), increasing
         self._counts: Int64s = np.zeros(0, np.int64)  # (step,)
         self._longest_ns = 0
-        self._coarse_bits = 0  # how many of the last bits of a step do not count
+        self._coarse_bits = 0  # number of low bits of a step that are ignored
 
     def add(self, steps_ns: Int64s) -> None:
         """Count steps (time,)."""
@@ -81,7 +81,7 @@ class Steps:
         return float(self._steps[low] + self._steps[high]) / 2
 
     def longer(self, than_ns: float) -> int:
-        """Return how many steps are longer."""
+        """Return the number of steps longer than ``than_ns``."""
         self._count()
         return int(self._counts[self._steps > than_ns].sum())
 
@@ -90,7 +90,7 @@ class Steps:
         return self._longest_ns
 
 
-GAP = 3.0  # times the usual step
+GAP = 3.0  # multiple of the median step
 SHOWN_ROWS = 3
 SHOWN_COLUMNS = 6
 TYPE_NAMES = {kind: name for name, kind in TYPES.items()}  # names of types in a layout
@@ -102,10 +102,10 @@ class StreamSummary:
 
     rows: int
     first_ns: int
-    rate_hz: float  # 0 where there are fewer than two rows
-    gaps: int  # steps of more than `GAP` times the usual one
+    rate_hz: float  # 0 with fewer than two rows
+    gaps: int  # number of steps longer than `GAP` times the median
     longest_s: float  # the longest step
-    columns: Mapping[str, tuple[str, str, str, float, float]]  # quantity, unit, type, least, most
+    columns: Mapping[str, tuple[str, str, str, float, float]]  # quantity, unit, type, minimum, maximum
     first: pa.Table  # the first rows
 
 
@@ -118,7 +118,7 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
     """
     first: pa.Table = rows.schema.empty_table()
     ends: dict[str, list[Any]] = {}
-    stamps: list[int] = []  # stamps of the first and the latest row
+    stamps: list[int] = []  # timestamps of the first and the latest row
     count, steps = 0, Steps()
     for batch in rows.to_batches() if isinstance(rows, pa.Table) else rows:
         if not batch.num_rows:
@@ -160,9 +160,9 @@ def _measured_fields(schema: pa.Schema) -> list[pa.Field]:
 
 
 def describe_sources(layout: Layout, folder: Path, sources: Sequence[RecordingFiles], kind: str | None = None) -> str:
-    """Return what would be read as lines: all recordings and labels, and the streams of the first that can be read.
+    """Return a description of what would be read: recordings, labels, and the streams of the first readable recording.
 
-    ``kind`` is the format of containers whose streams are read as they declare them where the layout has none.
+    ``kind`` is the container format whose declared streams are read if the layout has none.
     """
     labelled = labels.find_labels(layout, folder if folder.is_dir() else folder.parent, sources)
     count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"
@@ -234,10 +234,10 @@ def _cell_text(value: object) -> str:
 
 
 def declared_layout(kind: str, source: Path) -> str:
-    """Return the text of the layout that states what the first container at or below ``source`` with a stream declares.
+    """Return the text of the layout declared by the first container at or below ``source`` with a stream.
 
-    Given back with ``--layout`` it reads the same. Comments name the containers before it, and files that are no container.
-    Raises `UsageError` if there is no container, `TacpipeError` if none holds a stream.
+    With ``--layout`` it gives the same result. Comments name earlier containers, and files that are not containers.
+    Raises `UsageError` if there is no container, `TacpipeError` if none contains a stream.
     """
     paths = find_containers(kind, source)
     if not paths:
@@ -263,13 +263,13 @@ def declared_layout(kind: str, source: Path) -> str:
 
 
 def _why_unread(kind: str, path: Path, containers: Sequence[Path]) -> str:
-    """Return why a file is no container, "" where it lies in one."""
+    """Return the reason why a file is not a container, "" if it is inside one."""
     inside = any(path.is_relative_to(container) for container in containers)
     return "" if inside else why_unreadable(path.name, "", kind)
 
 
 def _layout_text(contents: EpisodeContents, command: str, path: Path, remarks: Sequence[str] = ()) -> str:
-    """Return the text of the layout that states what a container declares; ``command`` is the one that reads it.
+    """Return the text of the layout that a container declares; ``command`` is the command that reads it.
 
     ``remarks`` are sentences about other files, which become comments.
     """
@@ -307,8 +307,8 @@ def _time_text(time: Time) -> str:
 
 
 def _column_rules(fields: Sequence[pa.Field]) -> list[str]:
-    """Return an entry for each set of columns whose names differ in numbers alone and that are declared alike."""
-    fields = [field for field in fields if not set("{}*") & set(field.name)]  # these are left as they are declared
+    """Return an entry for each set of columns with equal declarations whose names differ only in numbers."""
+    fields = [field for field in fields if not set("{}*") & set(field.name)]  # such names keep their declaration
     alike: dict[tuple[str, str, str, str], list[str]] = {}
     for field in fields:
         about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}

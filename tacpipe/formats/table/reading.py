@@ -1,7 +1,7 @@
-"""Read one stream of a recording from its file: stamps, declared types and units, wide or long form.
+"""Read one stream of a recording from its file: timestamps, declared types and units, wide or long form.
 
-A table in long form has one row per channel and moment. Rows of a moment may be anywhere in the file, as where one channel
-follows another. So runs of rows are sorted, put in a spill file and merged, in bounded memory.
+A table in long form has one row per channel and time. Rows of one time may be anywhere in the file, for example if
+channels follow one another. So runs of rows are sorted, spilled to disk and merged, in bounded memory.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
 from tacpipe.video import files as video_files
 
-RUN_ROWS = 1 << 21  # rows sorted at once
-MAX_CHANNELS = 1 << 14  # a column with more names does not hold channels
-GRID_VALUES = 1 << 22  # values in memory at once, moments times channels
+RUN_ROWS = 1 << 21  # number of rows sorted at once
+MAX_CHANNELS = 1 << 14  # a column with more distinct names does not contain channels
+GRID_VALUES = 1 << 22  # maximum number of values in memory, times multiplied by channels
 MOMENT, CHANNEL, VALUE, ROW_INDEX = "t_ns", "channel", "value", "row"
 
 
 @dataclass(frozen=True)
 class LongTable:
-    """The sorted rows of a file in long form, in a spill file, and its channels in the order of their first rows."""
+    """The sorted rows of a file in long form, in a spill file, and its channels in order of first appearance."""
 
     file: RowFile
     channels: Sequence[str]
@@ -46,9 +46,9 @@ class LongTable:
     spill: Spill
 
     def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[tuple[Times, list[pa.Array]]]:
-        """Yield stamps in ns and one column per chosen channel, or NaN if there is no value, moment by moment.
+        """Yield timestamps in ns and one column per selected channel, with NaN for missing values, ordered by time.
 
-        Raises `TacpipeError` for two values of a channel at one moment, and as `columns.convert_column` does.
+        Raises `TacpipeError` for two values of a channel at one time, and the errors of `columns.convert_column`.
         """
         moments = 0
         for table in in_order(self.pieces, self.spill.read, MOMENT):
@@ -72,7 +72,7 @@ class LongTable:
             raise TacpipeError(f"{place} {error}.") from error
 
     def _expect_single(self, cells: AnyArray, codes: AnyArray, table: pa.Table) -> None:
-        """Raise `TacpipeError` if two rows have the same moment and channel, ``cells``."""
+        """Raise `TacpipeError` if two rows have the same time and channel, given as ``cells``."""
         order = np.argsort(cells, kind="stable")
         doubled = np.flatnonzero(np.diff(cells[order]) == 0)
         if not len(doubled):
@@ -87,7 +87,7 @@ class LongTable:
 
 
 def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, shared: Shared | None) -> LongTable:
-    """Return the rows of a table in long form. Raises as `rows.row_blocks` does, and for too many channels."""
+    """Return the rows of a table in long form. Raises the errors of `rows.row_blocks`, and one for too many channels."""
     assert stream.long is not None
     if not stream.time.column:
         raise UsageError(
@@ -119,7 +119,7 @@ def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, 
 
 
 def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: StreamLayout, place: Place) -> AnyArray:
-    """Return the number of each row's channel (row,); new ones are added to ``codes``."""
+    """Return the channel index of each row (row,); adds new channels to ``codes``."""
     encoded = column.cast(pa.string()).fill_null("").combine_chunks().dictionary_encode()
     names = encoded.dictionary.to_pylist()
     if "" in names:
@@ -134,7 +134,7 @@ def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: Strea
     return numbers
 
 
-Block = tuple[Times | None, list[pa.Array]]  # stamps, if rows have some, and columns
+Block = tuple[Times | None, list[pa.Array]]  # timestamps, if rows have them, and columns
 
 
 def stream_batches(
@@ -144,13 +144,14 @@ def stream_batches(
     shared: Shared | None = None,
     stamps_path: Path | None = None,
 ) -> pa.RecordBatchReader:
-    """Return the rows of the stream with ``t_ns`` as they are read; ``recording`` is the one to pick of many.
+    """Return the rows of a stream with ``t_ns``, read on demand; ``recording`` selects one of several in the file.
 
-    With ``shared`` the file is then cut into its recordings once, and not read for each. ``stamps_path`` is the file with
-    the stamps where the layout names one.
+    With ``shared`` the file is split into its recordings once, instead of being read for each. ``stamps_path`` is the
+    timestamp file, if the layout names one.
 
-    Raises `TacpipeError`, naming file, row and column, for what is not as the layout states, for stamps that run backwards,
-    and for a file without rows; also as batches are taken. One block is in memory; of a table in long form one run.
+    Raises `TacpipeError` with file, row and column for anything that does not match the layout, for decreasing
+    timestamps, and for a file without rows, also while batches are read. One block is in memory, or one run of a table
+    in long form.
     """
     stamps_ns = None if stamps_path is None else rows.stamps_of_file(stamps_path, stream)
     return _batches(file, stream, recording, columns.NO_DECLARATION, {}, shared, stamps_ns)
@@ -162,10 +163,10 @@ def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = 
 
 
 def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
-    """Return the rows of a stream of the container at ``path`` with ``t_ns``: a table of one that is in memory already.
+    """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 
-    Raises as `stream_batches` does. Where the layout's ``stream`` states neither time nor columns, they are as the container
-    declares them. What the container states of the column with the stamps is stated of ``t_ns``.
+    If the layout's ``stream`` sets neither time nor columns, the container's declarations apply. Metadata of the time
+    column are copied to ``t_ns``. Raises the errors of `stream_batches`.
     """
     stream = stream if stream.time.is_declared else replace(stream, time=source.time)
     if not stream.time.is_declared:
@@ -218,7 +219,7 @@ def _batches(
             stream, [name for name in names if name not in reserved], path, declared
         )
         types = {**rows.reserved_types(file, stream), **{column.name: column.read_as for column in chosen_columns}}
-        as_is = bool(declared)  # a container's own NaN and infinity are values
+        as_is = bool(declared)  # NaN and infinity in a container are values
         blocks = (
             _convert_block(stream, block, chosen_columns, place, as_is)
             for block, _, place in rows.row_blocks(file, stream, types, recording, shared)
@@ -233,7 +234,7 @@ def _batches(
 
 
 def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
-    """Return the field of ``t_ns``, with what else is stated of it."""
+    """Return the field of ``t_ns`` with further metadata."""
     if stream.time.rate_hz is not None:
         field = schema.time_field("from rate")
     elif stream.time.origin == "start":
@@ -246,7 +247,7 @@ def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
 def _check_stamps(
     blocks: Iterable[Block], file: RowFile, stream: StreamLayout, recording: str | None, start_ns: int
 ) -> Iterator[list[pa.Array]]:
-    """Yield stamps and columns of blocks. Raises `TacpipeError` for stamps that run backwards and for no rows."""
+    """Yield timestamps and columns of blocks. Raises `TacpipeError` if timestamps decrease or there are no rows."""
     row_count, last_ns = 0, None
     of_day = bool(stream.time.format) and not stamps.has_date(stream.time.format)
     for t_ns, arrays in blocks:
@@ -269,7 +270,7 @@ def _check_stamps(
 
 
 def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
-    """Return times of day with a day added where they begin again; ``last_ns`` is the one above them.
+    """Return times of day with a day added after each midnight; ``last_ns`` is the time before them.
 
     >>> _add_days_past_midnight(np.array([86_399, 1]) * 10**9, None)
     array([86399000000000, 86401000000000])
@@ -284,7 +285,7 @@ def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
 def _add_stamps_of_file(
     blocks: Iterable[Block], stamps_ns: Times, file: RowFile, stream: StreamLayout
 ) -> Iterator[Block]:
-    """Yield blocks with stamps of another file. Raises `TacpipeError` if their number is not that of the rows."""
+    """Yield blocks with timestamps from another file. Raises `TacpipeError` if their number differs from that of rows."""
     row_count = 0
     for _, arrays in blocks:
         count = len(arrays[0])
@@ -301,7 +302,7 @@ def _unequal_lengths(file: RowFile, stream: StreamLayout, rows_there: str, stamp
 
 
 def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
-    """Raise `TacpipeError` if stamps run backwards; ``last_ns`` is that above them, after ``before`` rows."""
+    """Raise `TacpipeError` if timestamps decrease; ``last_ns`` is the previous one, after ``before`` rows."""
     steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
     backwards = np.flatnonzero(steps_ns < 0)
     if not len(backwards):
@@ -319,7 +320,7 @@ def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile,
 def _convert_block(
     stream: StreamLayout, block: pa.Table, chosen_columns: list[ChosenColumn], place: Place, as_is: bool
 ) -> Block:
-    """Return the stamps of a block, where it has some, and its columns as their declared types."""
+    """Return the timestamps of a block, if it has them, and its columns in their declared types."""
     clock = "" if stream.time.file else stream.time.column
     t_ns = rows.stamps_of_column(block.column(clock), stream, place) if clock else None
     arrays = []
@@ -336,11 +337,11 @@ def _convert_block(
 
 
 def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = None) -> pa.RecordBatchReader:
-    """Return the frames of a video file or of a folder of images with ``t_ns``, as they are read.
+    """Return the frames of a video file or a folder of images with ``t_ns``, read on demand.
 
-    Stamps are those of ``stamps_path``, where the layout names a file of stamps, else from the rate or the names of images,
-    else the video's own. Raises `TacpipeError` for what is no video or image, for stamps that run backwards, and for
-    another number of stamps than frames.
+    Timestamps come from ``stamps_path`` if the layout names a timestamp file, else from the rate or the images' names,
+    else from the video. Raises `TacpipeError` for unreadable videos and images, for decreasing timestamps, and if the
+    numbers of timestamps and frames differ.
     """
     images = image_paths(path) if stream.camera == "images" else []
     frames = None if images else video_files.scan(path)
@@ -378,7 +379,7 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """Return the images that lie directly in a folder, by name, numbers in order of their value.
+    """Return the images directly in a folder, sorted by name with numbers by value.
 
     Raises `TacpipeError` if there is none.
     """
@@ -394,7 +395,7 @@ def image_paths(folder: Path) -> list[Path]:
 
 
 def parts_of(path: Path) -> list[str]:
-    """Return the name of a file divided before and after each number.
+    """Return a file name split before and after each number.
 
     >>> parts_of(Path("a/frame_12.jpg"))
     ['frame_', '12', '.jpg']
@@ -403,7 +404,7 @@ def parts_of(path: Path) -> list[str]:
 
 
 def _stamps_of_names(images: Sequence[Path], stream: StreamLayout) -> Times:
-    """Return the stamps that the names of images state: the last number of each, in ns (image,)."""
+    """Return the timestamps in image names, which are the last number of each, in ns (image,)."""
     numbers = [last_number(path) for path in images]
     nameless = [path for path, number in zip(images, numbers, strict=True) if number is None]
     if nameless:

@@ -36,7 +36,7 @@ Item = TypeVar("Item")
 
 
 def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
-    """Yield ``items``; a thread computes each while the caller uses the item before it. Errors are raised here.
+    """Yield ``items``; a thread computes each while the caller processes the previous one. Errors are raised here.
 
     >>> list(read_ahead(iter([1, 2, 3])))
     [1, 2, 3]
@@ -48,12 +48,12 @@ def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
             yield item
 
 
-ROW_COLUMN = "row"  # the last column: the position of each row in the file
+ROW_COLUMN = "row"  # last column, with each row's position in the file
 _LENGTH = 8  # bytes
 
 
 def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) -> None:
-    """Write the rows of ``blocks`` to ``draft``, apart for each recording that the column ``recording`` names."""
+    """Write the rows of ``blocks`` to ``draft``, separated by the value of the column ``recording``."""
     places: dict[str, list[tuple[int, int]]] = {}
     schema, start_row = None, 0
     for block in blocks:
@@ -78,7 +78,7 @@ class CutIndex(TypedDict):
 
 
 def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indices]]:
-    """Yield the rows of one recording of a `cut`, block by block, and which rows of the file they were."""
+    """Yield the rows of one recording in a split file block by block, with their positions in the original file."""
     with regular.failing(path), regular.opened(path, follow=False) as file:
         file.seek(-_LENGTH, 2)
         length = int.from_bytes(file.read(_LENGTH), "little")
@@ -92,7 +92,7 @@ def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indice
 
 
 def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Iterator[tuple[str, pa.Table]]:
-    """Yield the rows of each recording in a block, in their order."""
+    """Yield the rows of each recording in a block, in order."""
     column = block.column(recording).cast(pa.string()).combine_chunks().dictionary_encode()
     codes, names = column.indices.fill_null(-1).to_numpy(zero_copy_only=False), column.dictionary.to_pylist()
     order = np.argsort(codes, kind="stable")
@@ -104,7 +104,7 @@ def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Itera
     rows = pa.Table.from_arrays(
         [*plain, pa.array(np.arange(start_row, start_row + len(block)))], [*block.column_names, ROW_COLUMN]
     )
-    if (np.diff(codes) < 0).any():  # else each recording's rows lie together, and nothing is copied
+    if (np.diff(codes) < 0).any():  # otherwise the rows of each recording are contiguous, and nothing is copied
         rows = rows.take(pa.array(order))
     edges = np.searchsorted(codes[order], np.arange(len(names) + 1))
     for name, start, stop in zip(names, edges, edges[1:], strict=False):
@@ -128,12 +128,12 @@ class RowFile(Protocol):
         """Return the columns, block by block."""
 
     def place(self, index: int) -> str:
-        """How a row is named in errors."""
+        """Return the name of a row in errors."""
 
 
 @dataclass(frozen=True)
 class ContainedRows:
-    """The rows of a stream of a container; ``clock`` is a column of whole numbers that they are put in order of."""
+    """The rows of a container's stream; ``clock`` is an integer column by which they are sorted."""
 
     path: Path
     stream: SourceStream
@@ -144,7 +144,7 @@ class ContainedRows:
         return list(self.stream.schema.names)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the rows of the columns that ``types`` names."""
+        """Yield the rows of the columns in ``types``."""
         blocks = (block.select(list(types)) for block in self.stream.blocks())
         if not self.clock:
             yield from blocks
@@ -154,7 +154,7 @@ class ContainedRows:
         yield from in_order(pieces, spill.read, self.clock)
 
     def place(self, index: int) -> str:
-        """Return how the row ``index`` (from 0) is named in errors."""
+        """Return the name of the row ``index`` (from 0) in errors."""
         return f"{plain(self.stream.source)}, row {index + 1}"
 
 
@@ -169,10 +169,10 @@ def open_rows(path: Path, stream: StreamLayout) -> RowFile:
 
 
 def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
-    """Return the stamps in a file that holds those of all rows of ``stream``, in ns (row,).
+    """Return the timestamps in a file with those of all rows of ``stream``, in ns (row,).
 
-    They are in the column that the stream's time names, or in the only one of the file. Raises `TacpipeError` for a file
-    with several columns where none is named, and as `stamps_of_column` does.
+    They are in the column named by the stream's time, or in the file's only column. Raises `TacpipeError` for a file
+    with several columns if none is named, and the errors of `stamps_of_column`.
     """
     kind = EXTENSIONS.get(extension(path), "csv")
     clock = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
@@ -204,7 +204,7 @@ def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
 
 
 def reserved_types(file: RowFile, stream: StreamLayout) -> dict[str, pa.DataType]:
-    """Return as what the columns are parsed that are no channels."""
+    """Return the types for parsing the columns that are not channels."""
     parsed_types: dict[str, pa.DataType] = {}
     if stream.time.column and not stream.time.file:
         parsed_types[stream.time.column] = pa.string() if stream.time.is_text else stamps.DECIMAL
@@ -220,9 +220,9 @@ def row_blocks(
     recording: str | None,
     shared: Shared | None,
 ) -> Iterator[tuple[pa.Table, Indices, Place]]:
-    """Yield the blocks of a file, of one recording alone where it holds many, with which rows of the file they are.
+    """Yield the blocks of a file, or of one of its recordings, with the positions of their rows in the file.
 
-    The third is how errors name a row of the block.
+    The third value is a function from a row of the block to its name in errors.
     """
     for block, in_file in _select_rows(file, stream, column_types, recording, shared):
 
@@ -239,7 +239,7 @@ def _select_rows(
     recording: str | None,
     shared: Shared | None,
 ) -> Iterator[tuple[pa.Table, Indices]]:
-    """Yield the blocks of a file, or of a recording in it, and which rows of the file they are."""
+    """Yield the blocks of a file, or of a recording in it, with the positions of their rows in the file."""
     if stream.recording and shared is not None:
 
         def cut(draft: Draft) -> None:
@@ -257,7 +257,7 @@ def _select_rows(
 
 
 def stamps_of_column(column: pa.ChunkedArray, stream: StreamLayout, place: Place) -> Times:
-    """Return the stamps of a column in ns (row,). Raises `TacpipeError`, naming the row, for what is not one."""
+    """Return the timestamps in a column in ns (row,). Raises `TacpipeError` with the row for an invalid one."""
     try:
         return stamps.nanoseconds(column, stream.time)
     except stamps.StampError as error:

@@ -1,7 +1,7 @@
-"""Convert stamps of any unit, and text in a format of ``strptime``, to whole nanoseconds, int64.
+"""Convert timestamps of any unit, and text in a ``strptime`` format, to integer nanoseconds (int64).
 
-Numbers keep the file's digits: text is read as decimal numbers and never through float64, in which a Unix time of today has
-steps of 238 ns.
+Numbers keep the digits of the file: text is parsed as decimal numbers, never through float64, whose resolution at
+today's Unix time is 238 ns.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DAY_NS = 86_400 * 10**9
 
 
 def check_format(text: str, place: str) -> None:
-    """Raise `UsageError` for a format with a directive that is not read, or without an hour."""
+    """Raise `UsageError` for a format with an unsupported directive, or without an hour."""
     letters = re.findall(r"%(.)", text.replace("%%", ""), re.DOTALL)
     unread = sorted({f"%{letter}" for letter in letters} - {f"%{letter}" for letter in _DIRECTIVES})
     if unread or not {"H", "I"} & set(letters):
@@ -49,7 +49,7 @@ def check_format(text: str, place: str) -> None:
 
 
 def has_date(text: str) -> bool:
-    """Return whether stamps of a format state their day.
+    """Return whether timestamps of a format include a date.
 
     >>> has_date("%d.%m.%Y %H:%M"), has_date("%H:%M:%S.%f")
     (True, False)
@@ -60,7 +60,7 @@ def has_date(text: str) -> bool:
 def format_expression(text: str) -> str:
     """Return the regular expression of a format, with a group for each directive.
 
-    A fraction of a second may be left out, as Python does where it is zero.
+    A fraction of a second is optional, because Python omits it if it is zero.
     """
     regex = ""
     for match in _PART.finditer(text):
@@ -79,9 +79,9 @@ def format_expression(text: str) -> str:
 
 
 def parse_stamps(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
-    """Return stamps as nanoseconds since 1970 without regard to a zone, or since midnight, and whether each is a time.
+    """Return timestamps in nanoseconds since 1970 (ignoring the time zone) or since midnight, and whether each is valid.
 
-    ``column`` holds text of the format ``text``; both results have the shape (row,).
+    ``column`` contains text of the format ``text``; both results have the shape (row,).
 
     >>> import pyarrow as pa
     >>> parse_stamps(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
@@ -123,19 +123,19 @@ def parse_stamps(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
     return np.where(valid, t_ns * 10**9 + fraction, 0), valid
 
 
-IN_RANGE = "a time before the year 2262"  # 64 bits of nanoseconds end then
-DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
-DECIMAL = pa.decimal128(38, 18)  # the type that text is parsed as
-_UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
-_USUAL = 450_000_000  # limit for the high word of seconds (year 2233) below which products fit 64 bits
-_BEYOND = 10**37 >> 64  # limit for the high word, later than 2262 in every unit
-_MAX_STAMP = 1e19  # later than 2262 in every unit, and below the least number that Arrow reads as another decimal
+IN_RANGE = "a time before the year 2262"  # the limit of nanoseconds in 64 bits
+DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # number of decimals that are nanoseconds, by unit
+DECIMAL = pa.decimal128(38, 18)  # type for parsing text
+_UNIT = 10**9  # a nanosecond in units of the last digit of `DECIMAL` seconds
+_USUAL = 450_000_000  # limit of the high word of seconds (year 2233) below which products fit in 64 bits
+_BEYOND = 10**37 >> 64  # limit of the high word that is after 2262 in every unit
+_MAX_STAMP = 1e19  # after 2262 in every unit, and below the smallest number that Arrow misreads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
-_LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, written by Python's logging
+_LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, as written by Python's logging
 
 
 class StampError(ValueError):
-    """A stamp that is none: the index of its row within the column, and what is there."""
+    """An invalid timestamp: the index of its row in the column, and its text."""
 
     def __init__(self, row: int, value: str, expected: str) -> None:
         super().__init__(value)
@@ -143,9 +143,9 @@ class StampError(ValueError):
 
 
 def nanoseconds(column: pa.Array, time: Time) -> Int64s:
-    """Return stamps as nanoseconds (time,); numbers as the unit of ``time`` has them, rounded half to even.
+    """Return timestamps in nanoseconds (time,), converted from the unit of ``time`` and rounded half to even.
 
-    Raises `StampError` for a missing stamp, one that is not a time, and one beyond what 64 bits hold (the year 2262).
+    Raises `StampError` for a timestamp that is missing, is not a time, or does not fit in 64 bits (the year 2262).
 
     >>> nanoseconds(pa.array(["1744849152.0161362"]).cast(DECIMAL), Time()), nanoseconds(pa.array([1.5]), Time(unit="ms"))
     (array([1744849152016136200]), array([1500000]))
@@ -187,19 +187,19 @@ def _from_iso_text(column: pa.Array, zone: str) -> Int64s:
 
 
 def _from_format(column: pa.Array, time: Time) -> Int64s:
-    """Return stamps that are text in the format of ``time``."""
+    """Return timestamps given as text in the format of ``time``."""
     t_ns, valid = parse_stamps(column.cast(pa.string()), time.format)
     _refuse_flagged(pa.array(~valid), column, f"a time in the format {time.format}")
     return _to_utc(t_ns if has_date(time.format) else t_ns + _day_ns(time), time.zone)
 
 
 def _day_ns(time: Time) -> int:
-    """Return when the day of times of day begins: that of ``start``, else 1970-01-01."""
+    """Return the start of the day for times of day: that of ``start``, or else 1970-01-01."""
     return int(np.datetime64(time.start[:10], "D").astype("datetime64[ns]").astype(np.int64)) if time.start else 0
 
 
 def _to_utc(t_ns: Int64s, zone: str) -> Int64s:
-    """Return nanoseconds that clocks in a zone show as those of UTC."""
+    """Convert nanoseconds of local time in a zone to UTC."""
     if zone == "UTC":
         return t_ns
     stamps = pc.assume_timezone(pa.array(t_ns).cast(pa.timestamp("ns")), zone, ambiguous="earliest")
@@ -221,7 +221,7 @@ def _from_decimals(column: pa.Array, digits: int) -> Int64s:
 
 
 def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
-    """Return decimals as whole numbers of their last digit (row,), and whether 64 bits hold each.
+    """Return decimals as integers in units of their last digit (row,), and whether each fits in 64 bits.
 
     >>> last_digits(pa.array(["1.25", "-3"]).cast(pa.decimal128(19, 2)))[0]
     array([ 125, -300])
@@ -232,10 +232,10 @@ def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
 
 
 def overflows(rounded: pa.ChunkedArray) -> Bools:
-    """Return which stamps Arrow may have read as another number, shape (row,), from the same column read as float64.
+    """Return which timestamps Arrow may have misread, shape (row,), from the same column read as float64.
 
-    Arrow multiplies the digits of a cell by a power of ten within 128 bits and does not notice an overflow, by which 1e34
-    may become any number.
+    Arrow multiplies the digits of a cell by a power of ten in 128 bits and does not detect an overflow, so 1e34 may
+    become any number.
 
     >>> overflows(pa.chunked_array([[1744849152.5, None, -1e34]]))
     array([False, False,  True])
@@ -244,13 +244,13 @@ def overflows(rounded: pa.ChunkedArray) -> Bools:
 
 
 def _decimal_words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:
-    """Return the two words of eight bytes that a decimal128 is as a whole number of its last digit."""
+    """Return the high and low 64-bit words of decimal128 values."""
     words = np.frombuffer(column.buffers()[1], dtype="<i8").reshape(-1, 2)[column.offset :][: len(column)]
     return words[:, 1], words[:, 0].view(np.uint64)
 
 
 def _from_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> Int64s:
-    """Return seconds with 18 decimals, in two words, as nanoseconds, rounded half to even."""
+    """Convert seconds with 18 decimals, given as two words, to nanoseconds, rounded half to even."""
     high_whole, high_remainder = divmod(1 << 64, _UNIT)  # the high word counts 2^64
     low_whole, low_left = np.divmod(low, np.uint64(_UNIT))
     carried, remainder = np.divmod(high * high_remainder + low_left.astype(np.int64), _UNIT)
@@ -275,13 +275,13 @@ def _from_floats(column: pa.Array, factor: int) -> Int64s:
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
     _refuse_flagged(pa.array(bad), column, IN_RANGE)
-    floors = np.floor(values)  # apart from the rest: their product with the factor would be rounded
+    floors = np.floor(values)  # separately, because the product of the whole number with the factor would be rounded
     t_ns: Times = floors.astype(np.int64) * factor + np.rint((values - floors) * factor).astype(np.int64)
     return t_ns
 
 
 def _cast(column: pa.Array, kind: pa.DataType, expected: str) -> pa.Array:
-    """Return a column as ``kind``; raises `StampError`, with ``expected``, for the first that cannot be converted."""
+    """Cast a column to ``kind``. Raises `StampError`, with ``expected``, for the first value that cannot be converted."""
     try:
         return column.cast(kind)
     except pa.ArrowInvalid:

@@ -1,7 +1,7 @@
 """Read text tables (CSV, TSV and others) in blocks as numbers of declared types, and sheets of Excel workbooks (.xlsx).
 
-Text may be compressed with gzip and have any encoding. pyarrow parses block by block, with all cores; where it refuses a
-block, the file is read once more in Python to name the line and the cell. Lines are counted from 1, as an editor shows them.
+Text may be compressed with gzip and have any encoding. pyarrow parses block by block on all cores; if it rejects a
+block, Python reads the file again to find the line and the cell. Lines are counted from 1, as in an editor.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from tacpipe.io.parquet import owned
 from tacpipe.plugins import extras
 from tacpipe.printable import excerpt, listed, plain
 
-RECODED_BYTES = 1 << 20  # bytes decoded at once
+RECODED_BYTES = 1 << 20  # number of bytes decoded at once
 
 
 @contextlib.contextmanager
 def open_text(path: Path, encoding: str = "utf-8") -> Iterator[IO[bytes]]:
-    """Open a file for reading, unpacked where its name ends in .gz, and as UTF-8 where it is text of another ``encoding``.
+    """Open a file for reading as UTF-8, unpacked if its name ends with .gz, and converted from ``encoding``.
 
-    Raises `TacpipeError` for a file that cannot be read.
+    Raises `TacpipeError` if the file cannot be read.
     """
     with regular.failing(path), regular.opened(path) as raw:
         try:
@@ -57,7 +57,7 @@ def open_text(path: Path, encoding: str = "utf-8") -> Iterator[IO[bytes]]:
 
 
 def is_utf8(encoding: str) -> bool:
-    """Return whether text in an encoding is UTF-8 as it stands.
+    """Return whether text in an encoding needs no conversion to UTF-8.
 
     >>> is_utf8("UTF8"), is_utf8("cp1252")
     (True, False)
@@ -87,15 +87,15 @@ class _Recoded(io.RawIOBase):
         return count
 
 
-BLOCK_BYTES = 1 << 24  # below what the C library gives back to the system each time
-BOM = b"\xef\xbb\xbf"  # mark that some editors write at the start
-MAX_LINE_BYTES = 1 << 24  # bytes; a file without line ends is none
+BLOCK_BYTES = 1 << 24  # below the size that the C library returns to the system each time
+BOM = b"\xef\xbb\xbf"  # byte order mark that some editors write at the start
+MAX_LINE_BYTES = 1 << 24  # a file with longer lines is not a text table
 _NOT_BLANK = re.compile(rb"\S")
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """A text file of cells, as the layout's stream describes it."""
+    """A text file of cells, as described by a stream of the layout."""
 
     path: Path
     stream: StreamLayout
@@ -103,7 +103,7 @@ class TextTable:
     def names(self) -> list[str]:
         """Return the names of the columns: those of the header, or column1, column2, ….
 
-        Raises `TacpipeError` for a file without a row, and for a name that comes twice.
+        Raises `TacpipeError` for a file without rows, and for a repeated name.
         """
         for line, cells in self.rows():
             if self.stream.names:
@@ -127,7 +127,7 @@ class TextTable:
         raise TacpipeError(f"{self.path} has no row. Remove it, or record it again.")
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns that ``types`` names, block by block. Raises `TacpipeError`, with the line, for a wrong row."""
+        """Yield the columns in ``types`` block by block. Raises `TacpipeError` with the line of an invalid row."""
         names = self.names()
         parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
         read = pc.ReadOptions(column_names=names, use_threads=True)
@@ -149,7 +149,7 @@ class TextTable:
             yield table
 
     def _conversion(self, types: Mapping[str, pa.DataType]) -> pc.ConvertOptions:
-        """Return how Arrow reads the columns that ``types`` names."""
+        """Return Arrow's options for reading the columns in ``types``."""
         return pc.ConvertOptions(
             column_types=dict(types),
             include_columns=list(types),
@@ -159,7 +159,7 @@ class TextTable:
         )
 
     def _expect_width(self, line: int, cells: Sequence[str]) -> None:
-        """Raise `TacpipeError` if a row has another number of cells than the layout names columns."""
+        """Raise `TacpipeError` if the number of cells in a row differs from the number of column names in the layout."""
         if len(cells) != len(self.stream.names):
             raise TacpipeError(
                 f"{self.path}, line {line} has {len(cells)} cells, and header in [streams.{self.stream.name}] names "
@@ -167,14 +167,14 @@ class TextTable:
             )
 
     def place(self, index: int) -> str:
-        """Return the line that holds the data row ``index`` (from 0), as errors name it."""
+        """Return the line of the data row ``index`` (from 0), for errors."""
         for position, (line, _) in enumerate(self.rows()):
             if position == index + self.stream.header:
                 return f"line {line}"
         raise IndexError(f"{self.path} has no row {index}.")
 
     def _blocks(self) -> Iterator[tuple[bytes | memoryview, ...]]:
-        """Yield the bytes below the header, whole lines at a time, without comments; each in pieces."""
+        """Yield the bytes below the header in whole lines without comments, each as several pieces."""
         comment = self.stream.comment.encode()
         drop = re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
         with open_text(self.path, self.stream.encoding) as file:
@@ -192,7 +192,7 @@ class TextTable:
     def _without_comments(
         self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
     ) -> Iterator[tuple[bytes | memoryview, ...]]:
-        """Yield pieces that end with a line without what matches ``drop``, or nothing if no line holds anything."""
+        """Yield pieces that end with a line, without the matches of ``drop``; nothing if no line has content."""
         if drop is not None:
             pieces = (drop.sub(b"", b"".join(pieces)),)
         if any(_NOT_BLANK.search(piece) for piece in pieces):
@@ -216,7 +216,7 @@ class TextTable:
             header &= number < self.stream.skip_lines or not text or commented
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the number and the cells of each line that holds some, the header among them."""
+        """Yield number and cells of each non-empty line, including the header."""
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
         with open_text(self.path, self.stream.encoding) as file:
@@ -237,7 +237,7 @@ class TextTable:
         return TacpipeError(f"{self.path} has a line of over {MAX_LINE_BYTES} bytes; it is not a text table.")
 
     def _first_fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
-        """Return a sentence about the first row that is not as declared, or None."""
+        """Return a sentence about the first row that does not match the declaration, or None."""
         rows = self.rows()
         if self.stream.header:
             next(rows)
@@ -255,7 +255,7 @@ class TextTable:
         return None
 
     def remedy(self, kind: pa.DataType) -> str:
-        """Return what to do about a cell that is not of its type ``kind``."""
+        """Return what to do about a cell that does not match its type ``kind``."""
         return "Correct the cell, or declare it in missing."
 
     def _is_allowed(self, cell: str, kind: pa.DataType) -> bool:
@@ -276,7 +276,7 @@ class TextTable:
 
 
 def describe_type(kind: pa.DataType) -> str:
-    """Return what a cell of a type is, as in "which is not …".
+    """Return a phrase for the cells of a type, as in "which is not …".
 
     >>> describe_type(pa.uint16()), describe_type(pa.float64())
     ('a whole number from 0 to 65535', 'a number')
@@ -297,7 +297,7 @@ BLOCK_ROWS = 1 << 14
 
 @dataclass(frozen=True)
 class Workbook:
-    """One sheet of a workbook, as the layout's stream describes it."""
+    """One sheet of a workbook, as described by a stream of the layout."""
 
     path: Path
     stream: StreamLayout
@@ -322,7 +322,7 @@ class Workbook:
         return names
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns that ``types`` names, some rows at a time. Raises `TacpipeError` for a wrong cell."""
+        """Yield the columns in ``types`` in blocks of rows. Raises `TacpipeError` for an invalid cell."""
         names = self.names()
         with self._rows() as rows:
             if self.stream.header:
