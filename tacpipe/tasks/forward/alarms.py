@@ -1,24 +1,24 @@
-"""Measure whether predictors warn of a change of load before it begins.
+"""Measure whether predictions warn of a change of load before it begins.
 
-A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
-so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
-``truth`` k rows later, k being the ``horizon``, or NaN if there is none. ``groups`` (time,) numbers recordings or
-contacts, equal neighbours belong together, and nothing is given across them. Each feature is evaluated by itself.
+Plots of forecasts at the time at which they were made always look early, also if they overshoot; so warnings are
+counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) contains in row t the forecast, made at t, of
+``truth`` k rows later, where k is the ``horizon``; NaN if there is none. ``groups`` (time,) numbers recordings or
+contacts: equal neighbours belong together, and nothing is computed across groups. Each feature is evaluated separately.
 
-- A *change* is a run of rows t in which |z_t - z_{t-k}| is beyond 3 times its standard deviation sd in calibration data,
-  until it is below 1.5 times. A run that begins within 2 k rows of the end of the last belongs to it: a difference over
-  k rows repeats a short push with the other sign k rows later, and what warns of a change needs k rows of quiet before.
-- An *event* is the onset of a change: where the run begins, at t, the row after the last of t - k, ..., t - 1 that is
-  within a twentieth of z_t - z_{t-k} from z_{t-k}. Were it t itself, a forecast that merely follows would look early,
-  because a change that takes time has begun before it is beyond 3 sd.
-- An *alarm* is on in a row in which |ahead_t - z_t| > theta. It *leads* an event at T if it is on in one of the rows
-  T - k, ..., T - 1, by T less the first of them: what k rows predict is never known more than k rows before.
-- A *false alarm* is one in a row that is free of events: with a forecast whose k rows are in the group, and before
-  T - k - k/5 or from the end of the change on for every event T. An alarm represents the k rows that it predicts: one
-  that is still on after these is the next, so that an alarm that never ends is not a rare one.
+- A *change* is a run of rows t in which |z_t - z_{t-k}| exceeds 3 standard deviations sd of calibration data, until it
+  is below 1.5. A run that begins within 2 k rows after the previous one belongs to it: a difference over k rows repeats
+  a short push with the opposite sign k rows later, and a warning needs k quiet rows before the change.
+- An *event* is the onset of a change: for a run that begins at t, the row after the last of t - k, ..., t - 1 at which
+  less than a twentieth of z_t - z_{t-k} has happened. If it were t itself, a forecast that merely follows would look
+  early, because a gradual change begins before it exceeds 3 sd.
+- An *alarm* is on in a row in which |ahead_t - z_t| > theta. It *leads* an event at T if it is on in one of the rows T
+  - k, ..., T - 1, by T minus the first of them: a prediction over k rows cannot lead by more than k rows.
+- A *false alarm* is one in a row that is free of events: a row whose forecast is inside the group, and that is before T
+  - k - k/5 or after the end of the change for every event T. An alarm represents the k rows that it predicts. If it is
+  still on after them, it counts again, so that an alarm that never ends is not a rare one.
 
-Events that do not have a forecast in each of the k rows before are not counted: they could not be led by k rows.
-Persistence forecasts no change, hence never alarms.
+Events without a forecast in each of the k rows before them are not counted, because they could not be led by k rows.
+Persistence predicts no change, so it never alarms.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ from tacpipe.tasks.forward.tracks import Track
 if TYPE_CHECKING:
     from tacpipe.tasks.forward.predictors import Predicted, Prediction
 
-ON_SD, OFF_SD = 3.0, 1.5  # differences at which a change begins and ends, in standard deviations
-ONSET_FRACTION = 0.05  # fraction of a change up to which it has not begun
-EARLY_FRACTION = 0.2  # fraction of the horizon by which an alarm may be early and still not be false
-FALSE_ALARMS_PER_MINUTE = 1.0  # rate for each feature, where nothing happens
+ON_SD, OFF_SD = 3.0, 1.5  # thresholds at which a change begins and ends, in standard deviations
+ONSET_FRACTION = 0.05  # fraction of a change up to which it counts as not begun
+EARLY_FRACTION = 0.2  # fraction of the horizon by which an alarm may be early without being false
+FALSE_ALARMS_PER_MINUTE = 1.0  # rate per feature in rows without events
 
 
 @dataclass(frozen=True)
 class Anticipation:
-    """How well changes were predicted, over all features, or NaN if nothing states."""
+    """How well changes were predicted, over all features; NaN if unknown."""
 
     events: int
-    recall: float  # fraction of the events that an alarm leads
+    recall: float  # fraction of events led by an alarm
     median_lead_rows: float  # rows from alarm to event
-    median_lead_frames: float  # new frames from alarm to event, the event's own included
-    false_alarms_per_minute: float  # rate for each feature, in rows free of events
+    median_lead_frames: float  # new frames from alarm to event, including that of the event
+    false_alarms_per_minute: float  # rate per feature in rows without events
 
 
 class AlarmScore(TypedDict):
-    """The fields of `Anticipation` in ``metrics.json``; None where nothing states them."""
+    """The fields of `Anticipation` in ``metrics.json``; None if unknown."""
 
     events: int
     recall: float | None
@@ -81,9 +81,9 @@ def difference_sd(truth: AnyFloats, groups: AnyArray, *, horizon: int) -> AnyFlo
 
 
 def changes(truth: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats) -> list[Indices]:
-    """Return the onset and the end, exclusive, of the changes of each feature, each (change, 2).
+    """Return onset and end (exclusive) of the changes of each feature, each of shape (change, 2).
 
-    ``sd`` (feature,) is that of `difference_sd`; a feature whose is 0 never changes.
+    ``sd`` (feature,) comes from `difference_sd`; a feature with sd 0 never changes.
     """
     _check(truth, horizon, groups=groups, sd=sd)
     stretches = _stretches(groups)
@@ -105,10 +105,10 @@ def calibrate(
     rate_hz: float,
     per_minute: float = FALSE_ALARMS_PER_MINUTE,
 ) -> AnyFloats:
-    """Return theta (feature,): the least that gives no more than ``per_minute`` false alarms a minute in this data.
+    """Return theta (feature,): the lowest level with at most ``per_minute`` false alarms per minute in these data.
 
-    ``rate_hz`` is the rate of rows. Infinite for a feature without a row that is free of events: no alarm is known to be
-    rare enough there.
+    ``rate_hz`` is the rate of rows. The level is infinite for a feature without rows free of events, because no alarm
+    can then be shown to be rare.
     """
     _check(truth, horizon, groups=groups, ahead=ahead, sd=sd)
     stretches = _stretches(groups)
@@ -139,11 +139,14 @@ def level(
 
 
 def _lowest_level(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: int, allowed: float) -> float:
-    """Return the least level that ``deviation`` (time,) passes in no more than ``allowed`` alarms; infinite without rows."""
+    """Return the lowest level that ``deviation`` (time,) exceeds in at most ``allowed`` alarms; infinite without rows."""
     if not free.any():
         return float("inf")
     levels = np.unique(deviation[free])
-    low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
+    low, high = (
+        0,
+        len(levels) - 1,
+    )  # the highest level is never exceeded, and a value above one level is above all lower ones
     while low < high:
         middle = (low + high) // 2
         if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:
@@ -164,9 +167,9 @@ def score(
     rate_hz: float,
     repeated: Bools | None = None,
 ) -> Anticipation:
-    """Return how well ``ahead`` predicts the changes of ``truth`` with alarms beyond ``theta`` (feature,).
+    """Return how well ``ahead`` predicts the changes of ``truth``, with alarms above ``theta`` (feature,).
 
-    ``repeated`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
+    ``repeated`` (time,) marks rows that repeat the previous frame; None if every row is a new frame.
     """
     _check(truth, horizon, groups=groups, ahead=ahead, sd=sd, theta=theta)
     stretches = _stretches(groups)
@@ -199,14 +202,14 @@ def score(
 
 
 def _stretches(groups: AnyArray) -> Indices:
-    """Return the number of the group of each row (time,), so that no number comes twice."""
+    """Return a unique group number for each row (time,), also if numbers in ``groups`` recur."""
     begins = np.ones(len(groups), dtype=bool)
     begins[1:] = groups[1:] != groups[:-1]
     return np.cumsum(begins)
 
 
 def _spaced(stretches: Indices, horizon: int) -> Indices:
-    """Return row numbers (time,) between which groups lie so far apart that nothing of one is near another."""
+    """Return row numbers (time,) with gaps between groups that exceed every distance that is compared."""
     return np.arange(len(stretches)) + stretches * 2 * horizon
 
 
@@ -219,22 +222,22 @@ def _moved(truth: AnyFloats, stretches: Indices, horizon: int) -> AnyFloats:
 
 
 def _changes_of(truth: AnyFloats, moved: AnyFloats, spaced: Indices, horizon: int, sd: float) -> Indices:
-    """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
+    """Return onset and end of the changes (change, 2) of one feature; ``truth`` and ``moved`` are (time,)."""
     size = np.abs(moved)
     on = (size > ON_SD * sd) & (sd > 0)
-    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # a change ends where a value is missing
+    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # a change ends at a missing value
     if not len(starts):
         return np.zeros((0, 2), dtype=np.intp)
     separate = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
     starts, stops = starts[np.append(True, separate)], stops[np.append(separate, True)]
     before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
     has_begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
-    lasts = np.argmin(has_begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
+    lasts = np.argmin(has_begun[:, ::-1], axis=1)  # number of contiguous rows before the start that had begun to change
     return np.stack([starts - lasts, stops], axis=1)
 
 
 def _free(deviation: AnyFloats, spans: Indices, stretches: Indices, horizon: int) -> Bools:
-    """Return which rows (time,) have a forecast that its group holds and are not near a change of ``spans``."""
+    """Return which rows (time,) have a forecast inside their group and are not near a change in ``spans``."""
     free: Bools = np.isfinite(deviation)
     free[max(len(free) - horizon, 0) :] = False
     free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
@@ -246,10 +249,10 @@ def _free(deviation: AnyFloats, spans: Indices, stretches: Indices, horizon: int
 
 
 def _count(alarms: Indices, horizon: int, enough: float = np.inf) -> int:
-    """Return how many alarms the rows ``alarms`` are, sorted: each represents the k rows after it, too.
+    """Return the number of alarms in the sorted rows ``alarms``; each alarm also represents the k rows after it.
 
-    No choice of rows more than k apart is larger, so that more rows never make fewer alarms. Counts no further than one
-    beyond ``enough``.
+    This is the largest choice of rows more than k apart, so more rows never give fewer alarms. Stops counting one above
+    ``enough``.
     """
     count, at = 0, 0
     while at < len(alarms) and count <= enough:
@@ -263,7 +266,7 @@ def _minutes(rows: Bools, rate_hz: float) -> float:
 
 
 def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **arrays: AnyFloats) -> None:
-    """Refuse what cannot be evaluated."""
+    """Raise an error for data that cannot be evaluated."""
     if horizon < 1:
         raise TacpipeError(f"A forecast of {horizon} rows predicts nothing; the horizon must be 1 or more.")
     if truth.ndim != 2 or len(groups) != len(truth):
@@ -277,7 +280,7 @@ def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **arrays: AnyFlo
 
 
 def axes(layout: Sequence[Mapping[str, str]]) -> tuple[tuple[str, str], ...]:
-    """Return stream and axis of each load of channels that lie so."""
+    """Return stream and axis of each load of channels with this layout."""
     return tuple(dict.fromkeys(map(_axis, layout)))
 
 
@@ -309,7 +312,7 @@ WATCHED = (MODEL, BASELINE, "damped_trend", "last_value_linear", "ridge", "ridge
 
 @dataclass
 class Loads:
-    """The mean count of each sensor's axes on all rows, and its predictions at the last step of the horizon."""
+    """The mean count of each sensor's axes in all rows, and its predictions at the last step of the horizon."""
 
     layout: Layout
     horizon: int
@@ -330,17 +333,17 @@ class Loads:
             self.ahead.setdefault(name, []).append(np.full_like(truth, np.nan))
 
     def add(self, windows: Predicted) -> None:
-        """Add the predictions for some windows of the recording that was begun last."""
+        """Add the predictions for some windows of the recording started last."""
         for name, prediction in windows.predictions.items():
             self.add_one(name, windows.now, prediction)
 
     def add_one(self, name: str, now: Int64s, prediction: Prediction) -> None:
-        """Add the predictions of one predictor for windows whose last rows are ``now``, as `add` does."""
+        """Add the predictions of one predictor for windows with the last rows ``now``, as `add` does."""
         if name in WATCHED:
             self.ahead[name][-1][now] = loads(prediction.count[:, -1], self.layout)
 
     def calibrated(self) -> AlarmLevels:
-        """Return each load's usual change and, by predictor, the alarm levels that give a false alarm a minute."""
+        """Return each load's change sd and, by predictor, the alarm levels with one false alarm per minute."""
         if not self.truth:
             return {}
         truth, groups = np.concatenate(self.truth), np.concatenate(self.groups)
@@ -349,12 +352,12 @@ class Loads:
             name: calibrate(truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self.rate_hz).tolist()
             for name, ahead in self._with_forecasts()
         }
-        # JSON holds no infinity: null stands in its place
+        # null, because JSON has no infinity
         levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
         return {"sd": sd.tolist(), "theta": levels}
 
     def scored(self, levels: AlarmLevels) -> dict[str, AlarmScore]:
-        """Return how well each predictor predicted changes with the ``levels`` that `calibrated` gave."""
+        """Return how well each predictor predicted changes with the ``levels`` from `calibrated`."""
         if not levels or not self.truth:
             return {}
         truth, groups, sd = np.concatenate(self.truth), np.concatenate(self.groups), np.array(levels["sd"])
@@ -388,10 +391,10 @@ class Loads:
 
     @property
     def rate_hz(self) -> float:
-        """Rows a second, or 1 if no recording has two."""
+        """Rows per second, or 1 if no recording has two rows."""
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
 
 
 def _number(value: float) -> float | None:
-    """Return ``value`` to 9 digits, or None if it is not finite."""
+    """Return ``value`` rounded to 9 digits, or None if it is not finite."""
     return float(f"{value:.9g}") if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Give a trained forecaster quantiles: from its errors on recordings to one more file."""
+"""Add quantiles to a trained forecaster, as an additional file computed from its errors on recordings."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.tasks.task import CalibrationRequest
 
-FITTED = 5000  # windows that quantiles are fitted on, evenly spread over training recordings
-CORRECTED = 400  # windows of each calibration recording
+FITTED = 5000  # number of windows for fitting quantiles, evenly spread over training recordings
+CORRECTED = 400  # number of windows per calibration recording
 
 
 def calibrate(
@@ -32,8 +32,8 @@ def calibrate(
 ) -> dict[str, bytes]:
     """Return the files of a model with quantiles of its error, fitted on training and corrected on calibration recordings.
 
-    Raises `UsageError` if the model was trained or stopped by a calibration recording, and `TacpipeError` if the
-    recordings are not what the model reads or hold no window, and for too few of them.
+    Raises `UsageError` if a calibration recording was used for training or early stopping, and `TacpipeError` if the
+    model cannot read the recordings, if they contain no window, or if there are too few of them.
     """
     check_levels(request.quantiles)
     forecaster = Forecaster.load(model)
@@ -59,7 +59,7 @@ def calibrate(
 
 
 def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
-    """Refuse calibration recordings that the model was trained, stopped or shrunk by."""
+    """Raise an error for calibration recordings that were used for training, early stopping or shrinkage."""
     digests = set(forecaster.config["trained_on"].values())
     used = sorted(name for name, shard in calibration.recordings.items() if shard.digest in digests)
     if used:
@@ -70,7 +70,7 @@ def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
 
 
 def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> WindowErrors:
-    """Return the model's errors on at most ``limit`` windows of each recording, evenly spread."""
+    """Return the model's errors on at most ``limit`` evenly spread windows of each recording."""
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
     with terminal.progress_bar("calibrate", len(recordings.recordings)) as advance:

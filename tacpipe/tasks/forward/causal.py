@@ -1,7 +1,7 @@
-"""A forecaster fed row by row: what `tracks` and `predictors` make of a whole recording, without looking ahead.
+"""Run a forecaster row by row, without looking ahead, with the results of `tracks` and `predictors` on whole recordings.
 
-Rows are encoded and predicted one by one, never several at once: products of matrices of one row and of many round
-differently, and a forecast must not depend on how many rows came together.
+Rows are encoded and predicted one at a time, because matrix products of one row and of many rows round differently, and
+a forecast must not depend on how many rows arrived together.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from tacpipe.tasks.forward.forecaster import Forecaster
 
 JOINED = (
     2 * 3 * kinematics.TOOL_SPREAD_M
-)  # largest distance from its first place of a hand that is fixed to the last link
+)  # maximum distance from the initial position of a hand that is fixed to the last link
 
 
 class Arm:
-    """The arm's rows: place, orientation of continuous sign, and velocities from joints or from the row before."""
+    """The arm's rows: position, orientation with continuous sign, and velocities from joints or differences."""
 
     def __init__(self, orientation: AnyFloats) -> None:
-        """Make an arm at its first row; ``orientation`` (4,) is the quaternion whose sign recordings are given."""
+        """Start before the first row; ``orientation`` (4,) is the quaternion that defines the sign in recordings."""
         self._reference = orientation
         self._sign, self._opposite = 1.0, None if orientation is None else False
         self._decided = False
-        self._unit: Floats | None = None  # (1, 4), the quaternion before, as it came
-        self._before: tuple[int, Floats] | None = None  # time and place (7,) of the row before
-        self._tool_m: Floats | None = None  # (3,), where the hand was on the last link at first
+        self._unit: Floats | None = None  # (1, 4), previous quaternion as received
+        self._before: tuple[int, Floats] | None = None  # time and pose (7,) of the previous row
+        self._tool_m: Floats | None = None  # (3,), initial position of the hand on the last link
         self._carried = True
 
     def row(
@@ -46,10 +46,10 @@ class Arm:
         angles: Floats | None = None,
         speeds: Floats | None = None,
     ) -> Float32s:
-        """Return the arm (13,) at a row: position (3,), quaternion (4,), joint angles and speeds (7,) where there are any.
+        """Return the arm (13,) in a row: position (3,), quaternion (4,), and optionally joint angles and speeds (7,).
 
-        Velocities come from the joints of a known arm as long as the hand has stayed where it was on the last link; then,
-        and without joints, they are differences from the row before.
+        Velocities come from the joints of a known arm while the hand keeps its initial position on the last link.
+        Otherwise they are differences from the previous row.
         """
         placed = np.concatenate([position_m, self._continuous(quaternion)])
         moved = None if angles is None or speeds is None else self._by_joints(angles, speeds, position_m)
@@ -63,7 +63,7 @@ class Arm:
         return aligned
 
     def _continuous(self, quaternion: Floats) -> Floats:
-        """Return the quaternion (4,) as `rotations.continuous` has it in the whole series."""
+        """Return the quaternion (4,) with the sign that `rotations.continuous` gives it in the whole series."""
         with np.errstate(divide="ignore", invalid="ignore"):
             unit = quaternion[None] / np.linalg.norm(quaternion[None], axis=1, keepdims=True)
         if self._unit is not None and (unit * self._unit).sum(axis=1)[0] < 0:
@@ -96,19 +96,19 @@ class Arm:
 
 
 class Rolling:
-    """The last rows that a forecaster reads, and its prediction from them."""
+    """The latest rows that a forecaster reads, and its prediction from them."""
 
     def __init__(self, forecaster: Forecaster, *, continues: bool = False) -> None:
-        """Make one without rows.
+        """Start without rows.
 
-        Where it ``continues`` a session, the first rows depend on rows that it does not know, by velocities and
-        latents, and are not read.
+        If it ``continues`` a session, the first rows depend on earlier rows that are unknown, through velocities and
+        latents, and are not used.
         """
         codec, context = forecaster.codec, forecaster.context
         self._forecaster = forecaster
         self._latent = np.zeros((context, len(codec.latents)), np.float32)
         self._arm, self._finger = np.zeros((context, ARM), np.float32), np.zeros(context, np.float32)
-        # rows that the newest row's latents depend on
+        # number of rows that the newest row's latents depend on
         frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
         self._levels = np.zeros((frames, len(codec.channels)))
         self._begins: Bools = np.zeros(frames, bool)
@@ -130,14 +130,14 @@ class Rolling:
 
     @property
     def is_ready(self) -> bool:
-        """True if the newest rows are usable, as many as the model reads."""
+        """Whether enough consecutive usable rows are available."""
         return self._run >= self._forecaster.context
 
     def add(self, level: Floats, arm: Float32s, finger: float, *, follows: bool, encodes: bool, usable: bool) -> bool:
-        """Take a row: levels above rest (channel,), the arm (13,), the width between the fingers in m.
+        """Add a row: levels above rest (channel,), the arm (13,), and the gripper's opening in m.
 
-        ``follows``: it follows the row before without one missing between, for the window; ``encodes``, for the codec.
-        ``usable``: no stream had a gap. Returns whether all values of the row are finite.
+        ``follows``: whether the row follows the previous one without a gap for the window; ``encodes``: the same for
+        the codec. ``usable``: whether no stream had a gap. Returns whether all values of the row are finite.
         """
         self._levels[:-1], self._begins[:-1] = self._levels[1:], self._begins[1:]
         self._levels[-1], self._begins[-1] = level, not encodes
@@ -159,14 +159,14 @@ class Rolling:
         return finite
 
     def predict(self, plan: AnyFloats) -> Float32s:
-        """Return the levels above rest (horizon, channel) that are predicted with the arm's planned rows (horizon, 13)."""
+        """Return predicted levels above rest (horizon, channel) for the arm's planned rows (horizon, 13)."""
         features = self._forecaster.single.features(self._windows(plan))
         levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
         predicted: Float32s = levels[0].astype(np.float32)
         return predicted
 
     def band(self, plan: AnyFloats, ahead: Float32s) -> Float32s:
-        """Return all quantiles (horizon, channel, level) of what `predict` returned for the same ``plan``.
+        """Return all quantiles (horizon, channel, level) of the result of `predict` for the same ``plan``.
 
         The model must have quantiles.
         """
@@ -174,7 +174,7 @@ class Rolling:
         return quantiles
 
     def _windows(self, plan: AnyFloats) -> ForecastWindows:
-        """Return the rows that are read, and the arm's planned ones, as one window."""
+        """Return the current rows and the arm's planned ones as one window."""
         parts = (self._latent, np.concatenate([self._arm, plan.astype(np.float32)]), self._finger)
         return ForecastWindows(*(torch.from_numpy(part[:, None].copy()) for part in parts))
 
@@ -183,15 +183,15 @@ class PosePlan(NamedTuple):
     """Planned poses of the hand: times, and positions in m with quaternions x, y, z, w."""
 
     t_ns: Times  # (point,), ascending
-    poses: Floats  # (point, 7); a quaternion that is not finite: the hand does not turn
+    poses: Floats  # (point, 7); the hand does not turn if a quaternion is not finite
 
 
 def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
-    """Return the arm's rows (step, 13) at the times ``ahead_ns`` (step,), which follow ``t_ns``.
+    """Return the arm's rows (step, 13) at the times ``ahead_ns`` (step,) after ``t_ns``, following a plan.
 
-    ``now`` (13,) is the arm at ``t_ns``. A plan that begins later is reached from there in a straight line; after its end
-    the hand stays. Velocities are differences of the planned rows, as those of a recording are, and the sign of the
-    quaternions continues that of ``now``.
+    ``now`` (13,) is the arm at ``t_ns``. A plan that begins later is approached in a straight line; after its end the
+    hand stays. Velocities are differences of the planned rows, as in a recording, and the signs of the quaternions
+    continue that of ``now``.
     """
     points_ns, poses = plan
     if not np.isfinite(poses[:, 3:]).all():
@@ -213,7 +213,7 @@ def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s
 
 
 def without(t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
-    """Return the arm's rows (step, 13) at ``ahead_ns`` (step,) of a hand that moves and turns on as at ``t_ns``.
+    """Return the arm's rows (step, 13) at ``ahead_ns`` (step,) for a hand that keeps moving and turning as at ``t_ns``.
 
     ``now`` (13,) is the arm at ``t_ns``.
     """

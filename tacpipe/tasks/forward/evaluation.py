@@ -1,4 +1,4 @@
-"""Evaluate a forecaster and its quantiles next to the baselines: metrics, tables and predictions."""
+"""Evaluate a forecaster and its quantiles against baselines: metrics, tables and predictions."""
 
 from __future__ import annotations
 
@@ -42,25 +42,23 @@ from tacpipe.tasks.forward.training import HISTORY, check_codec
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-UNCONDITIONAL = (
-    "model_unconditional"  # the model's forecast with constant quantiles of its error on calibration recordings
-)
+UNCONDITIONAL = "model_unconditional"  # the model's forecast with constant error quantiles from calibration recordings
 COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
-SHOWN = 2  # recordings whose forecast is drawn with its band
-MAX_ROWS = 600  # rows of each
-STEP = 10  # ahead, that is drawn; the last one where the model predicts fewer
+SHOWN = 2  # number of recordings whose forecast is drawn with its band
+MAX_ROWS = 600  # maximum number of drawn rows per recording
+STEP = 10  # step that is drawn, or the last one if the model predicts fewer
 
 
 @dataclass
 class QuantileSums:
-    """Sums of each predictor's quantiles by recording, and forecasts to draw, or empty if a model has no quantiles."""
+    """Sums of each predictor's quantiles by recording, and forecasts to draw; empty if the model has no quantiles."""
 
     forecaster: Forecaster
-    sums: dict[str, dict[str, Sums]] = field(default_factory=dict)  # recording -> predictor -> sums
+    sums: dict[str, dict[str, Sums]] = field(default_factory=dict)  # sums by predictor, by recording
     examples: list[dict[str, str | int | list[float]]] = field(default_factory=list)  # see `_Drawn.example`
 
     def add(self, track: Track, trial: Trial) -> None:
-        """Count the windows of a recording."""
+        """Add the windows of a recording."""
         forecaster = self.forecaster
         uncertainty = forecaster.quantiles
         if uncertainty is None:
@@ -83,7 +81,7 @@ class QuantileSums:
                 self.examples.append(drawn.example(uncertainty.percents))
 
     def summary(self, trials: Sequence[Trial]) -> QuantileMetrics | None:
-        """Return the measures of the quantiles of each predictor, or None if the model has none."""
+        """Return the quantile measures of each predictor, or None if the model has no quantiles."""
         uncertainty = self.forecaster.quantiles
         if uncertainty is None:
             return None
@@ -102,7 +100,7 @@ class QuantileSums:
     def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
         sums_by_unit: dict[
             str, dict[str, Sums]
-        ] = {}  # unit of the interval (recording, or unseen object) to sums by predictor
+        ] = {}  # sums by predictor, by unit of the interval (recording, or unseen object)
         for trial in trials:
             sums, unit = self.sums[trial.name], trial.name if trial.known else str(trial.object)
             sums_by_unit[unit] = (
@@ -142,7 +140,7 @@ _COLUMNS = pa.schema(
 
 
 def band(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: slice) -> Float32s:
-    """Return the model's quantiles (window, step, channel, level) of some of a forecast's windows.
+    """Return the model's quantiles (window, step, channel, level) for some windows of a forecast.
 
     The model must have quantiles.
     """
@@ -165,7 +163,7 @@ def _parts(windows: int) -> Iterator[slice]:
 
 
 class _Drawn:
-    """A forecast of the channel of a recording that moves most, with its band."""
+    """The forecast of a recording's most active channel, with its band."""
 
     def __init__(self, forecaster: Forecaster, track: Track) -> None:
         self._step = min(STEP, forecaster.horizon)
@@ -176,12 +174,12 @@ class _Drawn:
         self._t_ns, self._rows = track.t_ns, list[tuple[Any, ...]]()
 
     def add(self, now: Int64s, truth: AnyFloats, predicted: AnyFloats) -> None:
-        """Keep the values of some windows."""
+        """Add the values of some windows."""
         at = (slice(None), self._step - 1, self._channel)
         self._rows += zip(self._t_ns[now + self._step] / 1e9, truth[at], *predicted[at].T, strict=True)
 
     def example(self, percents: Sequence[int]) -> dict[str, str | int | list[float]]:
-        """Return the curves: time in s, what was measured, and each quantile."""
+        """Return the curves: time in s, measured values, and each quantile."""
         columns = np.array(self._rows[:MAX_ROWS]).T
         names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
         return {
@@ -190,17 +188,17 @@ class _Drawn:
         }
 
 
-KEPT_BYTES = 1 << 24  # size of predictions in memory; larger ones go to disk
-STORED_STEPS = (1, 3, 5, 10)  # steps whose predictions are stored; 3, 5 and 10 are those of the paper's figures
+KEPT_BYTES = 1 << 24  # size of predictions kept in memory; larger ones are written to disk
+STORED_STEPS = (1, 3, 5, 10)  # steps whose predictions are stored; the paper's figures show 3, 5 and 10
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return metrics, tables and predictions of a model, its files given, on ``recordings``, next to its baselines.
+    """Return metrics, tables and predictions of a model, given as files, and of its baselines on ``recordings``.
 
-    Every window without a gap counts, in contact or not. Errors in counts are against the tactile channels themselves,
-    whatever the codec lost. Recordings that the model was trained or stopped on are recognised by their digests and reported
-    apart, and so are objects that it was trained on and others. Raises `TacpipeError` if the recordings are not what
-    the model reads.
+    Every window without a gap counts, in contact or not. Errors in counts are relative to the tactile channels,
+    including what the codec lost. Recordings used for training or early stopping are recognized by their digests and
+    reported separately, as are objects that were trained on and others. Raises `TacpipeError` if the model cannot read
+    the recordings.
     """
     forecaster = Forecaster.load(model)
     check_codec(model, recordings.files)
@@ -257,10 +255,11 @@ def _predictions(
     by_situation: BySituation,
     spill: Spill,
 ) -> pa.Table | pa.RecordBatchReader:
-    """Return the predictions for all windows of a recording, put aside in ``spill``; its errors are added to ``trial``.
+    """Return the predictions for all windows of a recording, spilled to ``spill``; adds its errors to ``trial``.
 
-    Where the model has not seen it, what alarms look at is added to ``alarms``, which the recording was begun in, and its
-    errors by situation to ``by_situation``. Some windows are in memory at a time, and of each one of the predictors.
+    If the model has not seen the recording, adds what alarms need to ``alarms``, in which the recording was started,
+    and its errors by situation to ``by_situation``. Only some windows, and of each one predictor, are in memory at a
+    time.
     """
     loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
@@ -288,9 +287,9 @@ def _predictions(
 def _prediction_table(
     forecaster: Forecaster, track: Track, now: Int64s, steps: Sequence[int], stored: Float32s
 ) -> pa.Table:
-    """Return one row a window: the time at which its prediction is available, the features then and those predicted.
+    """Return one row per window: the time when its prediction is available, present features, predicted features.
 
-    ``now`` (window,) are the last rows that are read; ``stored`` (step, feature, window) becomes the columns without a copy.
+    ``now`` (window,) are the last input rows; ``stored`` (step, feature, window) becomes the columns without a copy.
     """
     columns = [track.t_ns[now], track.contact[now].astype(np.int32)]
     latent = track.latent[now]
@@ -308,7 +307,7 @@ def _prediction_table(
 
 
 def check_rate(track: Track, forecaster: Forecaster) -> None:
-    """Refuse a track whose grid is not the one the model was trained on."""
+    """Raise an error if a track's grid is not the one that the model was trained on."""
     trained, rate_hz = forecaster.config["timeline"], float(forecaster.config["rate_hz"])
     option = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
     if track.timeline != trained:

@@ -1,4 +1,4 @@
-"""A trained model that reads arrays: its params, codec, scalings and baselines. `prediction` reads recordings."""
+"""A trained model that predicts from arrays: its params, codec, scalings and baselines. `prediction` reads recordings."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
 
 TASK = "forward"
-FAR = 0.95  # quantile over channels of the levels of a training row, of which the largest is kept
-FARTHEST = 2.0  # times that, beyond which the median level of a window is no level above rest
+FAR = 0.95  # quantile over channels of the levels in a training row, whose maximum over rows is stored
+FARTHEST = 2.0  # a window whose median level exceeds this multiple of the stored maximum is not relative to rest
 NEEDED: dict[str, model_files.Kind] = {
     **dict.fromkeys(("context", "horizon", "params.context", "params.horizon"), int),
     **dict.fromkeys(("architecture", "codec.kind", "codec.of", "params.actions"), str),
@@ -51,20 +51,20 @@ NEEDED: dict[str, model_files.Kind] = {
     "largest_level": float,
 }
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
-SHRINKAGE = "shrinkage"  # tensor of the weights file, (horizon,): see `Shrunk`; models of levels lack it
+SHRINKAGE = "shrinkage"  # tensor (horizon,) in the weights file, see `Shrunk`; models of levels lack it
 
 
 class WindowArrays(NamedTuple):
     """Windows of a recording, as `Forecaster.predict_windows` reads them."""
 
-    window: AnyFloats  # (window, context, column): `window_columns`, `derived_columns`, width of the gripper in m
+    window: AnyFloats  # (window, context, column): `window_columns`, `derived_columns`, gripper opening in m
     plan: AnyFloats  # (window, horizon, column): `plan_columns`, `derived_columns`
-    t_ns: Times  # (window,), time of the newest row that is read
+    t_ns: Times  # (window,), time of the newest input row
 
 
 @dataclass(frozen=True)
 class Forecaster:
-    """Predicts future tactile signals of windows of past ones, past motion and planned motion."""
+    """Predicts future tactile signals from windows of past signals, past motion and planned motion."""
 
     model: nn.Module
     params: Params
@@ -72,17 +72,17 @@ class Forecaster:
     codec: codecs.Codec
     baselines: FittedBaselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
-    chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
-    quantiles: ForecastQuantiles | None = None  # present if `tacpipe calibrate` made the model
+    chain: OpenedChain | None = None  # stages of its chain; None if unknown
+    quantiles: ForecastQuantiles | None = None  # present in models from `tacpipe calibrate`
 
     @property
     def context(self) -> int:
-        """How many rows of the past the model reads."""
+        """The number of past rows that the model reads."""
         return self.params.context
 
     @property
     def horizon(self) -> int:
-        """How many steps ahead it predicts."""
+        """The number of steps that it predicts."""
         return self.params.horizon
 
     @property
@@ -92,19 +92,19 @@ class Forecaster:
 
     @property
     def orientation(self) -> AnyFloats:
-        """The quaternion (4,) whose sign recordings are given."""
+        """The quaternion (4,) that defines the sign in recordings."""
         return np.array(self.config["inputs"]["orientation_reference"])
 
     @property
     def pose(self) -> Pose:
-        """The columns of the arm that it was trained on, or None if it was trained without one."""
+        """The arm columns that it was trained on, or None if it was trained without an arm."""
         stored_pose = self.config["inputs"].get("pose")
         return NAMED if stored_pose is None else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
 
     def track(self, recording: Recording) -> Track:
-        """Return a recording as the model reads it; see `tacpipe.tasks.forward.tracks.track`.
+        """Return a recording in the form that the model reads; see `tacpipe.tasks.forward.tracks.track`.
 
-        Models of before version 5 of `train forward` were trained on plans with the velocities of joints.
+        Models from before version 5 of `train forward` were trained on plans with joint velocities.
         """
         track = tracks.track(recording, self.codec, self.pose)
         stored = self.config["inputs"].get("plan_velocity") == tracks.BY_POSES
@@ -114,9 +114,9 @@ class Forecaster:
     def window_columns(self) -> tuple[str, ...]:
         """The first columns of a window for `predict`, each a column of the recordings: tactile channels, then the pose.
 
-        Of a tactile channel a window holds what the recording has less the channel's level at rest, which stands in its
-        field metadata ``rest``; the pose is as recorded, in m. A model that was trained without an arm has no pose, one that
-        was trained on positions alone no quaternion.
+        A window contains tactile channels relative to their level at rest, which is in the field metadata ``rest``, and
+        the pose as recorded, in m. A model trained without an arm has no pose; one trained only on positions has no
+        quaternion.
         """
         return (*self.codec.channels, *self.pose.columns)
 
@@ -127,38 +127,38 @@ class Forecaster:
 
     @property
     def derived_columns(self) -> tuple[str, ...]:
-        """The columns that `windows` adds behind those of window and plan, and that recordings need not hold.
+        """The columns that `windows` appends to those of window and plan, and that recordings need not contain.
 
-        Velocity and angular velocity, from the joints of a known arm, else as differences of the pose. A window then ends
-        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, or 0 if they have none. A model
-        without an arm has no velocities.
+        Velocity and angular velocity are computed from the joints of a known arm, or else as differences of the pose. A
+        window ends with the gripper's opening, ``robot_finger_m`` of the recordings, or 0 without one. A model without
+        an arm has no velocities.
         """
         return (*tracks.VELOCITY, *tracks.TURNING) if self.pose.position else ()
 
     @cached_property
     def single(self) -> Network:
-        """The network for one window at a time, as live sessions and `tacpipe predict --causal` run it."""
+        """The network for a single window, as used by live sessions and `tacpipe predict --causal`."""
         from tacpipe.tasks.forward.networks import Network
 
         return Network(self)
 
     def prepare_single(self) -> None:
-        """Have `single` ready, which takes a second: before a session begins, not at its first forecast."""
+        """Build `single`, which takes a second, before a session begins and not at its first forecast."""
         _ = self.single
 
     @property
     def predicts_change(self) -> bool:
-        """True if it predicts the change since the last row, rather than levels."""
+        """Whether it predicts the change since the last row rather than levels."""
         return bool(self.model.change_only)
 
     @property
     def lossy(self) -> bool:
-        """True if its features are levels from a codec, which changes the last row too."""
+        """Whether its features are levels from a codec, which also changes the last row."""
         return self.codec.kind != "raw" and self.codec.representation != INCREMENTS
 
     @property
     def feature_half(self) -> AnyFloats:
-        """Half of each feature's training range (feature,): what the paper's error is measured in."""
+        """Half of each feature's training range (feature,), the unit of the paper's error."""
         return np.array(self.config["scaling"]["feature_half"])
 
     @property
@@ -168,15 +168,15 @@ class Forecaster:
 
     @property
     def largest_level(self) -> float:
-        """The largest 95th percentile over channels of counts from rest, over training rows."""
+        """The maximum over training rows of the 95th percentile over channels of levels above rest, in counts."""
         return float(self.config["largest_level"])
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the forecaster among a model's files. Raises `TacpipeError` if they are of another task.
+        """Return the forecaster in a model's files. Raises `TacpipeError` if they belong to another task.
 
-        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
-        that recordings went through the same.
+        ``chain`` are the stages of the model's chain, from its manifest; without them `predict` cannot check that
+        recordings went through the same.
         """
         task = model_files.tree(files, CONFIG, {"task": str})["task"]
         if task != TASK:
@@ -203,7 +203,7 @@ class Forecaster:
         return forecaster
 
     def _try(self) -> None:
-        """Predict a window of zeros, and raise where a part does not fit another."""
+        """Predict a window of zeros, to raise an error if parts do not match."""
         fits = {
             "the context": self.context == self.config["context"] > 0,
             "the horizon": self.horizon == self.config["horizon"] > 0,
@@ -225,7 +225,7 @@ class Forecaster:
                 raise ValueError("the baselines predict another number of steps or channels")
 
     def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
-        """Return predicted counts above rest of arrays; `prediction.ForwardModel.predict` describes both."""
+        """Return predicted counts above rest from arrays; see `prediction.ForwardModel.predict`."""
         window = np.asarray(window)
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
@@ -234,11 +234,11 @@ class Forecaster:
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
-        """Return `tacpipe.tasks.task.quantiles_of` of the model."""
+        """Return the result of `tacpipe.tasks.task.quantiles_of` for the model."""
         return quantiles_of(self.quantiles, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
-        """Return quantiles of counts above rest of arrays; `prediction.ForwardModel.predict` describes all three."""
+        """Return quantiles of counts above rest from arrays; see `prediction.ForwardModel.predict`."""
         _, at = self.quantiles_of(percents)
         window = np.asarray(window)
         single = window.ndim == 2
@@ -250,7 +250,7 @@ class Forecaster:
         return quantiles[0] if single else quantiles
 
     def error_features(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
-        """Return features of how uncertain a forecast is: `window_features` of windows.
+        """Return the `window_features` of windows, from which the uncertainty of a forecast is computed.
 
         Forecasts ``ahead`` (window, step, channel) and levels ``past`` (window, context, channel) are above rest.
         """
@@ -259,13 +259,13 @@ class Forecaster:
     def band(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return all quantiles (window, step, channel, level) of the forecast ``ahead``.
 
-        `error_features` describes what is given. The model must have quantiles.
+        Arguments are those of `error_features`. The model must have quantiles.
         """
         assert self.quantiles is not None
         return self.quantiles.quantiles(self.error_features(windows, past, ahead), ahead)
 
     def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
-        """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
+        """Return the future tactile signals (window, horizon, channel) for the result of `_parts`."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = ForecastWindows(
@@ -274,7 +274,10 @@ class Forecaster:
         return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
-        """Refuse windows (window, context, channel) whose levels are not near rest; see `ForwardModel.predict`."""
+        """Raise an error for windows (window, context, channel) whose levels are far from rest.
+
+        See `ForwardModel.predict`.
+        """
         largest = self.largest_level
         medians = np.median(np.abs(touch), axis=(1, 2))  # (window,)
         wrong = np.flatnonzero(medians > FARTHEST * largest)
@@ -288,16 +291,16 @@ class Forecaster:
 
     @torch.no_grad()
     def features(self, windows: ForecastWindows) -> AnyFloats:
-        """Return the features to come (window, horizon, feature), in the codec's unit."""
+        """Return the predicted features (window, horizon, feature) in the codec's unit."""
         predicted: Tensor = self.model(acted(windows, self.actions))
         features: AnyFloats = predicted.transpose(0, 1).numpy()
         return features
 
     def decoded(self, features: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
-        """Return counts above rest (window, horizon, channel) of predicted features (window, horizon, feature).
+        """Return counts above rest (window, horizon, channel) for predicted features (window, horizon, feature).
 
-        ``last`` (window, channel) and ``last_feature`` (window, feature) are those of the last row read. A model that
-        predicts change adds the decoded change to the last row, so that it has no error from what the codec lost of it.
+        ``last`` (window, channel) and ``last_feature`` (window, feature) belong to the last input row. A model that
+        predicts change adds the decoded change to that row, so that it has no error from what the codec lost of it.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
         if self.predicts_change and self.lossy:
@@ -305,7 +308,7 @@ class Forecaster:
         return levels.astype(np.float64, copy=False)
 
     def anchored(self, levels: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
-        """Return decoded levels (window, horizon, channel) moved by what the codec lost of the last row."""
+        """Return decoded levels (window, horizon, channel) shifted by the codec's error in the last row."""
         moved: AnyFloats = levels + (last - self.codec.decode(last_feature))[:, None]
         return moved
 
@@ -343,7 +346,7 @@ class Forecaster:
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
     def _arm(self, rows: AnyFloats, has_velocities: bool) -> AnyFloats:
-        """Return the arm's rows (row, 13) with velocities, and quaternions of the sign that the model was trained on."""
+        """Return the arm's rows (row, 13) with velocities, and quaternions with the sign used in training."""
         rows = np.hstack([rows[:, :3], continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
         if not has_velocities:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
@@ -352,7 +355,7 @@ class Forecaster:
 
 
 def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
-    """Return the rows of an arm with the 7 columns of a pose, where the first ``columns`` are those that are there."""
+    """Return arm rows padded to the 7 columns of a pose; ``columns`` is the number of existing ones."""
     if columns == POSE:
         return rows
     pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
@@ -361,17 +364,17 @@ def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
 
 
 def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:
-    """Return where each raw channel lies; nothing of latents."""
+    """Return the position of each raw channel; an empty sequence for latents."""
     return codec.layout if codec.kind == "raw" else ()
 
 
 def largest_level(touch: AnyFloats) -> float:
-    """Return the largest 95th percentile over channels of absolute levels ``touch`` (time, channel); 0 without rows."""
+    """Return the maximum over rows of the 95th percentile over channels of |``touch``| (time, channel); 0 without rows."""
     return float(np.quantile(np.abs(touch), FAR, axis=1).max(initial=0.0)) if touch.size else 0.0
 
 
 def _begins(touch: AnyFloats) -> Bools:
-    """Return where each window begins in the windows' rows one after the other, (window · context,)."""
+    """Return which rows of concatenated windows, (window · context,), start a window."""
     begins = np.zeros(touch.shape[:2], dtype=bool)
     begins[:, 0] = True
     return begins.ravel()
