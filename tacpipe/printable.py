@@ -29,24 +29,24 @@ def excerpt(value: Any) -> str:
         return "a number of thousands of digits"
 
 
-def plain(text: str, most: int = 60) -> str:
+def plain(text: str, max_characters: int = 60) -> str:
     r"""Return text as it is where it is short and printable, else its `excerpt`.
 
     >>> plain("xela1"), plain("a\x1b[2J")
     ('xela1', "'a\\x1b[2J'")
     """
-    return text if len(text) <= most and text.isprintable() else excerpt(text)
+    return text if len(text) <= max_characters and text.isprintable() else excerpt(text)
 
 
-def listed(names: Iterable[object], most: int = 8) -> str:
+def listed(names: Iterable[object], max_names: int = 8) -> str:
     """Return names with commas between, the first of many.
 
-    >>> listed(["a", "b", "c"], most=2), listed([])
+    >>> listed(["a", "b", "c"], max_names=2), listed([])
     ('a, b and 1 more', 'none')
     """
     texts = [plain(str(name)) for name in names]
-    suffix = f" and {len(texts) - most} more" if len(texts) > most else ""
-    return (", ".join(texts[:most]) or "none") + suffix
+    suffix = f" and {len(texts) - max_names} more" if len(texts) > max_names else ""
+    return (", ".join(texts[:max_names]) or "none") + suffix
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:

@@ -49,7 +49,7 @@ class ModelOrigin(TypedDict):
 class TrainingCounts(TypedDict):
     """The recordings that a model was trained on."""
 
-    recordings: int | None  # of training and validation
+    recordings: int | None  # number for training and validation
     roles: Values  # numbers by role, or by role and sensor
 
 

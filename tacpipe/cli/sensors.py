@@ -200,7 +200,7 @@ class FindingJson(TypedDict):
 
 
 class PortJson(TypedDict):
-    """What was read at an address, as ``--json`` prints it."""
+    """The bytes read at an address, as ``--json`` prints it."""
 
     address: str
     baud: int | None

@@ -71,7 +71,7 @@ class ShownRecordings(DatasetOverview):
     """Recordings, their figures and labels."""
 
     kind: Literal["recordings"]
-    recordings: dict[str, dict[str, StreamFigures]]  # by recording and stream
+    recordings: dict[str, dict[str, StreamFigures]]  # figures by recording and stream
     attributes: Mapping[str, Mapping[str, Attribute]]
     excluded: dict[str, str]  # reasons
 

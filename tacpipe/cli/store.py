@@ -90,7 +90,9 @@ def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
     from tacpipe.maintenance import cache, transfer
     from tacpipe.maintenance import checkout as checkouts
 
-    listed = checkouts.known(cache.behind(locate()) if store is None else transfer.remote_store(store))
+    listed = checkouts.list_manifests(
+        cache.bucket_or_folder(locate()) if store is None else transfer.remote_store(store)
+    )
     value = {"schema_version": 1, "manifests": [asdict(entry) for entry in listed]}
     _print(value, as_json=as_json, text=checkouts.to_text(listed))
 

@@ -53,9 +53,9 @@ class LineageNode(TypedDict):
     labels: dict[str, dict[str, Attribute]]  # labels set by hand, by recording
     skipped: dict[str, str]  # reasons by recording
     sources: dict[str, dict[str, str]]  # digests of raw files by recording
-    inputs: dict[str, list[LineageNode | LostNode]]  # by name of the argument
+    inputs: dict[str, list[LineageNode | LostNode]]  # inputs by argument
     provenance: NotRequired[Provenance | None]  # only for the traced dataset
-    changes: NotRequired[list[str] | None]  # since its previous run; None if there was none
+    changes: NotRequired[list[str] | None]  # differences from its previous run, or None if there was none
 
 
 def trace(path: Path) -> LineageNode:

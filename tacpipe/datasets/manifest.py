@@ -66,7 +66,7 @@ class Manifest:
     stage: str
     version: int
     params: StoredParams = field(default_factory=dict)
-    inputs: Mapping[str, Sequence[InputDataset]] = field(default_factory=dict)  # by name of the argument
+    inputs: Mapping[str, Sequence[InputDataset]] = field(default_factory=dict)  # inputs by argument
     chain: Sequence[Step] = ()
     recordings: Mapping[str, RecordingEntry] = field(default_factory=dict)
     files: Mapping[str, Content] = field(default_factory=dict)

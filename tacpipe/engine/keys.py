@@ -61,7 +61,7 @@ class DatasetLineage(TypedDict):
 
 
 class DatasetIdentity(TypedDict):
-    """What a key holds of a dataset."""
+    """The part of a dataset that a key holds."""
 
     lineage: DatasetLineage
     recordings: Mapping[str, RecordingEntry]
@@ -69,7 +69,7 @@ class DatasetIdentity(TypedDict):
 
 
 class RolesIdentity(TypedDict):
-    """What a key holds of the roles in one fold of a split."""
+    """The roles in one fold of a split, as a key holds them."""
 
     roles: str  # digest of the table of the split
     fold: int

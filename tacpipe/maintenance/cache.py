@@ -24,7 +24,7 @@ from tacpipe.store.roots import Root
 from tacpipe.store.store import Store
 
 
-def behind(store: Store) -> AnyStore:
+def bucket_or_folder(store: Store) -> AnyStore:
     """Return the bucket of a cached store, or the store itself if it is a folder."""
     return store.bucket if isinstance(store, CachedStore) else store
 

@@ -46,14 +46,14 @@ class Known:
     project: str = ""  # name of the project that pushed it, or digits of its id, as used in PROJECT:PATH
 
 
-def known(store: AnyStore) -> list[Known]:
+def list_manifests(store: AnyStore) -> list[Known]:
     """Return the present and past manifests of the store's roots, newest first."""
     by_label: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
     for root in roots:
         root_label = pushed.label(root, roots)
-        written: list[WrittenManifest] = [root, *root.get("history", [])]
-        for entry in written:
+        versions: list[WrittenManifest] = [root, *root.get("history", [])]
+        for entry in versions:
             name, path = entry["manifest"], str(root["path"])
             try:
                 manifest = manifest_of.stored(store, name)
@@ -123,7 +123,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     """
     store = locate()
     if source is None and store.distant:
-        source = cache.behind(store)
+        source = cache.bucket_or_folder(store)
     manifest_digest = _manifest_digest(source or store, name)
     with store.at_work([manifest_digest]):
         content = (source or store).read(manifest_digest, regular.JSON_BYTES)
@@ -174,7 +174,9 @@ def _manifest_digest(store: AnyStore, name: str) -> str:
                 f"{store.place} has seen a dataset; `tacpipe store list` names both. {error}"
             ) from None
     matching = {
-        entry.manifest for entry in known(store) if entry.manifest.startswith(name) or entry.dataset.startswith(name)
+        entry.manifest
+        for entry in list_manifests(store)
+        if entry.manifest.startswith(name) or entry.dataset.startswith(name)
     }
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.place} begin with {name}; give more of its hex digits.")

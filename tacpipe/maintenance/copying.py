@@ -80,10 +80,10 @@ def _expect_formed(manifest: Manifest, name: str) -> None:
 def copy(
     source: AnyStore,
     target: AnyStore,
-    found: manifest_of.Found,
-    done: Transferred,
+    dataset: manifest_of.Found,
+    transferred: Transferred,
     *,
-    beside: tuple[str, ...],
+    dataset_dirs: tuple[str, ...],
     ancestors: bool,
     verify: bool,
     before: str = "",
@@ -92,7 +92,7 @@ def copy(
 
     ``before`` is a manifest in the target with much in common, such as the last one of that name.
     """
-    plan = _planned(source, target, found, ancestors=ancestors)
+    plan = _planned(source, target, dataset, ancestors=ancestors)
     sizes = plan.sizes()
     target.announce(sizes)  # announced before the sizes are read, so that no collection removes an object in between
     present_sizes = target.sizes(sizes)
@@ -101,7 +101,7 @@ def copy(
     absent += _damaged(
         target, [name for name in plan.objects if present_sizes.get(name) == sizes[name]], sizes, verify=verify
     )
-    _send(source, target, plan, absent, beside)
+    _send(source, target, plan, absent, dataset_dirs)
     target.settle(layout.object_name(name) for name in absent)
     fresh = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
     fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
@@ -109,11 +109,11 @@ def copy(
         target.take(name, [plan.manifests[name]])
     target.settle(layout.object_name(name) for name in fresh)
     moved = {*absent, *fresh}
-    done.objects += len(moved)
-    done.bytes += sum(sizes[name] for name in moved)
-    done.there += len(sizes) - len(moved)
-    done.replaced += sum(name in present_sizes for name in moved)
-    _copy_records(source, target, found, sizes, before)
+    transferred.objects += len(moved)
+    transferred.bytes += sum(sizes[name] for name in moved)
+    transferred.there += len(sizes) - len(moved)
+    transferred.replaced += sum(name in present_sizes for name in moved)
+    _copy_records(source, target, dataset, sizes, before)
 
 
 def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:

@@ -145,7 +145,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         unneeded.append(key)
     retained |= needed.objects
     objects = [name for name in layout.names(store.root, "objects") if name not in retained]
-    named_by = {} if recordings else unnamed.kept(store, objects, needed.manifests)
+    named_by = {} if recordings else unnamed.irreplaceable(store, objects, needed.manifests)
     retained = retained.union(named_by, *named_by.values())
     collected.records = sum(_remove_record(store.record_path(key), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(retained - needed.objects - needed.replaced - needed.pages - set(named_by))

@@ -31,7 +31,7 @@ def roots(store: AnyStore) -> list[Root]:
     return sorted(pushed_roots, key=lambda root: (str(root["path"]), project_id(root)))
 
 
-def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
+def labels(all_roots: Iterable[Root]) -> dict[tuple[str, str], str]:
     """Return how each of the pushed roots of a store is named, by its project's id and its path.
 
     >>> one, two = ({"id": digit * 32, "name": "exp"} for digit in "ab")
@@ -40,21 +40,21 @@ def labels(every: Iterable[Root]) -> dict[tuple[str, str], str]:
     >>> list(labels([{"path": "rec", "project": one}, {"path": "rec", "project": two}]).values())
     ['aaaaaaaa:rec', 'bbbbbbbb:rec']
     """
-    every = list(every)
-    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in every}
+    all_roots = list(all_roots)
+    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in all_roots}
     shared = Counter(ids.values())
     names = {
         identifier: identifier[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name
         for identifier, name in ids.items()
     }
-    return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in every}
+    return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in all_roots}
 
 
-def label(root: Root, every: Iterable[Root]) -> str:
-    """Return how a root of a store is named among all ``every`` of them: by its path, behind its project if pushed."""
+def label(root: Root, all_roots: Iterable[Root]) -> str:
+    """Return how a root of a store is named among ``all_roots``: by its path, behind its project if pushed."""
     if root["kind"] != PUSHED:
         return str(root["path"])
-    return labels([*(candidate for candidate in every if candidate["kind"] == PUSHED), root])[
+    return labels([*(candidate for candidate in all_roots if candidate["kind"] == PUSHED), root])[
         project_id(root), root["path"]
     ]
 
@@ -73,31 +73,31 @@ def _belongs_to(project: str, root: Root) -> bool:
     return by_id or ("project" in root and root["project"]["name"] == project)
 
 
-def project_in(store: AnyStore, wanted: str) -> Project:
+def project_in(store: AnyStore, requested: str) -> Project:
     """Return the project of a store that has this name, or an id that begins so. Raises `UsageError` if there is not one."""
     names_by_id = {project_id(root): root["project"]["name"] for root in roots(store)}
     matching = [
         identifier
         for identifier, name in names_by_id.items()
-        if wanted == name or (len(wanted) >= MIN_DIGITS and identifier.startswith(wanted))
+        if requested == name or (len(requested) >= MIN_DIGITS and identifier.startswith(requested))
     ]
     if len(matching) != 1:
         names = listed((f"{name} ({identifier[:_SHOWN_DIGITS]})" for identifier, name in names_by_id.items()), _SHOWN)
         subject = "several projects are" if matching else "no project is"
         raise UsageError(
-            f"{subject} called {wanted} in {store.place}; it has {names}. Give one's name, or digits of its id."
+            f"{subject} called {requested} in {store.place}; it has {names}. Give one's name, or digits of its id."
         )
     return Project(matching[0], names_by_id[matching[0]])
 
 
-def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
-    """Return the root that is ``wanted`` by the project ``own``: a ``PROJECT:PATH``, or a path, in the project ``name``.
+def find(store: AnyStore, requested: str, name: str, project: Project | None) -> Root:
+    """Return the root that ``project`` requested: a ``PROJECT:PATH``, or a path, which is ``name`` within the project.
 
-    A name alone is that of ``own``. Where ``own`` never pushed anything it may be that of the only project that has it,
+    A path alone is one of ``project``. If that never pushed anything, it may be one of the only project that has it,
     as on a second computer. Raises `UsageError` where none or several are meant, and names what is there.
     """
     all_roots = roots(store)
-    matching = _roots_of_project(wanted, all_roots) or _roots_of_name(name, all_roots, own)
+    matching = _roots_of_project(requested, all_roots) or _roots_of_name(name, all_roots, project)
     if len(matching) == 1:
         return matching[0]
     names = labels(all_roots)
@@ -105,16 +105,16 @@ def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
     other_labels = sorted(names[project_id(root), root["path"]] for root in same_name)
     if other_labels:
         raise UsageError(
-            f"{store.place} has no dataset {wanted} of this project, but of others: {listed(other_labels, _SHOWN)}. Give "
+            f"{store.place} has no dataset {requested} of this project, but of others: {listed(other_labels, _SHOWN)}. Give "
             f"one of these names."
         )
     labelled = [(root, names[project_id(root), root["path"]]) for root in all_roots]
     shown_names = [
-        root["path"] if _roots_of_name(root["path"], all_roots, own) == [root] else root_label
+        root["path"] if _roots_of_name(root["path"], all_roots, project) == [root] else root_label
         for root, root_label in labelled
     ]
     available = listed(sorted(shown_names), _SHOWN) if shown_names else "nothing that was pushed"
-    raise UsageError(f"{store.place} has no dataset {wanted}; it has {available}.")
+    raise UsageError(f"{store.place} has no dataset {requested}; it has {available}.")
 
 
 def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | None) -> list[Root]:
@@ -124,15 +124,15 @@ def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | N
     ]
 
 
-def refuse_newer(there: AnyStore, before: Root, seen: Collection[str | None], name: str) -> None:
-    """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen``."""
+def refuse_newer(store: AnyStore, before: Root, seen_manifests: Collection[str | None], name: str) -> None:
+    """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen_manifests``."""
     manifest = str(before["manifest"])
-    if manifest in seen:
+    if manifest in seen_manifests:
         return
     date = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
     raise UsageError(
-        f"{there.place} holds another {name} than this project had here: {manifest[:12]}, pushed on {date}. `tacpipe "
-        f"store checkout {manifest[:12]} --remote {there.place} -o DIRECTORY` writes it to a directory. --replace "
+        f"{store.place} holds another {name} than this project had here: {manifest[:12]}, pushed on {date}. `tacpipe "
+        f"store checkout {manifest[:12]} --remote {store.place} -o DIRECTORY` writes it to a directory. --replace "
         f"pushes anyway, "
         f"and keeps it as an earlier snapshot."
     )
@@ -149,16 +149,16 @@ def lasting(store: AnyStore, manifest: str) -> bool:
     return replacing.lasting(pushed_manifest)
 
 
-def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
-    """Keep no longer what ``wanted`` names: all snapshots of ``PROJECT:PATH``, or one by `MIN_DIGITS` or more of its digits.
+def forget(store: AnyStore, requested: str, *, dry_run: bool = False) -> bool:
+    """Keep no longer all snapshots of ``PROJECT:PATH``, or the one of which ``requested`` is `MIN_DIGITS` or more digits.
 
     Returns whether there was any. Raises `UsageError` if several are meant.
     """
     all_roots = roots(store)
-    matching = _roots_of_project(wanted, all_roots) or [root for root in all_roots if root["path"] == wanted]
+    matching = _roots_of_project(requested, all_roots) or [root for root in all_roots if root["path"] == requested]
     if len(matching) > 1:
         names = listed((label(root, all_roots) for root in matching), _SHOWN)
-        raise UsageError(f"{store.place} keeps several datasets {wanted}: {names}. Give one of these names.")
+        raise UsageError(f"{store.place} keeps several datasets {requested}: {names}. Give one of these names.")
     if matching:
         if not dry_run:
             store.roots.remove(matching[0])
@@ -167,11 +167,11 @@ def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
         digest
         for root in all_roots
         for digest in manifests(root)
-        if len(wanted) >= MIN_DIGITS and digest.startswith(wanted)
+        if len(requested) >= MIN_DIGITS and digest.startswith(requested)
     }
     if len(snapshots) > 1:
         raise UsageError(
-            f"{len(snapshots)} snapshots in {store.place} begin with {wanted}; give more of its hex digits."
+            f"{len(snapshots)} snapshots in {store.place} begin with {requested}; give more of its hex digits."
         )
     for root in all_roots if snapshots and not dry_run else ():
         _remove_manifest(store, root, *snapshots)

@@ -34,7 +34,7 @@ _MEASURED: tuple[_Measured, ...] = (
     "quarantine",
     "tmp",
     "checkpoints",
-)  # in the order of the status
+)  # folders that the status lists
 
 
 class FolderSize(TypedDict):

@@ -97,7 +97,7 @@ def push(
                     target,
                     dataset,
                     transferred,
-                    beside=(str(dataset.directory.absolute()),),
+                    dataset_dirs=(str(dataset.directory.absolute()),),
                     ancestors=ancestors,
                     verify=verify,
                     before="" if before is None else before["manifest"],
@@ -138,10 +138,10 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
 
 
 def bring(
-    there: AnyStore, here: Store, found: manifest_of.Found, done: Transferred, *, ancestors: bool = False
+    source: AnyStore, target: Store, dataset: manifest_of.Found, transferred: Transferred, *, ancestors: bool = False
 ) -> None:
     """Copy what a dataset of another store needs into this one, within a run of this store. Raises the errors of `push`."""
-    copying.copy(there, here, found, done, beside=(), ancestors=ancestors, verify=False)
+    copying.copy(source, target, dataset, transferred, dataset_dirs=(), ancestors=ancestors, verify=False)
 
 
 @contextlib.contextmanager

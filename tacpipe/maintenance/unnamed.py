@@ -35,13 +35,13 @@ class _Candidate:
     objects: set[str]
 
 
-def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dict[str, set[str]]:
+def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterable[Manifest]) -> dict[str, set[str]]:
     """Return the digests of manifests and pages among ``objects`` that must be kept, with all digests in them.
 
-    These contain recordings or labels that are neither in a ``known`` manifest nor in another kept one. A damaged
+    These contain recordings or labels that are neither in ``named_manifests`` nor in another kept one. A damaged
     object that may be a manifest or a page is kept with everything it names, because its content is unknown.
     """
-    covered = {possession for manifest in known for possession, _ in replacing.possessions(manifest)}
+    covered = {possession for manifest in named_manifests for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
     candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether the candidate is a page
     for name, content in _beginning(store, objects, (_BEGINS, pages.BEGINS)):

@@ -41,7 +41,7 @@ class RecordingEntry(TypedDict):
     """A recording in a dataset or a record."""
 
     attributes: Mapping[str, Attribute]
-    shards: Mapping[str, Shard]  # by name of the stream
+    shards: Mapping[str, Shard]  # shards by name of the stream
 
 
 class StoredResult(TypedDict):
@@ -62,20 +62,20 @@ class Step(TypedDict):
 
 @final
 class StageIdentity(TypedDict):
-    """What the key of a stage's result is the digest of."""
+    """The identity of a stage's result, whose digest is its key."""
 
     stage: str
     version: int
     params: StoredParams
-    inputs: Values  # by name of the argument; its kind in `tacpipe.plugins.stage` decides the form
+    inputs: Values  # values by argument, in a form that depends on its kind in `tacpipe.plugins.stage`
 
 
 @final
 class RunIdentity(TypedDict):
-    """What the key of a whole command is the digest of."""
+    """The identity of a whole command, whose digest is its key."""
 
     run: str  # name of the stage
-    version: Sequence[int | None]  # of the stage and of its fit
+    version: Sequence[int | None]  # versions of the stage and of its fit
     params: StoredParams
     datasets: Sequence[str]  # digests of manifests
     named: Mapping[str, str]  # digests of the manifests of models and splits, by name of the option
@@ -86,7 +86,7 @@ class RunIdentity(TypedDict):
 
 @final
 class GroupIdentity(TypedDict):
-    """What the key of the results of a group of recordings is the digest of."""
+    """The identity of the results of a group of recordings, whose digest is their key."""
 
     group: str  # name of the stage
     step: Step
@@ -106,7 +106,7 @@ class Processor(TypedDict, total=False):
 
 
 class Environment(TypedDict, total=False):
-    """Where and with what a result was computed. Older versions state less of it."""
+    """The computer and the software that computed a result. Older versions state less of it."""
 
     libraries: dict[str, str]  # versions by name
     git_commit: str | None
@@ -115,11 +115,11 @@ class Environment(TypedDict, total=False):
     device: str
     processor: Processor
     seconds: float
-    worker: str  # of the executor
+    worker: str  # name of the executor's worker
 
 
 class Provenance(Environment, total=False):
-    """How the result of a stage was computed."""
+    """The computer and the code that computed the result of a stage."""
 
     irreplaceable: bool  # no stage can compute it again
     code: str | None  # digest of the file of the stage
@@ -136,21 +136,21 @@ class Summary(TypedDict, total=False):
 
 
 class RunProvenance(Environment, Summary):
-    """How the results of a command or of a group of recordings were computed."""
+    """The computer and the code that computed the results of a command or of a group of recordings."""
 
 
 class ComputedResult(TypedDict):
     """The part of a record that a command uses after the result was computed."""
 
     result: StoredResult
-    provenance: Provenance  # in records of a `RunIdentity` or a `GroupIdentity` a `RunProvenance`: see `summary`
+    provenance: Provenance  # a `RunProvenance` for a `RunIdentity` or a `GroupIdentity`: see `summary`
 
 
 class Record(ComputedResult):
     """A result and how it was made, stored under the digest of its identity."""
 
     identity: Identity
-    digest: str  # of identity and result
+    digest: str  # digest of identity and result
     check: str  # digest of the provenance
 
 

@@ -55,13 +55,13 @@ class ZarrMetadata(TypedDict, total=False):
 
     zarr_format: int
     shape: list[int]
-    attributes: StoredAttributes  # since format 3
-    dtype: Any  # until format 2: a name, or a list of fields
+    attributes: StoredAttributes  # format 3
+    dtype: Any  # format 2: a name, or a list of fields
     chunks: list[int]
     compressor: Any
     filters: list[Any] | None
     dimension_separator: str
-    data_type: str  # since format 3
+    data_type: str  # format 3
     codecs: list[Any]
     chunk_grid: Any
     chunk_key_encoding: Any

@@ -127,7 +127,7 @@ class _ContainerShares:
 
     def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], Values]:
         files: dict[str, Path] = {}
-        values: dict[str, Values] = {}  # by name of a file
+        values: dict[str, Values] = {}  # values by name of a file
         by_place: dict[Path, list[str]] = {}
         for name, place in recording.files.items():
             by_place.setdefault(place, []).append(name)
