@@ -20,6 +20,7 @@ from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss, stream_label
 from tacpipe.exports.files import Files, Scratch, copy_to_sink
 from tacpipe.plugins.constraints import Rate
+from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 from tacpipe.printable import listed
 
@@ -39,6 +40,7 @@ DEMOS = "demos.hdf5"
 MASKS = {"train": "train", "val": "valid", "test": "test"}  # robomimic's name by role
 EXTRA = "tacpipe"  # group of a demonstration with data that policies must not read
 VERSION = ("v110", "v110")  # HDF5 of 2016, which stores many small columns in half the space of older versions
+IMAGES = "images"  # dataset of decoded frames
 CHUNK_ROWS = 1 << 16
 LEVEL = 4  # gzip level; higher levels take twice the time for 1 %
 _STREAMS = f"""
@@ -52,7 +54,8 @@ with h5py.File("EXPORT/RECORDING.h5") as file:
     values, unit = file["STREAM/COLUMN"][:], file["STREAM/COLUMN"].attrs["unit"]
 ```
 
-tacpipe reads them back with `tacpipe ingest hdf5`.
+The group of a camera has its packets as they were recorded; with `--images` the dataset `images` has the decoded frames
+(frame, row, column, rgb). tacpipe reads the packets back with `tacpipe ingest hdf5`.
 """
 _DEMOS = f"""
 One file of demonstrations, `{DEMOS}`, as robomimic reads them: `data/demo_0/obs/STREAM_QUANTITY` has the shape
@@ -68,6 +71,8 @@ class Params:
     """How the files are structured."""
 
     structure: Literal["streams", "robomimic"] = "streams"  # one file per recording, or one with demonstrations
+    # streams: decode the frames of cameras into arrays too (frame, row, column, rgb), next to their packets
+    images: bool = added(False)
     rate_hz: Rate | None = None  # robomimic: synchronize to this rate first
     master: str = ""  # robomimic: stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # robomimic: stream of the actions: its targets, else its state one frame later
@@ -75,6 +80,8 @@ class Params:
 
     def check(self) -> None:
         """Raise `UsageError` for an option that has no effect on streams."""
+        if self.structure == "robomimic" and self.images:
+            raise UsageError("images belongs to --structure streams; demonstrations have no frames of cameras.")
         if self.structure == "streams" and (self.rate_hz is not None or self.actions or self.master or self.common):
             raise UsageError(
                 "rate_hz, master, actions and common belong to --structure robomimic; streams are written as they are."
@@ -97,7 +104,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
         return Result({"": RecordingOutput(frames.describe(recording))})
     losses: list[Loss] = []
     columns: list[ColumnName] = []
-    content = _recording(recording, losses, columns)
+    content = _recording(params, recording, losses, columns)
     tables = contents.part(recording, losses, columns)
     return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copy_to_sink(content)})
 
@@ -137,7 +144,7 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
     return Result(files=Files({files.README_NAME: text}), notes=notes, written=writers)
 
 
-def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
+def _recording(params: Params, recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
     """Return a temporary file with a recording, because HDF5 does not write sequentially.
 
     Adds losses to ``losses`` and written columns to ``columns``.
@@ -153,8 +160,26 @@ def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnNam
             for field in table.schema:
                 losses += _column(group, field, table.column(field.name), stream)
             columns += [(stream, name) for name in group]
+            if params.images:
+                _images(group, table)
             sink.check()
     return sink.check()
+
+
+def _images(group: h5py.Group, columns: Columns) -> None:
+    """Write the decoded frames of a stream of frames, one chunk per frame; rows without a frame are black."""
+    from tacpipe.video.decoding import decode_frames, read_batches
+    from tacpipe.video.stream import read_format
+
+    video_format = read_format(columns)
+    if video_format is None or not columns.num_rows:
+        return
+    shape = (columns.num_rows, video_format.height_px, video_format.width_px, 3)
+    dataset = group.create_dataset(
+        IMAGES, shape, "u1", chunks=(1, *shape[1:]), compression="gzip", compression_opts=LEVEL, shuffle=True
+    )
+    for row, image in decode_frames(video_format, read_batches(columns)):
+        dataset[row] = image
 
 
 def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:

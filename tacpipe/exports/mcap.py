@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mcap.writer import Writer
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.exports.pictures import Pictures
     from tacpipe.exports.ros import Topic
     from tacpipe.io.columns import Columns
 
@@ -41,8 +42,10 @@ One MCAP file a recording (profile `ros2`, messages in CDR with their definition
 
 The topic `/STREAM` has messages of the type `tacpipe_msgs/msg/Stream`, a field a column; the metadata of its channel name
 stream, columns and units (`tacpipe`, JSON). Topics below it repeat some columns as usual messages: `/STREAM/pose`, and
-encoded images as `sensor_msgs/msg/CompressedImage` in `/STREAM/image`. Labels are in the metadata record `tacpipe`. tacpipe
-reads the files back with `tacpipe ingest mcap`.
+encoded images as `sensor_msgs/msg/CompressedImage` in `/STREAM/image`. A video that Foxglove plays (H.264, H.265, VP9 or
+AV1 without B-frames) is in `/STREAM/video` as `foxglove_msgs/msg/CompressedVideo`, with start codes in place of sizes. Any
+other video is decoded and encoded as JPEG in `/STREAM/image`, which loses some detail. `/STREAM` has all packets bit for
+bit. Labels are in the metadata record `tacpipe`. tacpipe reads the files back with `tacpipe ingest mcap`.
 """
 
 
@@ -54,7 +57,7 @@ class Params:
     usual_messages: bool = True
 
 
-@stage(version=2, reads=ALL)
+@stage(version=3, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
     losses: list[Loss] = []
@@ -64,7 +67,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(contents.part(recording, losses, columns))}, written={f"{name}.mcap": write})
 
 
-@stage(version=2, part=part)
+@stage(version=3, part=part)
 def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as MCAP files for Foxglove and ROS 2.
 
@@ -107,6 +110,8 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
     import numpy as np
 
     from tacpipe.exports import ros
+    from tacpipe.exports.pictures import Pictures
+    from tacpipe.video.stream import read_format
 
     starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
     for stream in recording.streams:
@@ -128,7 +133,9 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
         head = ros.stream_topic(stream, table.schema.empty_table())
         columns = [(stream, name) for name in (TIME, *(column["name"] for column in head.metadata["columns"]))]
         images = [name for name in table.column_names if _holds_images(table, name)] if params.usual_messages else []
-        topics = functools.partial(_topics, params, stream, images)
+        video_format = read_format(table) if params.usual_messages and not images and table.num_rows else None
+        frames = None if video_format is None else Pictures(table, video_format)
+        topics = functools.partial(_topics, params, stream, images, frames)
         yield _Stream(topics, stream, columns, ordered=not np.any(np.diff(t_ns) < 0))
 
 
@@ -151,11 +158,14 @@ def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[Topic]:
     return [ros.cloud_topic(stream, table, start_ns)]
 
 
-def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table) -> list[Topic]:
+def _topics(
+    params: Params, stream: str, images: Sequence[str], frames: Pictures | None, table: pa.Table
+) -> list[Topic]:
     """Return the topics for a block of rows of a stream."""
     from tacpipe.exports import ros
 
     usual = ros.usual_topics(stream, table, images) if params.usual_messages else []
+    usual += [frames.topic(stream, table)] if frames is not None else []
     return [ros.stream_topic(stream, table), *usual]
 
 

@@ -173,6 +173,9 @@ _DEFINITIONS = {
         "uint32 row_step\nuint8[] data\nbool is_dense\n"
     ),
     "sensor_msgs/CompressedImage": f"{_HEADER}string format\nuint8[] data\n",
+    "foxglove_msgs/CompressedVideo": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    ),
     "tactile_msgs/TactileState": f"{_HEADER}sensor_msgs/ChannelFloat32[] sensors\n",
 }
 
@@ -239,21 +242,25 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
     return Topic(name, _full_type(message), _definition(message, definitions), t_ns, parts, metadata)
 
 
+def derived_topic(stream: str, name: str, kind: str, t_ns: Int64s, parts: Sequence[Part]) -> Topic:
+    """Return a topic below that of a stream, whose messages begin with a stamp and the name of the frame."""
+    top = f"/{topic_part(stream_label(stream))}"
+    values = [*header_parts(t_ns, stream_label(stream)), *parts]
+    return Topic(
+        f"{top}/{name}", _full_type(kind), _definition(kind, _DEFINITIONS), t_ns, values, {"derived_from": top}
+    )
+
+
 def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> list[Topic]:
     """Return the topics of standard messages formed by the columns of a stream.
 
     ``images`` are the columns of encoded images. Rows without an image have no message.
     """
-    topics = []
-    top = f"/{topic_part(stream_label(stream))}"
+    topics: list[Topic] = []
     t_ns = table.column(TIME).to_numpy()
 
     def add(name: str, kind: str, stamps_ns: Int64s, parts: Sequence[Part]) -> None:
-        values = [*header_parts(stamps_ns, stream_label(stream)), *parts]
-        metadata: TopicMetadata = {"derived_from": top}
-        topics.append(
-            Topic(f"{top}/{name}", _full_type(kind), _definition(kind, _DEFINITIONS), stamps_ns, values, metadata)
-        )
+        topics.append(derived_topic(stream, name, kind, stamps_ns, parts))
 
     for column in images:
         values = [value or b"" for value in table.column(column).to_pylist()]

@@ -1,0 +1,106 @@
+"""Write frames of cameras as messages that viewers show: compressed video of codecs that Foxglove plays, or JPEG."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from tacpipe.exports.contents import TIME
+from tacpipe.video.decoding import jpeg_images, read_batches
+from tacpipe.video.stream import KEY_FRAME, PACKET, VideoFormat, in_decode_order
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.exports.ros import Topic
+    from tacpipe.io.columns import Columns
+
+PLAYED = {"h264": "h264", "hevc": "h265", "vp9": "vp9", "av1": "av1"}  # codecs that Foxglove plays, with its names
+VIDEO, IMAGE = "foxglove_msgs/CompressedVideo", "sensor_msgs/CompressedImage"
+START_CODE = b"\x00\x00\x00\x01"
+
+
+class Pictures:
+    """The frames of a stream, which are asked for block by block in the order of rows."""
+
+    def __init__(self, columns: Columns, video_format: VideoFormat) -> None:
+        self._columns, self._format = columns, video_format
+        self.is_video = video_format.codec in PLAYED and not video_format.reorder_frames  # Foxglove plays no B-frames
+        self._frames: Iterator[tuple[int, bytes]] | None = None
+        self._next: tuple[int, bytes] | None = None
+        self._stop = 0  # row after the last block
+
+    def topic(self, stream: str, table: pa.Table) -> Topic:
+        """Return the topic of the next block of rows; rows without a frame have no message."""
+        from tacpipe.exports import ros
+
+        first, self._stop = self._stop, self._stop + table.num_rows
+        block = list(self._before(self._stop)) if table.num_rows else []
+        t_ns = table.column(TIME).to_numpy()[[row - first for row, _ in block]]
+        content = ros.Texts([data for _, data in block])
+        if self.is_video:
+            return ros.derived_topic(stream, "video", VIDEO, t_ns, [content, ros.text_part(PLAYED[self._format.codec])])
+        return ros.derived_topic(stream, "image", IMAGE, t_ns, [ros.text_part("jpeg"), content])
+
+    def _before(self, stop: int) -> Iterator[tuple[int, bytes]]:
+        """Yield row and content of the following frames up to the row ``stop``."""
+        if self._frames is None:
+            batches = read_batches(self._columns)
+            self._frames = self._packets(batches) if self.is_video else jpeg_images(self._format, batches)
+        while (frame := self._next or next(self._frames, None)) is not None:
+            self._next = None
+            if frame[0] >= stop:
+                self._next = frame
+                return
+            yield frame
+
+    def _packets(self, batches: Iterator[pa.Table]) -> Iterator[tuple[int, bytes]]:
+        headers, size_bytes = parameter_sets(self._format)
+        for row, columns in in_decode_order(self._format, batches):
+            packet = columns[PACKET]
+            if isinstance(packet, bytes) and packet:
+                content = with_start_codes(packet, size_bytes) if size_bytes else packet
+                yield row, headers + content if columns[KEY_FRAME] else content
+
+
+def parameter_sets(video_format: VideoFormat) -> tuple[bytes, int]:
+    """Return what a decoder needs before a key frame, and how many bytes state the size of a unit in a packet.
+
+    H.264 and H.265 lie in files with the size before each unit (ISO/IEC 14496-15), and Foxglove reads start codes
+    instead. Others and packets that have start codes need nothing: 0.
+    """
+    extradata = video_format.extradata
+    if video_format.codec not in ("h264", "hevc"):
+        return b"", 0
+    if extradata[:1] != b"\x01":  # start codes
+        return extradata, 0
+    units: list[bytes] = []
+    if video_format.codec == "h264":
+        place, size_bytes = 5, (extradata[4] & 3) + 1
+        for mask in (0x1F, 0xFF):  # sequence parameter sets, picture parameter sets
+            count, place = extradata[place] & mask, place + 1
+            place = _read_units(extradata, place, count, units)
+    else:
+        place, size_bytes = 23, (extradata[21] & 3) + 1
+        for _ in range(extradata[22]):
+            place = _read_units(extradata, place + 3, int.from_bytes(extradata[place + 1 : place + 3]), units)
+    return b"".join(START_CODE + unit for unit in units), size_bytes
+
+
+def with_start_codes(packet: bytes, size_bytes: int) -> bytes:
+    """Return a packet whose units have start codes in place of their sizes."""
+    units, place = [], 0
+    while place + size_bytes <= len(packet):
+        stop = place + size_bytes + int.from_bytes(packet[place : place + size_bytes])
+        units.append(START_CODE + packet[place + size_bytes : stop])
+        place = stop
+    return b"".join(units)
+
+
+def _read_units(extradata: bytes, place: int, count: int, units: list[bytes]) -> int:
+    """Add ``count`` units with sizes of two bytes to ``units``; return the place after them."""
+    for _ in range(count):
+        stop = place + 2 + int.from_bytes(extradata[place : place + 2])
+        units.append(extradata[place + 2 : stop])
+        place = stop
+    return place

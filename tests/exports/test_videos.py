@@ -1,0 +1,103 @@
+"""Streams of frames in MCAP and HDF5: what viewers decode is what was recorded, and packets come back bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pytest
+
+import tacpipe
+from tacpipe.arrays import Bytes
+from tacpipe.video.stream import read_format
+from tests.conftest import Lab
+from tests.exports import recordings
+from tests.exports.test_mcap import read
+from tests.stages.test_extract import frames_of
+from tests.video import videos
+
+COUNT = 40
+PLAYED = {"libx264": ("h264", "mp4"), "libx265": ("h265", "mkv")}
+
+
+def write(lab: Lab, encoder: str, ending: str, monkeypatch: pytest.MonkeyPatch, *, b_frames: int) -> Path:
+    """Write a dataset with a video; return the video."""
+    parameters = {
+        "libx264": {"g": "12", "bf": str(b_frames), "x264-params": "log-level=none"},
+        "libx265": {"x265-params": f"keyint=12:bframes={b_frames}:scenecut=0:log-level=none"},
+        "mpeg4": {"g": "12", "bf": str(b_frames)},
+    }
+    monkeypatch.setattr(videos, "OPTIONS", parameters)
+    path = videos.write(lab.folder / f"gel.{ending}", encoder, COUNT)
+    recordings.write(lab.folder / "rec", {"a": ({"gel": frames_of(path)}, {})})
+    return path
+
+
+def decoded(codec: str, packets: list[bytes]) -> list[Bytes]:
+    """Return the images of packets that a fresh decoder gets without anything else."""
+    context: Any = av.CodecContext.create(codec, "r")
+    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
+    return [frame.to_ndarray(format="rgb24") for frame in [*frames, *context.decode(None)]]
+
+
+@pytest.mark.parametrize("encoder", PLAYED)
+def test_a_video_that_foxglove_plays_is_compressed_video_with_all_that_a_decoder_needs(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, encoder: str
+) -> None:
+    name, ending = PLAYED[encoder]
+    path = write(lab, encoder, ending, monkeypatch, b_frames=0)
+    lab.run("export mcap rec -o mcap")
+    topics = read(lab.folder / "mcap/a.mcap")
+    messages = [message for _, message in topics["/gel/video"]]
+    assert "/gel/image" not in topics
+    assert {message.format for message in messages} == {name}
+    assert len(messages) == COUNT
+    images = decoded({"h265": "hevc"}.get(name, name), [bytes(message.data) for message in messages])
+    assert np.array_equal(images, videos.decoded(path))
+    from_second_key_frame = decoded(
+        {"h265": "hevc"}.get(name, name), [bytes(message.data) for message in messages[12:]]
+    )
+    assert np.array_equal(from_second_key_frame, videos.decoded(path)[12:])
+
+
+@pytest.mark.parametrize(("encoder", "ending", "b_frames"), [("mpeg4", "avi", 0), ("libx264", "mp4", 3)])
+def test_any_other_video_is_decoded_and_encoded_as_images(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, encoder: str, ending: str, b_frames: int
+) -> None:
+    path = write(lab, encoder, ending, monkeypatch, b_frames=b_frames)
+    lab.run("export mcap rec -o mcap")
+    messages = read(lab.folder / "mcap/a.mcap")["/gel/image"]
+    t_ns = tacpipe.open("rec")["a"].table("gel").column("t_ns").to_pylist()
+    assert [stamp for stamp, _ in messages] == t_ns
+    for (_, message), original in zip(messages, videos.decoded(path), strict=True):
+        (image,) = decoded("mjpeg", [bytes(message.data)])
+        assert np.abs(image.astype(int) - original).mean() < 6
+
+
+@pytest.mark.parametrize(
+    ("encoder", "ending", "b_frames"), [("mpeg4", "avi", 2), ("libx264", "mp4", 3), ("mjpeg", "avi", 0)]
+)
+@pytest.mark.parametrize("kind", ["mcap", "hdf5"])
+def test_packets_come_back_bit_for_bit_with_their_format(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, kind: str, encoder: str, ending: str, b_frames: int
+) -> None:
+    write(lab, encoder, ending, monkeypatch, b_frames=b_frames)
+    lab.run(f"export {kind} rec -o out")
+    lab.run(f"ingest {kind} out -o back")
+    original, back = (tacpipe.open(name)["a"].table("gel") for name in ("rec", "back"))
+    assert read_format(back) == read_format(original)
+    for name in ("t_ns", "packet", "pts", "dts", "key_frame"):
+        assert back.column(name).to_pylist() == original.column(name).to_pylist()
+
+
+def test_h5py_reads_decoded_frames(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(lab, "mpeg4", "avi", monkeypatch, b_frames=2)
+    lab.run("export hdf5 rec -o h5 --images")
+    with h5py.File("h5/a.h5") as file:
+        assert np.array_equal(file["gel/images"][:], videos.decoded(path))
+    refused = lab.call("export hdf5 rec -o demos --images --structure robomimic")
+    assert refused.code == 2
+    assert "images belongs to --structure streams" in refused.err
