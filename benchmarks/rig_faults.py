@@ -69,7 +69,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     source = emulator.source(name, its_pace, rate_hz)
     packets = stream.address.scheme in PACKETS
     plan = TransmissionPlan(source, its_pace, faults, [1], packets=packets)
-    ledger, reading = Ledger(name), LinkReader(stream.sensor)
+    ledger, reading = Ledger(name), LinkReader(source.sensor)
     ledger.sources.append(source)
     batches: list[Batch] = []
     harmed: Counter[str] = Counter()
