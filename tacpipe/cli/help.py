@@ -158,6 +158,10 @@ class HelpGroup(TyperGroup):
                 formatter.write_dl([(name.ljust(width), rows[name]) for name in names])
 
 
+def unrequested() -> None:
+    """Represent a command that was not requested, in help alone."""
+
+
 def _sections(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """Return the commands of ``rows`` by section; those that no section names are of other packages."""
     sections = {title: tuple(name for name in names if name in rows) for title, names in SECTIONS.items()}

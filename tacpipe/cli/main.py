@@ -198,9 +198,9 @@ def _misuse() -> type[Any]:
 
 def _add_summaries(program: typer.Typer) -> None:
     """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
-    from tacpipe.cli import commands, stages
+    from tacpipe.cli import commands
     from tacpipe.plugins import registry
 
     lines = registry.commands()
     for name in (*lines, *commands.NAMES):
-        program.command(name, help=lines.get(name) or commands.summary(name))(stages.nothing)
+        program.command(name, help=lines.get(name) or commands.summary(name))(help.unrequested)

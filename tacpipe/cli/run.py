@@ -233,7 +233,7 @@ def _answered(arguments: Sequence[str]) -> bool:
     if not arguments or arguments[0] not in groups:
         return False
     program = typer.Typer(rich_markup_mode=None)
-    program.callback()(stages.nothing)
+    program.callback()(help.unrequested)
     try:
         stages.add_group(program, arguments[0], arguments)
         help.refuse_addresses(program)

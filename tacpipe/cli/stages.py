@@ -14,6 +14,7 @@ import typer
 
 from tacpipe import printable
 from tacpipe.cli import stage_options
+from tacpipe.cli.help import unrequested
 from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import terminal
@@ -56,12 +57,8 @@ def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> Non
     for method in requested:  # A broken method does not affect the other methods.
         add(methods, by_method[method], method)
     for method in () if requested else by_method:
-        methods.command(method, help=registry.summary(by_method[method]))(nothing)
+        methods.command(method, help=registry.summary(by_method[method]))(unrequested)
     program.add_typer(methods, name=group)
-
-
-def nothing() -> None:
-    """Represent a command that was not requested."""
 
 
 def add(program: typer.Typer, name: str, command: str) -> None:

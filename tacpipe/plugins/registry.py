@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 import inspect
 import operator
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from configparser import ConfigParser
@@ -19,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
-from tacpipe.io.files import listed
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import AnyStage, Stage
@@ -71,7 +71,8 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
     for folder in dict.fromkeys(sys.path):
         for file in _entry_point_files(folder):
             try:
-                text = file.read_text(encoding="utf-8")
+                with open(file, encoding="utf-8") as reading:
+                    text = reading.read()
             except (FileNotFoundError, NotADirectoryError, PermissionError):
                 continue
             if "[tacpipe." not in text:
@@ -82,7 +83,7 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
             for group, targets in targets_by_group.items():
                 if parser.has_section(group):
                     for name, target in parser.items(group):
-                        targets.setdefault(name, (target, file))
+                        targets.setdefault(name, (target, Path(file)))
     return targets_by_group
 
 
@@ -182,13 +183,14 @@ def collect_packages() -> Iterator[set[str]]:
         _used_packages.reset(token)
 
 
-def _entry_point_files(folder: str) -> list[Path]:
+def _entry_point_files(folder: str) -> list[str]:
     """Return the possible entry-point files in a folder of installed packages."""
-    pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
+    ending = ".dist-info" if folder.endswith("-packages") else ".egg-info"
     try:
-        return [metadata / "entry_points.txt" for metadata in listed(Path(folder or "."), pattern)]
-    except PermissionError:  # Python ignores such a folder too
+        names = os.listdir(folder or ".")  # noqa: PTH208
+    except (FileNotFoundError, NotADirectoryError, PermissionError):  # Python ignores such a folder too
         return []
+    return [f"{folder or '.'}/{name}/entry_points.txt" for name in sorted(names) if name.endswith(ending)]
 
 
 @functools.cache
