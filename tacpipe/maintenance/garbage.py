@@ -22,8 +22,8 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
+from tacpipe.maintenance.sound_records import NOTE, RecordSummary, SoundRecords
 from tacpipe.store import layout, presence
-from tacpipe.store.records import Record, digests
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
@@ -131,15 +131,15 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
     # records are read before `live`, because damaged ones go to quarantine, which `live` reads
-    records = [*map(_brief, store.records())]
+    records = _summaries(store)
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
     retained, unneeded = set(needed.lasting), []
-    for key, named_text, irreplaceable in records:
-        names = set(named_text.split())
+    for key, summary in records.items():
+        names = set(summary.names.split())
         if names <= needed.objects or names <= retained:
             continue
-        if irreplaceable and not recordings:
+        if summary.irreplaceable and not recordings:
             retained |= names - needed.objects
             continue
         unneeded.append(key)
@@ -170,10 +170,14 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
     return collected
 
 
-def _brief(keyed_record: tuple[str, Record]) -> tuple[str, str, bool]:
-    """Return a record's key, its digests, and whether it marks a recording; compact, because all records stay in memory."""
-    key, record = keyed_record
-    return key, " ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable"))
+def _summaries(store: Store) -> dict[str, RecordSummary]:
+    """Return the summary of each record that is sound, by its key."""
+    sound, summaries = SoundRecords(store), {}
+    for key in layout.names(store.root, "records"):
+        with contextlib.suppress(MissingError):
+            summaries[key] = sound.read(key)
+    sound.remember()
+    return summaries
 
 
 def _remove(store: Store, moved_names: list[str], needed: set[str], collected: Collected) -> None:
@@ -345,7 +349,7 @@ def _sweep(
             _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-        presence.forget_notes(store, [path.stem for path in layout.entries(store.root, "roots")])
+        presence.forget_notes(store, [NOTE, *(path.stem for path in layout.entries(store.root, "roots"))])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1

@@ -19,6 +19,7 @@ from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import readable_errors, walk, write_whole
 from tacpipe.io.hashing import file_digest
+from tacpipe.maintenance.sound_records import SoundRecords
 from tacpipe.printable import plain
 from tacpipe.store import layout
 from tacpipe.store.leases import Holder
@@ -124,8 +125,10 @@ def verify(store: Store) -> Soundness:
     soundness = Soundness(foreign=layout.foreign(store.root))
     for name in layout.names(store.root, "objects"):
         soundness.objects += _read(store.read, name, soundness)
+    sound = SoundRecords(store)
     for key in layout.names(store.root, "records"):
-        soundness.records += _read(store.read_record, key, soundness)
+        soundness.records += _read(sound.read, key, soundness)
+    sound.remember()
     store.roots.all()
     soundness.damaged += [f"root {name}" for name in store.roots.damaged()]
     missing = set(_absent_objects(store, soundness)) - set(soundness.damaged)
