@@ -62,7 +62,7 @@ def table(comparisons: Sequence[Comparison]) -> str:
             writer.writerow([method, part, *(f"{value:.{DIGITS.get(task, 3)}f}" for value in values), count])
     most = max(comparison.rows[0].recordings for comparison in first)
     if task == "material":
-        materials = len(first[0].rows[0].method.details[0].config["materials"])
+        materials = len(first[0].rows[0].method.details[0].config["classes"])
         writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, most])
     if task == "touch":
         writer.writerow(["constant", "both", 0, 0, 0, most])
@@ -94,10 +94,17 @@ def main_entries(comparison: Comparison) -> list[Entry]:
 
 
 def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
-    """Return a row with the value that its table states: skill over the constant for touch, else the score of its task."""
+    """Return a row with the value that its table states: skill over the constant for touch, else the score of its task.
+
+    The interval of an accuracy is Wilson's, as in `tacpipe evaluate`, so that no end is above 100 %.
+    """
     from tacpipe.comparison import engine
+    from tacpipe.metrics.intervals import wilson
 
     value: Any = row.score
+    if comparison.task == "material":
+        low, high = wilson(round(value.mean / 100 * row.recordings), row.recordings)
+        return name, (value.mean, 100 * low, 100 * high), row.recordings
     if comparison.task == "touch":
         source = next((other.method for other in comparison.rows if other.predictor == CONSTANT), row.method)
         value = engine.difference(row.method, source, comparison.question, (row.predictor, CONSTANT))

@@ -365,6 +365,25 @@ def test_the_tables_of_results_are_made_from_results() -> None:
     ]
 
 
+def test_the_table_of_materials_states_shares_of_slides_with_wilson_s_interval() -> None:
+    from tacpipe.comparison import engine
+    from tacpipe.metrics.intervals import wilson
+    from tests.tasks.material.report import material_fakes
+
+    results = [
+        material_fakes.result("minirocket", wrong={"biotac": 1}, also={"mean_level": {"biotac": 4}}),
+        material_fakes.result("raec", wrong={"biotac": 2}, epochs=150),
+    ]
+    rows = list(csv.DictReader(io.StringIO(module("result_pages").table(engine.compare(results)))))
+    assert list(rows[0]) == ["method", "sensor", "accuracy_percent", "low", "high", "slides"]
+    slides = int(rows[0]["slides"])
+    for row, right in zip(rows, (slides - 1, slides - 2, slides - 4), strict=False):
+        low, high = wilson(right, slides)
+        values = [f"{100 * value:.1f}" for value in (right / slides, low, high)]
+        assert [row["accuracy_percent"], row["low"], row["high"]] == values
+    assert (rows[-1]["method"], rows[-1]["accuracy_percent"]) == ("chance", f"{100 / material_fakes.MATERIALS:.1f}")
+
+
 PARSED = {  # beginnings of examples of the help that are parsed and not run, and why
     "acquire": "needs the devices of a rig",
     "candidates": "names a published grasp",
