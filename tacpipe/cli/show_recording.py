@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypedDict
 from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.errors import UsageError
+from tacpipe.io import Json
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins.stage import Attribute
@@ -103,7 +104,7 @@ class RecordingOverview:
     events: Sequence[RecordedEvent]
     attributes: Mapping[str, Attribute]
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> Json:
         """Return the overview as plain values."""
         return {"kind": "recording", **dataclasses.asdict(self)}
 

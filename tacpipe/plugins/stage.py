@@ -38,6 +38,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar, cast
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Json
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -48,8 +49,8 @@ ROLES = ("train", "val", "calibration", "test")
 ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # path by name in the source
-Values = Mapping[str, Any]  # JSON values by name
-ParamValue = str | float | bool | None | Sequence[Any] | Mapping[str, Any]
+Values = Json  # what ``discover`` gives for a recording, and other JSON values by name
+ParamValue = str | float | bool | None | Sequence[Any] | Json
 StoredParams = Mapping[str, ParamValue]  # params of a stage as keys, manifests and models hold them
 Presets = Mapping[str, Values]  # named sets of params
 RecordingName = str
