@@ -16,6 +16,21 @@ from typing import Any
 DOCS = Path(__file__).parent
 BUILT_IN = ("tacpipe.", "tacpipe_stages.")
 FIRST = ("open", "load", "run", "Dataset", "Recording")  # names at the top of the page on Python
+MODELS = (
+    "tacpipe.tasks.forward.prediction.ForwardModel",
+    "tacpipe.tasks.material.model.MaterialModel",
+    "tacpipe.tasks.touch.model.TouchModel",
+)
+BASE_CLASSES = {  # each with the page that has a complete example
+    "tacpipe.tasks.task.Task": "task",
+    "tacpipe.tasks.forward.params.ForwardModelParams": "model",
+    "tacpipe.tasks.material.params.NetworkParams": "model",
+    "tacpipe.tasks.material.params.Estimator": "model",
+    "tacpipe.codecs.codec.FittedCodec": "codec",
+    "tacpipe.sensors.sensor.Sensor": "sensor",
+    "tacpipe.trackers.tracking.Tracker": "tracker",
+    "tacpipe.engine.executors.local.Executor": "executor",
+}
 TABLE = re.compile(r"^\[\[results: (\w+)\]\]$", re.MULTILINE)
 
 
@@ -196,7 +211,7 @@ def _cell(text: str) -> str:
 
 
 def python() -> str:
-    """Return the page of the Python interface: one entry a name of ``tacpipe.__all__``, from its docstring."""
+    """Return the page of the Python interface: entry points first, then models, base classes of plug-ins and errors."""
     import tacpipe
 
     parts = [
@@ -207,13 +222,26 @@ def python() -> str:
     public = [name for name in tacpipe.__all__ if not name.startswith("__")]
     errors = [name for name in public if name.endswith(("Error", "Warning"))]
     others = sorted({*public} - {*FIRST, *errors}, key=str.lower)
-    names = (*(name for name in FIRST if name in public), *others, *sorted(errors))
-    parts += [f"::: {_path(name)}\n    options:\n      heading_level: 2\n" for name in names]
+    parts += [_entry(_path(name)) for name in FIRST]
+    parts.append("## Models\n\n`tacpipe.load` returns one of these classes.\n")
+    parts += [_entry(path, 3) for path in MODELS]
+    parts.append(
+        "## Base classes of plug-ins\n\nFormats, stages and exports are functions with the decorator `stage`: "
+        "[A format](../extending/format.md), [A stage](../extending/stage.md), [An export](../extending/export.md).\n"
+    )
+    for path, page in BASE_CLASSES.items():
+        parts += [_entry(path, 3), f"[A complete example](../extending/{page}.md)\n"]
+    parts += [_entry(_path(name)) for name in (*others, *sorted(errors))]
     parts.append(
         "## Constraints of params\n\n::: tacpipe.plugins.constraints\n    options:\n      show_root_heading: false\n"
         "      filters: ['!^_', '!^allows$', '!^describe$']\n"
     )
     return "\n".join(parts)
+
+
+def _entry(path: str, level: int = 2) -> str:
+    """Return the instruction for mkdocstrings that inserts the docstring at ``path``."""
+    return f"::: {path}\n    options:\n      heading_level: {level}\n"
 
 
 def _path(name: str) -> str:

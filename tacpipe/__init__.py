@@ -74,9 +74,15 @@ def __dir__() -> list[str]:
 
 
 def open(path: str | PathLike[str]) -> Dataset:
-    """Return the dataset whose directory or manifest is ``path``; its bytes are read and verified when asked for.
+    """Open the dataset at ``path``, a directory or its manifest.
 
-    Raises `UsageError` if there is no dataset, `DamagedError` if its manifest was changed.
+    Data are read and verified when they are needed:
+
+        dataset = tacpipe.open("data/synced")
+        frame = dataset["trial-003"].table().to_pandas()
+
+    :raises UsageError: if there is no dataset.
+    :raises DamagedError: if the manifest was changed.
     """
     from tacpipe.engine.pipeline import open_dataset
 
@@ -108,34 +114,32 @@ def run(
     track: Sequence[str] = (),
     **params: Any,
 ) -> Dataset | Any:
-    """Run a stage and return its opened output; what was computed before is not computed again.
+    """Run a stage and return its opened output, from the store if the result exists.
 
-    It does what the command ``tacpipe NAME DATASETS... -o OUTPUT`` does, with the same key, so that each answers what the
-    other computed::
+    It is the command ``tacpipe NAME DATASETS... -o OUTPUT`` with the same key, so both reuse each other's results:
 
         synced = tacpipe.run("synchronize", "data/recordings", output="data/synced", rate_hz=25)
         model = tacpipe.run("train.forward", "data/segments", split="data/split", output="models/forward", epochs=2)
 
-    :param name: the stage, ``GROUP.METHOD`` where a command has two words: ``"segment.contacts"``, ``"ingest.xela-flat"``;
-        a plug-in's as well.
+    :param name: the stage, built in or of a plug-in; ``GROUP.METHOD`` for two words, as ``"segment.contacts"``.
     :param datasets: datasets to read, paths or opened ones; for ``ingest`` the folder of the recordings.
-    :param output: the directory to write; the file for a stage that writes one, as ``"report.html"``.
+    :param output: the directory to write; a file such as ``"report.html"`` for a stage that writes one file.
     :param model: the trained model of ``evaluate`` and ``predict``.
-    :param split: which recordings train, validate and test, with ``fold``; ``role`` is the one to read.
+    :param split: the split that assigns roles to recordings, with ``fold``; ``role`` selects the role to read.
     :param codec: a dataset whose fitted codec to apply; ``init``: a model to begin with; ``extend``: an older split
         whose roles to keep.
-    :param preset: a preset of params. A file of params is read only if ``params_file`` names one (``block``: its block).
-    :param jobs: processes to use; 0: one per core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
-        computes what is stored too, ``replace`` lets the output replace what it must not lose otherwise.
-    :param device: what networks are trained on: cpu, cuda or mps; auto is cuda where there is one.
-    :param progress: show progress on a terminal, and print what a command prints while it runs.
-    :param track: trackers that follow a training, as ``("tensorboard", "mlflow:http://127.0.0.1:5000")``.
+    :param preset: a preset of params. ``params_file`` names a file of params, and ``block`` its block.
+    :param jobs: number of processes; 0: one per core. ``skip_bad`` skips recordings that cannot be read, ``rerun``
+        computes even if a result is stored, and ``replace`` replaces other content of the output.
+    :param device: device to train on: cpu, cuda or mps; auto is cuda if there is one.
+    :param progress: whether to show progress and print the output of the command.
+    :param track: trackers of a training, as ``("tensorboard", "mlflow:http://127.0.0.1:5000")``.
     :param params: params of the stage, checked as on the command line.
-    :returns: a `Dataset`, or a `pathlib.Path` where the output is a file.
-    :raises UsageError: for an unknown stage, param or value, and where an input is missing or the output must stay.
-    :raises TacpipeError: where the stage cannot read its inputs; other errors are those of its own code.
+    :returns: a `Dataset`, or a `pathlib.Path` if the output is a file.
+    :raises UsageError: for an unknown stage, param or value, a missing input, or an output that must not be replaced.
+    :raises TacpipeError: if the stage cannot read its inputs. A stage may raise other errors.
 
-    What a command would note about a valid result is a `ResultWarning`.
+    A note of the command becomes a `ResultWarning`.
     """
     from tacpipe.engine import calling
 
@@ -165,12 +169,17 @@ def run(
 
 
 def load(path: str | PathLike[str]) -> Any:
-    """Return the model at ``path``: what its task makes of the files that `tacpipe train` wrote.
+    """Load the model at ``path``, the output of `tacpipe train`.
 
-    ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording of it, returns the arrow table that
-    ``tacpipe predict`` writes, after the stages that the model was trained behind: those that the recordings have not been
-    through yet are run, and answered by the store where they ran before. ``predict`` also reads arrays; how, the class of
-    the model states, which is that of its task. Raises `UsageError` if ``path`` holds no model.
+    ``model.predict`` takes a dataset or one of its recordings. It first runs the stages of the model that the recordings
+    lack, and returns the arrow table that ``tacpipe predict`` writes:
+
+        model = tacpipe.load("models/forward")
+        table = model.predict(tacpipe.open("data/segments"))
+
+    ``predict`` also takes arrays, as the class of the model describes: `ForwardModel`, `MaterialModel` or `TouchModel`.
+
+    :raises UsageError: if ``path`` holds no model.
     """
     from tacpipe.datasets import model_files
     from tacpipe.plugins import extras
