@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import sysconfig
+import time
 import venv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -75,6 +77,17 @@ class Project:
         words = [str(self.programs / "python"), "-m", "tests.recording.patient", *shlex.split(command)]
         return self.run(words, command)
 
+    def record_until(self, enough: Callable[[], bool], command: str) -> None:
+        """Run ``tacpipe`` with a command that records until it is interrupted, as soon as there is enough."""
+        words = [str(self.programs / "python"), "-m", "tests.recording.patient", *shlex.split(command)]
+        with subprocess.Popen(words, cwd=self.folder, env=self.variables, stderr=subprocess.PIPE, text=True) as process:
+            while process.poll() is None and not enough():
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            assert process.stderr is not None
+            errors = process.stderr.read()
+        assert process.returncode == 0, f"{command}: {errors}"
+
 
 @pytest.mark.long
 @pytest.mark.timeout(3600)
@@ -105,9 +118,8 @@ def test_a_task_of_another_package_publishes_live_what_it_predicts_from_the_reco
         project.tacpipe("split data/recordings -o data/split --scheme random --val 0.34 --test 0")
         project.tacpipe("train load data/recordings --split data/split -o models/trained --stream skin --ahead 3")
         project.tacpipe("calibrate models/trained data/recordings --split data/split -o models/load")
-        project.record(
-            f"live rig.toml --model models/load -o rec --duration-s 3 --limit 1e9 --publish udp:127.0.0.1:{port}"
-        )
+        command = f"live rig.toml --model models/load -o rec --limit 1e9 --publish udp:127.0.0.1:{port} --quiet"
+        project.record_until(lambda: len(messages) > 80, command)
     project.tacpipe("evaluate models/load rec -o results/load")
     assert "coverage" in json.loads((project.folder / "results/load/metrics.json").read_text())["quantiles"]
     project.tacpipe("predict models/load rec -o predicted --causal --quantiles 10,90")
