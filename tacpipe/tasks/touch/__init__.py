@@ -1,5 +1,5 @@
-"""The tactile reading of a grasp, predicted from a point cloud of the object and the two points where fingers close.
+"""Predict the tactile reading of a grasp from a point cloud of the object and the two contact points of the fingers.
 
-A grasp is a recording with a ``cloud``, a ``grasp`` and a ``reading`` of two BioTac SP. Four targets are predicted: the
-pressure of the fluid and 24 electrodes of thumb and middle finger each.
+A grasp is a recording with a ``cloud``, a ``grasp`` and a ``reading`` of two BioTac SP sensors. There are four targets:
+the fluid pressure and the 24 electrodes of the thumb and of the middle finger.
 """

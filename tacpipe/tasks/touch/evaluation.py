@@ -1,4 +1,4 @@
-"""Evaluation of a model of touch on grasps that it has not seen, next to its baselines."""
+"""Evaluate a touch model and its baselines on unseen grasps."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
-Scores = dict[str, float | None]  # values by name; None where a measure is not defined
+Scores = dict[str, float | None]  # values by name; None if a measure is undefined
 
 
 class ReadingMeasures(TypedDict):
-    """The measures of a predictor's readings, by target."""
+    """The errors of a predictor, by target."""
 
     rmse: Scores
     rmse_counts: Scores
@@ -53,41 +53,41 @@ class ReadingMeasures(TypedDict):
     skill: Scores
     skill_low: Scores
     skill_high: Scores
-    n: int  # grasps
+    n: int  # number of grasps
 
 
 class PredictorMeasures(ReadingMeasures):
-    """The measures of a predictor, over all grasps and by object."""
+    """The errors of a predictor, over all grasps and by object."""
 
     by_object: dict[str, ReadingMeasures]
 
 
 class ModelMeasures(PredictorMeasures):
-    """The measures of the model itself."""
+    """The errors of the model itself."""
 
-    by_electrode: dict[str, dict[str, Scores]]  # by target, electrode and measure
+    by_electrode: dict[str, dict[str, Scores]]  # target -> electrode -> measure -> value
 
 
 @dataclass(frozen=True)
 class TouchScores:
-    """The measures of all predictors on some grasps."""
+    """The errors of all predictors on a set of grasps."""
 
     counts: dict[str, int]
     predictors: dict[str, PredictorMeasures] = field(default_factory=dict)
 
     def to_json(self) -> Json:
-        """Return the scores as ``metrics.json`` has them."""
+        """Return the scores as they are stored in ``metrics.json``."""
         return {"counts": self.counts, **self.predictors}
 
 
 def reading_measures(
     readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]
 ) -> ReadingMeasures:
-    """Return the measures of one predictor's readings, by measure and target.
+    """Return the errors of one predictor, by measure and target.
 
-    ``rmse`` and ``mae`` are in fractions of each target's range (`biotac_sp.RANGES`), over grasps and electrodes at once;
-    ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
-    ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over ``clusters``.
+    ``rmse`` and ``mae`` are fractions of each target's range (`biotac_sp.RANGES`), pooled over grasps and electrodes.
+    ``rmse_counts`` is in device counts. ``rmse_batch_mean`` is the figure of the letter: the mean over batches of ten.
+    ``skill`` is 1 - RMSE / RMSE of ``constant``, with a 95 % interval over ``clusters``.
     """
     measures: ReadingMeasures = {
         "rmse": {},
@@ -128,33 +128,33 @@ def by_electrode(readings: Readings, predicted: Readings) -> dict[str, dict[str,
 
 
 def select_rows(predicted: Readings, mask: Bools) -> dict[str, Floats]:
-    """Return the values of the grasps that a mask (grasp,) chooses."""
+    """Return the values of the grasps selected by a mask (grasp,)."""
     return {target: values[mask] for target, values in predicted.items()}
 
 
 def _finite(value: float) -> float | None:
-    """Return a measure, or None if it is not defined, for JSON."""
+    """Return a value for JSON, or None if it is not finite."""
     return value if np.isfinite(value) else None
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return ``metrics.json``, ``by_object.csv`` and the predictions of each predictor for each grasp.
+    """Return ``metrics.json``, ``by_object.csv`` and each predictor's values for each grasp.
 
-    The measures are of grasps that the model was not trained on, and again of those among them whose object it knows
-    (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are reported
-    apart, under ``seen``. Raises `TacpipeError` if grasps have no reading, or are not what the model reads.
+    Errors are computed on unseen grasps, and separately on those of objects with training grasps (``known``) and
+    without (``novel``). Training grasps, and grasps whose reading equals that of a training grasp, are reported under
+    ``seen``. Raises `TacpipeError` if grasps have no reading or lack inputs of the model.
     """
     predictor = Predictor.load(model)
     with terminal.progress_bar(
         "evaluate", 2 * len(recordings.recordings)
-    ) as advance:  # each grasp is read, then predicted
+    ) as advance:  # each grasp is read and then predicted
         return _evaluated(model, predictor, grasps_of.read(recordings, advance=advance), recordings, advance)
 
 
 def _evaluated(
     model: Mapping[str, bytes], predictor: Predictor, grasps: Grasps, recordings: Dataset, advance: Callable[..., None]
 ) -> Result:
-    """Return the result of a model on grasps; ``advance`` moves the bar when they are predicted."""
+    """Return the result of a model on grasps; ``advance`` updates the progress bar after their prediction."""
     if not len(grasps):
         raise TacpipeError(
             "There is no grasp to evaluate the model on. Give a dataset with recordings of the requested role."
@@ -199,7 +199,7 @@ def _evaluated(
 def _quantiles(
     predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
 ) -> Json:
-    """Return the measures of a calibrated model's quantiles, of known objects and of novel ones; empty for others."""
+    """Return the quantile measures of a calibrated model on known and on novel objects; empty for other models."""
     if predictor.quantiles is None:
         return {}
     parts = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training}
@@ -218,7 +218,7 @@ def _quantiles(
 def _headlines(
     predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
 ) -> list[headline.Headline]:
-    """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
+    """Return comparisons of the model with its baselines by target, on known and on novel objects."""
     objects = {name: object_name or "unnamed" for name, object_name in zip(grasps.names, grasps.objects, strict=True)}
     target_headlines = []
     for part in (True, False):
@@ -239,9 +239,9 @@ def _headlines(
 
 
 def _scores(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> TouchScores:
-    """Return the measures of every predictor on some grasps, over all of them and by object.
+    """Return the errors of every predictor on the grasps of ``mask``, over all of them and by object.
 
-    Intervals are over objects where one of them is not known, else over grasps (``is_known`` (grasp,)).
+    Intervals are over objects if any object is novel, otherwise over grasps. ``is_known`` is (grasp,).
     """
     if not mask.any():
         return TouchScores({"grasps": 0})
@@ -272,7 +272,7 @@ def _measures(
 
 
 def _by_object_csv(scores: TouchScores) -> bytes:
-    """Return a row an object, predictor and target: how many grasps, RMSE in shares and counts, R2, skill."""
+    """Return CSV with one row per object, predictor and target: grasps, relative RMSE, RMSE in counts, R2 and skill."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
@@ -288,7 +288,7 @@ def _by_object_csv(scores: TouchScores) -> bytes:
 
 
 def _about(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
-    """Return a row a grasp: which recording, object and session, when, and whether the model knows it or its object."""
+    """Return one row per grasp: recording, object, session, time, and whether grasp and object are known."""
     return pa.table(
         {
             "recording": pa.array(grasps.names, pa.string()),
@@ -302,15 +302,17 @@ def _about(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
-    """Return the attribute that marks what simulated recordings led to, or None if all are real."""
+    """Return the attribute that marks results of simulated recordings; None if all recordings are real."""
     is_simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
     return {"simulated": True} if is_simulated else {}
 
 
 def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = None) -> pa.Table:
-    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, where predicted.
+    """Return one row per grasp with ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` if predicted.
 
-    ``bands`` holds quantiles by their level in percent, which follow each value as ``e_th_01_q90``.
+    Float32, device counts.
+
+    ``bands`` contains quantiles by level in percent. Their columns, such as ``e_th_01_q90``, follow that of the value.
     """
     fields, arrays = [], []
     for target, values in predicted.items():

@@ -1,4 +1,4 @@
-"""Grasps of a dataset as arrays: clouds, grasps and readings."""
+"""Load the grasps of a dataset as arrays: clouds, grasps and readings."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
 
 STREAMS = ("cloud", "grasp")
 READING = "reading"
-MIN_POINTS = 3  # points of a cloud; fewer have neither surface nor main axis
-FARTHEST_M = 0.1  # largest distance of a grasp point, maybe on a hidden side, from the cloud of its object
+MIN_POINTS = 3  # minimum number of points; fewer have no surface and no main axis
+FARTHEST_M = 0.1  # maximum distance of a contact point, possibly on a hidden side, from its object's cloud
 
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps side by side, each with its cloud and, where it is known, the reading of both fingers."""
+    """Grasps with their clouds and, if available, the readings of both fingers."""
 
     names: tuple[str, ...]
-    objects: tuple[str, ...]  # empty if none is labelled
+    objects: tuple[str, ...]  # empty string if unlabelled
     sessions: tuple[str, ...]
     t_ns: Times  # (grasp,)
     clouds: tuple[Cloud, ...]
     grasps: tuple[Grasp, ...]
     readings: Mapping[str, Floats]  # target -> (grasp, value), device counts; empty without readings
-    digests: tuple[str, ...]  # digests of the recordings
+    digests: tuple[str, ...]  # of the recordings
 
     def __len__(self) -> int:
-        """Return how many grasps there are."""
+        """Return the number of grasps."""
         return len(self.names)
 
     def joined(self, appended: Grasps) -> Grasps:
-        """Return these grasps and then the others."""
+        """Return these grasps followed by the ``appended`` ones."""
         return Grasps(
             self.names + appended.names,
             self.objects + appended.objects,
@@ -57,12 +57,12 @@ class Grasps:
 
 
 def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[..., None] | None = None) -> Grasps:
-    """Return the grasps of a dataset in the order of names; with ``with_readings`` each must have a reading.
+    """Return the grasps of a dataset, ordered by recording name.
 
-    ``advance`` is called after each.
+    With ``with_readings`` every grasp must have a reading. ``advance`` is called after each grasp.
 
-    Raises `TacpipeError` if a recording lacks a stream or a column, where a value is not finite, where a cloud has
-    next to no points, and where a grasp lies far from it.
+    Raises `TacpipeError` if a recording lacks a stream or column, a value is not finite, a cloud has too few points, or
+    a grasp is far from its cloud.
     """
     names = sorted(recordings.recordings)
     shards = [recordings.recordings[name] for name in names]
@@ -91,7 +91,7 @@ def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[.
 
 
 def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
-    """Raise `TacpipeError` if a cloud has fewer than 3 points or lies more than 10 cm from a grasp point."""
+    """Raise `TacpipeError` if a cloud has fewer than 3 points or a contact point is more than 10 cm away from it."""
     if len(cloud) < MIN_POINTS:
         raise TacpipeError(
             f"{name} has a cloud of {len(cloud)} points; at least {MIN_POINTS} are needed. Segment it again or leave it out."

@@ -1,4 +1,4 @@
-"""The headline of touch, the RMSE of one target on known or novel objects, and the names of the parts of a result."""
+"""Compute the headline of touch, the RMSE of a target on known or novel objects, and define names of result parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TARGETS = {
     "e_th": "electrodes thumb",
     "e_mf": "electrodes middle finger",
 }
-BASELINES = {  # names in tables of the predictors that every result has
+BASELINES = {  # predictors in every result -> names in tables
     "constant": "constant",
     "object_mean": "mean of the object",
     "nearest_in_time": "mean of the nearest in time",
@@ -37,10 +37,11 @@ def headline(
     objects: Mapping[str, str],
     runs: int = 1,
 ) -> Headline | None:
-    """Return how a method compares with its baselines on one target.
+    """Return the comparison of a method with its baselines on one target.
 
-    Errors are, by seed and grasp, the sum of squares as fractions of the target's range, which is ``range_counts`` wide, and
-    the number of values that were summed. Grasps are drawn anew where objects are known, else ``objects`` (by grasp).
+    Errors are stored by seed and grasp as (sum of squares, number of values), the squares in fractions of the target's
+    range ``range_counts``. The bootstrap resamples grasps if objects are known, otherwise ``objects`` (grasp ->
+    object).
     """
     drawn = None if known_objects else objects
     compared = {BASELINES.get(name, name.replace("_", " ")): _sums(sums) for name, sums in baselines.items() if sums}
@@ -63,7 +64,7 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
 
 
 def measure(range_counts: float, cluster: str) -> Measure:
-    """Return how sums of squares and numbers of values become errors on a target whose range is ``range_counts`` wide."""
+    """Return the conversion of sums of squares and numbers of values to errors, for a target with this range."""
 
     def rmse(sums: AnyFloats) -> AnyFloats:
         return np.sqrt(np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1), np.nan))
@@ -91,7 +92,7 @@ def measure(range_counts: float, cluster: str) -> Measure:
     )
 
 
-COVERAGE = "coverage.parquet"  # each value of each grasp, with the band that a calibrated model predicted
-PREDICTIONS = "predictions"  # the recording; each name below is a stream of it, with the same grasps as rows
+COVERAGE = "coverage.parquet"  # each value of each grasp, with its band predicted by a calibrated model
+PREDICTIONS = "predictions"  # recording with one stream per name below; all streams have the same grasps as rows
 GRASPS, TRUE, MODEL = "grasps", "true", "model"
-CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # the baselines
+CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # baselines

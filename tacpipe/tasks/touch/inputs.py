@@ -1,4 +1,4 @@
-"""The inputs of networks: points drawn from the cloud of a grasp or about its contacts, and numbers of the grasp."""
+"""Build network inputs: points sampled from a grasp's cloud or near its contacts, and numeric features of the grasp."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ WRISTS = ("given", "estimated")
 
 @dataclass(frozen=True)
 class CloudInputs:
-    """Options of the inputs: one of the letter's six modes, how many points are drawn, their scale and rotation."""
+    """Input options: one of the six modes of the letter, number of points, normalisation and rotation."""
 
     mode: str
     points: int
     normalisation: str
-    rotation_deg: float = 0.0  # largest angle of the random turn about each axis, in training
+    rotation_deg: float = 0.0  # maximum angle of the random training rotation about each axis
     wrist: str = "given"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Raise `TacpipeError` for invalid options."""
         for name, choices in (("mode", MODES), ("normalisation", NORMALISATIONS), ("wrist", WRISTS)):
             if getattr(self, name) not in choices:
                 label = "inputs" if name == "mode" else name
@@ -52,58 +52,61 @@ class CloudInputs:
 
     @property
     def coloured(self) -> bool:
-        """True if colours are read."""
+        """Whether colours are read."""
         return self.mode.startswith("rgb")
 
     @property
     def channels(self) -> int:
-        """Numbers of a point."""
+        """Number of values per point."""
         return 6 if self.coloured else 3
 
     @property
     def posed(self) -> bool:
-        """True if the wrist's rotation is read."""
+        """Whether the wrist rotation is read."""
         return self.mode.endswith("pose")
 
     @property
     def grasp_numbers(self) -> int:
-        """Numbers of the grasp: none, both contact points, or these and the wrist's rotation."""
+        """Number of grasp features: 0, both contact points, or these and the wrist rotation."""
         return 15 if self.posed else 6 if self.mode.endswith("cont") else 0
 
     def sources(self, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]) -> CloudSources:
-        """Return clouds and grasps to draw from. Raises `TacpipeError` if one lacks what is read."""
+        """Return a sampler of these clouds and grasps. Raises `TacpipeError` if one lacks an input."""
         return CloudSources(self, names, clouds, grasps)
 
 
 class CloudSources:
-    """Clouds and grasps to draw from."""
+    """Samples points of clouds with grasps."""
 
     def __init__(
         self, inputs: CloudInputs, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
     ) -> None:
-        """Take clouds and grasps; raises `TacpipeError` if one has too few points, no colours or no wrist."""
+        """Store clouds and grasps.
+
+        Raises `TacpipeError` if a cloud has too few points or no colours, or a grasp has no wrist.
+        """
         self.inputs, self.clouds, self.grasps = inputs, clouds, grasps
         for name, cloud, grasp in zip(names, clouds, grasps, strict=True):
             _check(inputs, name, cloud, grasp)
 
     @cached_property
     def extents(self) -> list[Extent]:
-        """How far each cloud reaches."""
+        """Extent of each cloud."""
         return [Extent.of(cloud) for cloud in self.clouds]
 
     @cached_property
     def wrists(self) -> list[Floats | None]:
-        """Each wrist's rotation, or its estimate."""
+        """Rotation of each wrist, or its estimate."""
         if self.inputs.wrist == "estimated":
             return [frame.estimated_wrist(grasp) for grasp in self.grasps]
         return [grasp.wrist for grasp in self.grasps]
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
-        """Return points (cloud, point, channel) and the grasps' numbers (cloud, number), drawn and turned anew."""
+        """Return sampled, randomly rotated points (cloud, point, channel) and grasp features (cloud, number)."""
         return self._arrays([(index, rng) for index in indices], self.inputs.rotation_deg)
 
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
-        """Return the same without turns; which points are drawn depends on the cloud's points and on ``visit`` alone."""
+        """Return the same arrays without rotation; the sample depends only on the number of points and on ``visit``."""
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].points_m.tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)), 0.0)
 
@@ -149,13 +152,13 @@ def _check(inputs: CloudInputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
         )
 
 
-UNIT_M = 0.05  # length that is 1 for the network
-PLACES = 3  # about g1, about g2, the whole
+UNIT_M = 0.05  # length that is scaled to 1
+PLACES = 3  # patch about g1, patch about g2, whole cloud
 
 
 @dataclass(frozen=True)
 class PatchOptions:
-    """How large patches are, how many points are drawn of each, and whether colours and the grasp's place are read."""
+    """Patch options: radius, number of points per patch, and whether colours and grasp position are read."""
 
     points: int
     radius_m: float
@@ -163,7 +166,7 @@ class PatchOptions:
     placed: bool
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Raise `TacpipeError` for invalid options."""
         if self.points < 1:
             raise TacpipeError(f"points is {self.points}; it must be 1 or more.")
         if not self.radius_m > 0:
@@ -171,28 +174,28 @@ class PatchOptions:
 
     @property
     def channels(self) -> int:
-        """Numbers of a point."""
+        """Number of values per point."""
         return 6 if self.coloured else 3
 
     @property
     def grasp_numbers(self) -> int:
-        """Numbers of the grasp: its opening, and where it is: both points, approach and closing."""
+        """Number of grasp features: the opening and, with position, both points, approach and closing direction."""
         return 13 if self.placed else 1
 
     def sources(self, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]) -> PatchSources:
-        """Return clouds and grasps to draw patches from. Raises `TacpipeError` if colours are read and one has none."""
+        """Return a sampler of patches of these clouds. Raises `TacpipeError` if a cloud lacks required colours."""
         return PatchSources(self, names, clouds, grasps)
 
 
 class PatchSources:
-    """Clouds and grasps to draw patches from."""
+    """Samples patches of clouds with grasps."""
 
     def __init__(
         self, patches: PatchOptions, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
     ) -> None:
-        """Take clouds and grasps; raises `TacpipeError` if colours are to be read and a cloud has none."""
+        """Store clouds and grasps. Raises `TacpipeError` if a cloud lacks required colours."""
         self.patches = patches
-        self.clouds: list[Float32s] = []  # (point, channel) each
+        self.clouds: list[Float32s] = []  # each of shape (point, channel)
         self.near: list[list[Indices]] = []  # indices of points near g1 and near g2
         if patches.coloured:
             require_colours(names, clouds)
@@ -206,11 +209,11 @@ class PatchSources:
         self.numbers = _numbers(grasps, patches.placed)
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
-        """Return patches (cloud, patch, point, channel) and the grasps' numbers (cloud, number), drawn anew."""
+        """Return sampled patches (cloud, patch, point, channel) and grasp features (cloud, number)."""
         return self._arrays([(index, rng) for index in indices])
 
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
-        """Return the same; which points are drawn depends on those about the grasp and on ``visit`` alone."""
+        """Return the same arrays; the sample depends only on the points near the grasp and on ``visit``."""
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)))
 
@@ -225,7 +228,7 @@ class PatchSources:
 
 
 def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
-    """Raise `TacpipeError` naming the first whose cloud has no colours."""
+    """Raise `TacpipeError` with the name of the first cloud that has no colours."""
     for name, cloud in zip(names, clouds, strict=True):
         if cloud.colours is None:
             raise TacpipeError(
@@ -234,14 +237,14 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
 
 
 def _about(points: Floats, place_m: float, radius_m: float) -> Indices:
-    """Return the points within the radius of a contact, or the nearest one where there is none."""
+    """Return the indices of the points within a radius of a contact, or the nearest point if there are none."""
     away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
     inside = np.flatnonzero(away <= radius_m)
     return inside if len(inside) else np.array([int(away.argmin())])
 
 
 def _chosen(total: int, count: int, rng: np.random.Generator) -> Indices:
-    """Return ``count`` draws of ``total``: each at most once as long as they last, then again."""
+    """Return ``count`` random indices below ``total``; an index repeats only after all have been used."""
     if count <= total:
         chosen: Indices = rng.choice(total, count, replace=False, shuffle=False)
         return chosen

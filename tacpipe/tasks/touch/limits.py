@@ -1,15 +1,15 @@
-"""Measure the limits of predicting touch on some grasps: repeatability, number of grasps, information of the grasp.
+"""Measure limits on predicting touch: repeatability, number of grasps, and information in the grasp.
 
-The forests here are those of the architecture ``trees``, with leaves of a fixed size; they are trained and tested by
-cross-validation within known objects, and their skill is 1 - RMSE / RMSE of the constant of all training grasps.
+The forests are those of the architecture ``trees`` with a fixed leaf size. They are cross-validated within known
+objects, and their skill is 1 - RMSE / RMSE of the constant of all training grasps.
 
-Two grasps of one object at the same place differ in their readings by what no camera and no planner states: how hard the
-hand closed, how the skin lay, noise. Half of the mean squared difference of near pairs is at least the variance that
-nothing read of the grasp can explain, because such pairs differ in pose too. So the skill that it leaves is a lower bound on
-what can be reached, not an upper bound. Pairs at larger distances show how fast likeness is lost.
+Two grasps of one object at the same position have different readings because of effects that neither camera nor planner
+measures: closing force, position of the skin, noise. Such pairs also differ slightly in pose, so half of their mean
+squared difference is an upper bound on the unexplainable variance. The remaining skill is therefore a lower bound on
+the achievable skill, not an upper bound. Pairs at larger distances show how fast similarity decreases.
 
-Objects differ in how much their readings vary, and not all of them have near pairs. So differences are compared with
-the variance of the pair's own object, and the ratio is what is carried over to all objects.
+Objects differ in the variance of their readings, and some have no near pairs. So each pair's difference is divided by
+the variance within its object, and this ratio is applied to all objects.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tacpipe.metrics.intervals import Estimate
 from tacpipe.models.forest import Forest
 from tacpipe.tasks.touch.grasps import Grasps
 
-EDGES_MM = (0.0, 6.0, 10.0, 20.0, 40.0, math.inf)  # edges of the classes of distance
+EDGES_MM = (0.0, 6.0, 10.0, 20.0, 40.0, math.inf)  # edges of the distance bins
 RESAMPLES = 500
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -39,13 +39,16 @@ NOTHING = Estimate(math.nan, math.nan, math.nan)
 class Pairs:
     """Pairs of grasps of the same object."""
 
-    first: Indices  # (pair,), numbers of grasps
+    first: Indices  # (pair,), indices of grasps
     second: Indices  # (pair,)
-    distance_mm: Floats  # (pair,): root of the mean of both contacts' squared displacement, in the camera's frame
+    distance_mm: Floats  # (pair,): root mean square displacement of both contacts, in the camera's frame
 
     @classmethod
     def from_contacts(cls, contacts_m: Floats, objects: Sequence[str]) -> Pairs:
-        """Return every pair; ``contacts_m`` are (grasp, finger, axis). Grasps without an object are in none."""
+        """Return all pairs of grasps of the same object; ``contacts_m`` is (grasp, finger, axis).
+
+        Grasps without an object are skipped.
+        """
         first, second = np.triu_indices(len(objects), 1)
         names = np.asarray(objects)
         same = (names[first] == names[second]) & (names[first] != "")
@@ -56,22 +59,21 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Repeatability of one target, from pairs of one class of distance."""
+    """Repeatability of one target, from the pairs of one distance bin."""
 
     pairs: int
-    likeness: (
-        Estimate  # 1 - half the mean squared difference / variance within objects: 1 equal, 0 as unlike as any pair
-    )
-    pair_skill: Estimate  # skill over the constant of a predictor that errs by no more than such pairs differ
+    likeness: Estimate  # 1 - half the mean squared difference / variance within objects; 1 if equal, 0 for random pairs
+    pair_skill: Estimate  # skill over the constant of a predictor whose errors equal the differences of such pairs
 
 
 def repeatability(
     values: Floats, objects: Sequence[str], pairs: Pairs, low_mm: float, high_mm: float, seed: int = 0
 ) -> Repeatability:
-    """Return what pairs at ``low_mm`` or more and less than ``high_mm`` show of values (grasp, value), device counts.
+    """Return the repeatability of values (grasp, value), device counts, from pairs in a distance bin.
 
-    Intervals are the middle 95 % over resampled grasps: a pair counts as often as both of its grasps are drawn. They are
-    NaN without a pair.
+    The bin contains distances of at least ``low_mm`` and less than ``high_mm``. Intervals are the middle 95 % over
+    resampled grasps; a pair's weight is the product of the counts of its two grasps. They are NaN if there are no
+    pairs.
     """
     near = (pairs.distance_mm >= low_mm) & (pairs.distance_mm < high_mm)
     first, second = pairs.first[near], pairs.second[near]
@@ -101,10 +103,10 @@ def repeatability(
 
 
 def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, float]:
-    """Return the variance of values (grasp, value) about the mean of each object (object,), and about that of all.
+    """Return the variances of values (grasp, value) about each object's mean (object,) and about the overall mean.
 
-    ``kind`` (grasp,) is the number of the object; ``weight`` (grasp,) how often each grasp counts. Variances of the values
-    are added; that within an object is unbiased, and 0 where the object counts once or never.
+    ``kind`` (grasp,) contains object indices, and ``weight`` (grasp,) the count of each grasp. Variances are summed
+    over values. The variance within an object is unbiased, and 0 if the object's total count is below 2.
     """
     objects = int(kind.max()) + 1
     counts = np.bincount(kind, weight, objects)
@@ -122,7 +124,7 @@ def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, fl
 def table(
     readings: Mapping[str, Floats], contacts_m: Floats, objects: Sequence[str]
 ) -> list[tuple[float, float, dict[str, Repeatability]]]:
-    """Return `repeatability` by class of distance, each with its bounds in mm, and by target."""
+    """Return the bounds of each distance bin in mm and `repeatability` by target."""
     pairs = Pairs.from_contacts(contacts_m, objects)
     return [
         (low, high, {name: repeatability(values, objects, pairs, low, high) for name, values in readings.items()})
@@ -132,38 +134,38 @@ def table(
 
 FOLDS = 5
 LEAF = 4
-SIZES = (2, 4, 8, 16, 32)  # training grasps of each object
+SIZES = (2, 4, 8, 16, 32)  # training grasps per object
 OTHER = {
     "pdc_th": ("pdc_mf", "e_mf"),
     "e_th": ("pdc_mf", "e_mf"),
     "pdc_mf": ("pdc_th", "e_th"),
     "e_mf": ("pdc_th", "e_th"),
 }
-Skills = dict[str, Estimate]  # target to skill
+Skills = dict[str, Estimate]  # target -> skill
 
 
 @dataclass(frozen=True)
 class Point:
     """A point of a learning curve."""
 
-    grasps: int  # most grasps of one object that were trained on
-    trained: float  # grasps trained on, mean over folds
+    grasps: int  # maximum number of training grasps per object
+    trained: float  # number of training grasps, mean over folds
     skill: Skills
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that were measured on grasps."""
+    """Limits measured on a set of grasps."""
 
-    counts: Mapping[str, int]  # grasps by object
-    near: Sequence[tuple[float, float, Mapping[str, Repeatability]]]  # bounds in mm
+    counts: Mapping[str, int]  # number of grasps by object
+    near: Sequence[tuple[float, float, Mapping[str, Repeatability]]]  # distance bins, with bounds in mm
     curve: Sequence[Point]
-    other_finger: Skills  # skills of forests that also read the other finger's reading
+    other_finger: Skills  # skills of forests that also get the other finger's reading
     draws: int
     trees: int
 
     def to_json(self) -> Json:
-        """Return all of it for JSON; NaN is null, and so is the upper bound of the last class of distance."""
+        """Return all limits for JSON; NaN and the upper bound of the last distance bin become null."""
         return {
             "grasps": dict(self.counts),
             "draws": self.draws,
@@ -196,10 +198,10 @@ def limits(
     seed: int = 0,
     advance: Callable[..., None] | None = None,
 ) -> Limits:
-    """Return what limits the prediction of touch on grasps with readings.
+    """Return the limits of predicting touch on grasps with readings.
 
-    ``draws`` is how often folds and training grasps are drawn anew; ``advance`` is called `steps` times. Raises
-    `TacpipeError` if an object has fewer than five grasps, one for each fold, or where grasps have no object.
+    ``draws`` is the number of random choices of folds and training grasps. ``advance`` is called `steps` times. Raises
+    `TacpipeError` if grasps have no object, or an object has fewer than five grasps, one per fold.
     """
     counts = {name: grasps.objects.count(name) for name in sorted(set(grasps.objects))}
     rarest = min(counts, key=lambda name: counts[name], default="")
@@ -220,13 +222,13 @@ def limits(
 
 
 def steps(sizes: Iterable[int], draws: int) -> int:
-    """Return how often `limits` calls ``advance`` at most."""
+    """Return the maximum number of calls of ``advance`` by `limits`."""
     return (len(set(sizes)) + 1) * draws * FOLDS
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """Cross-validation of forests on some grasps."""
+    """Cross-validation of forests on a set of grasps."""
 
     grasps: Grasps
     rows: Floats  # (grasp, feature)
@@ -236,12 +238,12 @@ class _Trial:
     advance: Callable[..., None]
 
     def point(self, size: int) -> Point:
-        """Return the skill where ``size`` grasps of each object are trained on."""
+        """Return the learning-curve point for ``size`` training grasps per object."""
         skill, trained = self._skills(size, dict.fromkeys(self.grasps.readings, self.rows), f"{size} grasps an object")
         return Point(size, trained, skill)
 
     def other_finger(self) -> Skills:
-        """Return the skill of forests that also read what the other finger measured, on all training grasps."""
+        """Return the skill of forests that also read the other finger, trained on all training grasps."""
         readings = self.grasps.readings
         rows = {
             name: np.concatenate(
@@ -279,7 +281,7 @@ class _Trial:
 
 
 def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
-    """Return the fold of each grasp (grasp,), 0 to 4, the grasps of each object spread evenly over all."""
+    """Return the fold (grasp,), 0 to 4, of each grasp, with each object's grasps distributed evenly over folds."""
     names = np.asarray(objects)
     folds = np.zeros(len(names), np.int64)
     for name in sorted(set(objects)):
@@ -289,7 +291,7 @@ def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
 
 
 def drawn(candidates: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
-    """Return those of the grasps ``candidates`` (grasp,) that train: ``size`` of each object, or all that it has."""
+    """Return ``size`` random grasps of each object among ``candidates`` (grasp,), or all if it has fewer."""
     names = np.asarray(objects)[candidates]
     return np.concatenate([rng.permutation(candidates[names == name])[:size] for name in sorted(set(names))])
 

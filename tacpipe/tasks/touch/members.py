@@ -1,7 +1,6 @@
-"""The members of a model of touch, each of which predicts some targets, and the training of its networks.
+"""Members of a touch model, which predict a subset of the targets each, and the training of its networks.
 
-The mean of the members is the model's prediction. A network learns the values of a grasp from points that are drawn at each
-visit.
+The model's prediction is the mean over members. Networks are trained on points that are sampled anew at each visit.
 """
 
 from __future__ import annotations
@@ -27,36 +26,36 @@ from tacpipe.training.following import Line, Validated
 from tacpipe.training.scaling import Affine
 
 LOSSES = ("rmse", "balanced")
-EPSILON = 1e-6  # added under the root, as in the group's published code
-WATCHED = 64  # grasps of a batch when nothing is learned
+EPSILON = 1e-6  # added inside the square root, as in the group's published code
+WATCHED = 64  # batch size in validation
 SEEDS = 2**62
 
 
 class Drawn(Protocol):
-    """A source of drawn points: `CloudSources` or `PatchSources` of `tacpipe.tasks.touch.inputs`."""
+    """Sampler of points: `CloudSources` or `PatchSources` of `tacpipe.tasks.touch.inputs`."""
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
-        """Return points and the grasps' numbers, drawn anew."""
+        """Return randomly sampled points and the features of the grasps."""
 
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
-        """Return the same as at every other time with this ``visit``."""
+        """Return points and features that are the same for equal ``visit``."""
 
 
 @dataclass(frozen=True)
 class ScaledGrasps:
-    """Grasps to learn from or to watch, and their scaled readings."""
+    """Grasps for training or validation, with their scaled readings."""
 
     sources: Drawn
     values: Tensor  # (grasp, value)
 
     def __len__(self) -> int:
-        """Return how many grasps there are."""
+        """Return the number of grasps."""
         return len(self.values)
 
 
 @dataclass(frozen=True)
 class TouchWork:
-    """The work of a network of touch; ``weights`` (value,) are those of each value in the loss ``balanced``."""
+    """Training of a touch network; ``weights`` (value,) are the weights of values in the ``balanced`` loss."""
 
     training: ScaledGrasps
     watched: ScaledGrasps
@@ -65,7 +64,7 @@ class TouchWork:
     weights: Tensor
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be learned."""
+        """Raise `TacpipeError` for an invalid loss or batch size, or fewer than two training grasps."""
         if self.loss_name not in LOSSES:
             raise TacpipeError(f"loss is {self.loss_name!r}; it must be {' or '.join(LOSSES)}.")
         if self.batch < 2:
@@ -76,7 +75,7 @@ class TouchWork:
             raise TacpipeError(f"There are {len(self.training)} grasps to learn from; there must be 2 or more.")
 
     def batches(self, epoch: int) -> list[Tensor]:
-        """Return indices of all training grasps, shuffled; a single one that is left over joins the batch before it."""
+        """Return shuffled batches of indices of all training grasps; a single leftover grasp joins the previous batch."""
         shuffled = torch.randperm(len(self.training))
         sizes = [self.batch] * (len(shuffled) // self.batch)
         remainder = len(shuffled) % self.batch
@@ -87,19 +86,19 @@ class TouchWork:
         return list(torch.split(shuffled, sizes))
 
     def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
-        """Return the loss of the grasps with these indices, whose points are drawn now, and their number."""
+        """Return the loss of a batch of grasps with newly sampled points, and the batch size."""
         rng = np.random.default_rng(int(torch.randint(SEEDS, (1,))))
         arrays = self.training.sources.draw(batch.tolist(), rng)
         return self._loss(output(model, arrays), self.training.values[batch]), len(batch)
 
     def watch(self, model: nn.Module) -> Validated:
-        """Return the loss over all watched grasps, always with the same points."""
+        """Return the loss over all validation grasps, with points that do not change between epochs."""
         predicted = predictions(model, self.watched.sources, len(self.watched), draws=1)
         values = self.watched.values
         return {"val_loss": float(self._loss(torch.from_numpy(predicted).to(values), values))}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
-        """Return the loss of what is watched."""
+        """Return the validation loss as the rank of an epoch."""
         return {"": (float(line["val_loss"]),)}
 
     def _loss(self, predicted: Tensor, values: Tensor) -> Tensor:
@@ -115,14 +114,14 @@ class TouchWork:
 
 
 def output(model: nn.Module, arrays: Arrays) -> Tensor:
-    """Return the output of a network for points and numbers (grasp, value), on the device of its weights."""
+    """Return a network's output (grasp, value) for points and features, on the device of its weights."""
     device = next(model.parameters()).device
     values: Tensor = model(*(torch.from_numpy(array).to(device) for array in arrays))
     return values
 
 
 def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Float32s:
-    """Return the mean over ``draws`` of what a network makes of the first ``count`` grasps, (grasp, value), scaled."""
+    """Return the network's predictions for the first ``count`` grasps, averaged over ``draws``: (grasp, value), scaled."""
     rows = []
     with torch.no_grad():
         for first in range(0, count, WATCHED):
@@ -132,32 +131,32 @@ def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Flo
     return torch.cat(rows).cpu().numpy()
 
 
-MAX_POINTS = 100_000  # points of a cloud, and times that they are drawn
+MAX_POINTS = 100_000  # maximum number of points per cloud and of draws
 
 
 class Member(Protocol):
-    """A part of a model that predicts targets of its own."""
+    """A part of a model that predicts some of its targets."""
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Names of the targets that it predicts."""
+        """Names of the predicted targets."""
 
     def predict(self, grasps: Grasps) -> Floats:
-        """Return the values of its targets side by side (grasp, value), device counts."""
+        """Return the values of all targets of this member as columns (grasp, value), device counts."""
 
 
 @dataclass(frozen=True)
 class ForestMember:
-    """Forests that read the grasp's geometry; where several predict a target their mean counts."""
+    """Forests on the geometry of the grasp; if several predict the same target, their mean is used."""
 
     targets: tuple[str, ...]
-    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it predicts, side by side
+    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # (predicted targets, forest)
     coloured: bool
     placed: bool
     features: tuple[str, ...]
 
     def predict(self, grasps: Grasps) -> Floats:
-        """Return the values of its targets (grasp, value), device counts."""
+        """Return the values of all targets of this member as columns (grasp, value), device counts."""
         if self.coloured:
             require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
@@ -169,7 +168,7 @@ class ForestMember:
 
 @dataclass(frozen=True)
 class NetworkMember:
-    """A network that reads points, and the scale of its output."""
+    """A network on points, and the scale of its output."""
 
     targets: tuple[str, ...]
     network: nn.Module
@@ -177,7 +176,7 @@ class NetworkMember:
     params: PointNetwork
 
     def predict(self, grasps: Grasps) -> Floats:
-        """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
+        """Return the values of its targets (grasp, value) in device counts, averaged over ``draws`` of the params."""
         values = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
         if values.shape != (shape := (len(grasps), len(self.scale.offset))):
             raise TacpipeError(f"The network returns {values.shape}; it must return (cloud, value), here {shape}.")
@@ -185,13 +184,13 @@ class NetworkMember:
 
 
 def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
-    """Return values side by side (grasp, value) by target."""
+    """Split the columns of values (grasp, value) by target."""
     ends = np.cumsum([biotac_sp.width(target) for target in targets])[:-1]
     return dict(zip(targets, np.split(values, ends, axis=1), strict=True))
 
 
 def averaged(predictions: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
-    """Return by target (grasp, value) the mean of several predictions, each its targets' values side by side."""
+    """Return the mean of several predictions by target (grasp, value); each contains its targets' values as columns."""
     by_target: dict[str, list[Floats]] = {}
     for targets, values in predictions:
         for target, target_values in parted(values, targets).items():
@@ -200,7 +199,7 @@ def averaged(predictions: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, F
 
 
 def units(values: Floats, targets: Sequence[str]) -> Floats:
-    """Return what to divide each of the values (grasp, value) by so that every target counts the same, (value,)."""
+    """Return divisors (value,) of values (grasp, value) that give every target the same weight."""
     spread = values.std(axis=0)
     widths = np.concatenate([[biotac_sp.width(target)] * biotac_sp.width(target) for target in targets])
     unit: Floats = np.where(spread > 0, spread, 1.0) * np.sqrt(widths)
@@ -208,7 +207,7 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
 
 
 def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
-    """Return an untrained network for params and targets. Raises `TacpipeError` if params build something else."""
+    """Return an untrained network. Raises `TacpipeError` if the params build anything else."""
     values = sum(biotac_sp.width(target) for target in targets)
     read = params.point_inputs
     built = params.build(PointNetworkShape(read.channels, read.grasp_numbers, values))
@@ -220,12 +219,12 @@ def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
 
 
 def checked(params: PointNetwork) -> None:
-    """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
+    """Raise `ValueError` for sizes far above those of any params of `tacpipe train touch`."""
     for name, value in (("draws", params.draws), ("points", params.points)):
         if not 0 < value <= MAX_POINTS:
             raise ValueError(f"{name} is {value}")
 
 
 def sources(params: PointNetwork, grasps: Grasps) -> Drawn:
-    """Return where a network's points are drawn from. Raises `TacpipeError` if a grasp lacks what it reads."""
+    """Return the point sampler of a network. Raises `TacpipeError` if a grasp lacks an input."""
     return params.point_inputs.sources(grasps.names, grasps.clouds, grasps.grasps)

@@ -1,4 +1,4 @@
-"""Predict with a loaded model of touch, for recordings or for a cloud and a grasp, and calibrate its quantiles."""
+"""Predict with a loaded touch model, for recordings or for a cloud and a grasp, and calibrate its quantiles."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
 def predict(
     model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = (), quantiles: Sequence[int] = ()
 ) -> Result:
-    """Return one table, ``predictions``: a row a grasp with the recording's name and all predicted values, device counts.
+    """Return one table, ``predictions``: one row per grasp with recording name and predicted values in device counts.
 
-    Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` if
-    there are no recordings or they are not what the model reads. ``quantiles`` (percent), of a calibrated model, add columns
-    such as ``e_mf_07_q90``.
+    Grasps need no reading. ``steps`` is for tasks that predict over time and has no effect here. ``quantiles``
+    (percent) of a calibrated model add columns such as ``e_mf_07_q90``. Raises `TacpipeError` if there are no
+    recordings or they lack inputs of the model.
     """
     table = predictions(Predictor.load(model), recordings, quantiles)
     return Result({PREDICTIONS: RecordingOutput(table, simulated(recordings))})
 
 
 def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
-    """Return the table of `predict`, which raises the same errors."""
+    """Return the table of `predict`; raises the same errors."""
     at = predictor.quantiles_of(quantiles)[1] if quantiles else []
     grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
@@ -61,7 +61,7 @@ def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[i
 
 
 class TouchModel(Predictor):
-    """Predicts the tactile reading of grasps: of recordings, or of a cloud and a grasp."""
+    """Predicts the tactile readings of grasps, from recordings or from a cloud and a grasp."""
 
     @overload
     def predict(self, recordings: Dataset | Recording, /, *, quantiles: Sequence[int] = ()) -> pa.Table: ...
@@ -72,16 +72,16 @@ class TouchModel(Predictor):
     def predict(
         self, recordings: Dataset | Recording | Cloud, grasp: Grasp | None = None, /, *, quantiles: Sequence[int] = ()
     ) -> pa.Table | PredictedReading:
-        """Return predicted readings: of a dataset or one of its recordings as a table, of one cloud as `PredictedReading`.
+        """Return predicted readings: a table for a dataset or recording, a `PredictedReading` for a cloud.
 
-        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
-        a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
-        ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as ``e_mf_07_q90``. ``.to_pandas()`` makes
-        a frame of it. Raises `UsageError` if the recordings did not go through the stages that the model was trained
-        behind.
+        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict`
+        writes: one row per grasp with ``recording`` and the predicted values in device counts, such as ``pdc_th`` and
+        ``e_mf_07``, float32. ``quantiles`` (percent, among those of `tacpipe calibrate`) adds columns such as
+        ``e_mf_07_q90``. Convert it to a data frame with ``.to_pandas()``. Raises `UsageError` if the recordings did not
+        pass through the stages that the model was trained behind.
 
-        **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` if the grasp
-        lies far from the cloud, and where either lacks what the model reads.
+        **A cloud and a grasp**, in metres and in the same frame, give the reading of this grasp. Raises `TacpipeError`
+        if the grasp is far from the cloud, or if either lacks an input of the model.
         """
         if isinstance(recordings, Cloud):
             if grasp is None:
@@ -93,7 +93,7 @@ class TouchModel(Predictor):
 
 
 def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, float]:
-    """Return the 50 predicted values of a grasp on a cloud by column, device counts."""
+    """Return the 50 predicted values of a grasp on a cloud: column -> device counts."""
     touch = model.predict(cloud, grasp)
     values: dict[str, float] = {}
     for finger, pressure, electrodes in (("th", touch.pdc_th, touch.e_th), ("mf", touch.pdc_mf, touch.e_mf)):
@@ -105,9 +105,9 @@ def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, flo
 def calibrate(
     model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, validation: Dataset
 ) -> dict[str, bytes]:
-    """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
+    """Return the files of a model with quantiles whose coverage on validation grasps equals their levels.
 
-    Raises `TacpipeError` if the model learned from these validation grasps, and where there are none.
+    Raises `TacpipeError` if there are no validation grasps, or the model was trained on them.
     """
     check_levels(request.quantiles)
     predictor = Predictor.load(model)

@@ -1,6 +1,6 @@
-"""How a model of touch is built and trained: the params of `tacpipe train touch`, one class an architecture.
+"""Params of `tacpipe train touch`, which define how a touch model is built and trained; one class per architecture.
 
-Classes of other packages extend `Patches` or `Pointnet`, which choose what is read of a cloud, and build another network.
+Classes of other packages extend `Patches` or `Pointnet`, which select the inputs, and build another network.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], 
 
 @dataclass(frozen=True)
 class TouchModelParams(ABC):
-    """Params that every model of the task ``touch`` has."""
+    """Params of all touch models."""
 
-    ARCHITECTURES: ClassVar[str] = "touch"  # the task, as entry points name it
+    ARCHITECTURES: ClassVar[str] = "touch"  # name of the task in entry points
     architecture: str = "tree-ensemble"
     targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
     # label of this run in a report, next to others of the same method, as blocked
@@ -74,12 +74,12 @@ class TouchModelParams(ABC):
 
     @property
     def chooses_by_validation(self) -> bool:
-        """True if validation grasps choose something: a network's epoch, or when its training ends."""
+        """Whether validation grasps select a network's epoch or stop its training."""
         return False
 
     @abstractmethod
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
-        """Learn from ``grasps`` and add the members of the model, their tensors and their history to ``model``.
+        """Train on ``grasps`` and add the members, their tensors and their history to ``model``.
 
         `Patches` and `Pointnet` implement it for the networks that an architecture builds.
         """
@@ -87,7 +87,7 @@ class TouchModelParams(ABC):
 
 @dataclass(frozen=True)
 class Trees(TouchModelParams):
-    """Forests over the geometry of a grasp: the best model that we know."""
+    """Forests over the geometry of a grasp: our most accurate model."""
 
     # tree-ensemble: the mean of one forest per target and one of all targets; trees: one forest per target
     architecture: Annotated[
@@ -103,12 +103,12 @@ class Trees(TouchModelParams):
 
     @property
     def coloured(self) -> bool:
-        """True if colours are read."""
+        """Whether colours are read."""
         return self.inputs == "rgb"
 
     @property
     def adds_joint_forest(self) -> bool:
-        """True if one forest of all targets is averaged with the forests of single ones."""
+        """Whether a forest of all targets is averaged with the forests of single targets."""
         return self.architecture == "tree-ensemble"
 
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
@@ -118,7 +118,7 @@ class Trees(TouchModelParams):
 
 @dataclass(frozen=True)
 class PointNetwork(TouchModelParams, ABC):
-    """Params that networks that read points have in common."""
+    """Params of all networks that read points."""
 
     # one network for all targets; else one each, as in the paper
     multi_target: Annotated[bool, StoredAs("together")] = True
@@ -140,38 +140,38 @@ class PointNetwork(TouchModelParams, ABC):
 
     @property
     def chooses_by_validation(self) -> bool:
-        """True if validation grasps choose the epoch of a network, or when its training ends."""
+        """Whether validation grasps select a network's epoch or stop its training."""
         return self.select == "best" or bool(self.patience)
 
     @property
     @abstractmethod
     def point_inputs(self) -> CloudInputs | PatchOptions:
-        """What the network reads of a cloud; `Patches` and `Pointnet` state it."""
+        """Inputs of the network from a cloud, defined by `Patches` and `Pointnet`."""
 
     @abstractmethod
     def build(self, shape: PointNetworkShape) -> nn.Module:
-        """Return the network, of random weights, for what it reads and predicts.
+        """Return a network with random weights for these inputs and outputs.
 
         ``shape`` is a `tacpipe.models.point_networks.PointNetworkShape`.
 
-        It is called as ``network(points, numbers)`` and returns scaled values (cloud, ``shape.values``), those of the
-        targets side by side.
+        The network is called as ``network(points, numbers)`` and returns scaled values (cloud, ``shape.values``), the
+        targets' values as columns.
 
-        - Of an architecture that extends `Patches`, ``points`` are (cloud, 3, point, ``shape.channels``): those about the
-          two contacts, in the axes of the grasp, and the whole cloud; place in metres comes first, then colour.
-        - Of one that extends `Pointnet`, they are the whole cloud, (cloud, point, ``shape.channels``), as ``inputs`` and
-          ``normalisation`` state.
-        - ``numbers`` (cloud, ``shape.numbers``) describe the grasp.
+        - If the architecture extends `Patches`, ``points`` are (cloud, 3, point, ``shape.channels``): patches about the
+          two contacts, in the axes of the grasp, and the whole cloud. Channels are position in metres, then colour.
+        - If it extends `Pointnet`, ``points`` are the whole cloud (cloud, point, ``shape.channels``), as defined by
+          ``inputs`` and ``normalisation``.
+        - ``numbers`` (cloud, ``shape.numbers``) are features of the grasp.
 
-        The task draws points anew at each visit, scales the readings, trains (Adam, the loss and epoch that params choose,
-        checkpoints that resume, bfloat16), averages over ``networks`` and ``draws``, stores weights as safetensors, and
+        The task samples points at each visit, scales the readings, trains (Adam, the loss and epoch selected by params,
+        resumable checkpoints, bfloat16), averages over ``networks`` and ``draws``, stores weights as safetensors, and
         evaluates next to the baselines.
         """
 
 
 @dataclass(frozen=True)
 class Patches(PointNetwork):
-    """Points about both contacts, in the axes of the grasp."""
+    """Networks on points near both contacts, in the axes of the grasp."""
 
     # patches: networks that read points about both contacts
     architecture: Literal["patches"] = "patches"
@@ -185,17 +185,17 @@ class Patches(PointNetwork):
 
     @property
     def point_inputs(self) -> PatchOptions:
-        """Points about both contacts."""
+        """Points near both contacts."""
         from tacpipe.tasks.touch.inputs import PatchOptions
 
         return PatchOptions(self.points, self.radius_mm / 1000, self.inputs == "rgb", self.place)
 
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
-        """Add networks that the shared loop trains: one for all targets or one for each."""
+        """Add networks trained by the shared loop: one for all targets or one for each."""
         grasps.train_networks(self, model)
 
     def build(self, shape: PointNetworkShape) -> nn.Module:
-        """Return the network of patches."""
+        """Return the patch network."""
         from tacpipe.models.point_networks import PatchNetwork
 
         return PatchNetwork(
@@ -244,13 +244,13 @@ class Pointnet(PointNetwork):
 
     @property
     def point_inputs(self) -> CloudInputs:
-        """The whole cloud, with contact points and wrist as ``inputs`` states."""
+        """The whole cloud, with contact points and wrist as selected by ``inputs``."""
         from tacpipe.tasks.touch.inputs import CloudInputs
 
         return CloudInputs(self.inputs, self.points, self.normalisation, self.rotation_deg, self.wrist)
 
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
-        """Add networks that the shared loop trains: one for all targets or one for each."""
+        """Add networks trained by the shared loop: one for all targets or one for each."""
         grasps.train_networks(self, model)
 
     def build(self, shape: PointNetworkShape) -> nn.Module:
@@ -261,14 +261,14 @@ class Pointnet(PointNetwork):
 
 
 Params = TouchModelParams  # params of any architecture
-DEFAULT = TouchModelParams.architecture  # the architecture that is trained if none is named
-PAPER = Pointnet.architecture  # the architecture of the paper
+DEFAULT = TouchModelParams.architecture  # default architecture
+PAPER = Pointnet.architecture  # architecture of the paper
 
 
 class MemberDescription(TypedDict):
-    """A member of a model, which predicts some of its targets."""
+    """Description of a member of a model, which predicts some of its targets."""
 
-    kind: str  # forest or network; a forest has all that follows
+    kind: str  # forest or network; only a forest has the fields below
     targets: list[str]
     groups: NotRequired[list[list[str]]]  # targets of each forest
     features: NotRequired[list[str]]
@@ -278,22 +278,22 @@ class MemberDescription(TypedDict):
 
 
 class GraspQuantiles(TypedDict):
-    """The calibration of a model's quantiles."""
+    """Calibration of a model's quantiles."""
 
-    levels: list[int]  # percent
+    levels: list[int]  # in percent
     method: str
     grasps: int
 
 
 class TouchConfig(ModelConfig):
-    """``config.json`` of a model of the task ``touch``."""
+    """``config.json`` of a touch model."""
 
     split: str
     targets: list[str]
     objects: list[str]
-    counts: dict[str, int]  # grasps by role
+    counts: dict[str, int]  # number of grasps by role
     members: list[MemberDescription]
-    parameters: int | None  # numbers that are learned; None: forests
-    learned_objects: NotRequired[list[str]]  # of each training grasp, for the baselines
-    kept_of_novel: NotRequired[dict[str, float]]  # shrinkage by target
+    parameters: int | None  # number of trainable parameters; None for forests
+    learned_objects: NotRequired[list[str]]  # object of each training grasp, for the baselines
+    kept_of_novel: NotRequired[dict[str, float]]  # shrinkage factor by target
     quantiles: NotRequired[GraspQuantiles]

@@ -1,8 +1,8 @@
-"""Predict the tactile reading of both fingers from a cloud and a grasp, by a trained model or a baseline.
+"""Predict the tactile reading of both fingers from a cloud and a grasp, with a trained model or a baseline.
 
-What a model knows of some objects need not hold for others. So each training object is left out in turn: of what a model
-of the others predicts beyond their constant, the fraction is kept that errs least on it, over all of them. 1 keeps a
-prediction as it is, 0 replaces it by the constant.
+What a model learned from its training objects may not hold for novel ones. So each training object is left out in turn,
+and a model of the other objects predicts it. The difference between prediction and constant is scaled by the factor
+with the least error over all left-out objects: 1 leaves a prediction unchanged, 0 replaces it by the constant.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from tacpipe.tasks.touch.quantiles import ReadingQuantiles
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
-NEIGHBOUR_COUNT = 3  # training grasps whose mean is predicted
+NEIGHBOUR_COUNT = 3  # number of training grasps that are averaged
 
 
 @dataclass(frozen=True)
 class Baselines:
-    """The readings of the training grasps, from which baselines predict."""
+    """Readings of the training grasps, from which baselines predict."""
 
     readings: Mapping[str, Floats]  # target -> (grasp, value), device counts
     objects: tuple[str, ...]
@@ -50,11 +50,11 @@ class Baselines:
 
     @classmethod
     def from_grasps(cls, grasps: Grasps) -> Baselines:
-        """Return the baselines that training grasps give."""
+        """Return the baselines of training grasps."""
         return cls(grasps.readings, grasps.objects, grasps.t_ns)
 
     def check(self) -> None:
-        """Raise `ValueError` if arrays are not as long as there are training grasps, or of another width."""
+        """Raise `ValueError` if the arrays do not match the number of training grasps or the widths of the targets."""
         for name, values in self.readings.items():
             if values.shape != (len(self.objects), biotac_sp.width(name)) or self.t_ns.shape != values.shape[:1]:
                 raise ValueError(f"baselines of {name} are {values.shape} for {len(self.objects)} grasps")
@@ -62,9 +62,9 @@ class Baselines:
     def predict(self, grasps: Grasps) -> dict[str, dict[str, Floats]]:
         """Return each baseline's values by target (grasp, value), device counts.
 
-        ``constant`` predicts the mean of all training grasps; ``object_mean`` that of the grasps of the same object, and the
-        constant where none is or no object is named; ``nearest_in_time`` the mean of the three training grasps nearest in
-        time, which follows a drifting sensor and knows nothing of the grasp.
+        ``constant`` is the mean of all training grasps. ``object_mean`` is the mean of those of the same object, or the
+        constant if there are none. ``nearest_in_time`` is the mean of the three training grasps nearest in time: it
+        follows sensor drift and ignores the grasp.
         """
         names = np.array(self.objects)
         same = [(names == name) & (names != "") for name in grasps.objects]  # (grasp)(training grasp,)
@@ -83,7 +83,7 @@ class Baselines:
         }
 
     def same_reading(self, grasps: Grasps) -> Bools:
-        """Return whether each grasp (grasp,) has a reading of training, to the count: one that was logged twice."""
+        """Return a mask (grasp,) of grasps whose reading equals that of a training grasp, because it was logged twice."""
         before, now = (
             np.concatenate([values[name] for name in self.readings], axis=1)
             for values in (self.readings, grasps.readings)
@@ -92,30 +92,30 @@ class Baselines:
         return np.array([row.tobytes() in training_rows for row in np.asarray(now, np.float64)], bool)
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
-        """Return what `from_tensors` reads, but for the objects' names."""
+        """Return the tensors that `from_tensors` reads; they do not include the objects' names."""
         return {**{f"felt.{name}": values for name, values in self.readings.items()}, "t_ns": self.t_ns}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[np.generic]], objects: tuple[str, ...]) -> Baselines:
-        """Return the baselines that `tensors` wrote."""
+        """Return the baselines stored by `tensors`."""
         readings = {
             name: tensors[f"felt.{name}"].astype(np.float64) for name in biotac_sp.TARGETS if f"felt.{name}" in tensors
         }
         return cls(readings, objects, tensors["t_ns"].astype(np.int64))
 
 
-MIN_OBJECTS = 3  # objects; with two, a model of one is asked about the other
+MIN_OBJECTS = 3  # minimum number of objects; with two, a model of one object would predict the other
 
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How predictions for novel objects are shrunk, by target."""
+    """Shrinkage of predictions for novel objects, by target."""
 
-    factor: Mapping[str, float]  # multiplies the difference between prediction and constant, 0 to 1
+    factor: Mapping[str, float]  # factor of the difference between prediction and constant, 0 to 1
     constant: Mapping[str, Floats]  # (value,), device counts
 
     def apply(self, predicted: Mapping[str, Floats], novel: Bools) -> dict[str, Floats]:
-        """Return predictions (grasp, value) by target, those of the ``novel`` grasps (grasp,) shrunk."""
+        """Return predictions (grasp, value) by target, shrunk for the ``novel`` grasps (grasp,)."""
         shrunk = {}
         for name, values in predicted.items():
             constant = self.constant[name]
@@ -123,13 +123,13 @@ class Shrinkage:
         return shrunk
 
     def tensors(self) -> dict[str, AnyArray]:
-        """Return what `from_tensors` reads."""
+        """Return the tensors that `from_tensors` reads."""
         factors = {f"kept.{name}": np.array([value]) for name, value in self.factor.items()}
         return {**factors, **{f"constant.{name}": values for name, values in self.constant.items()}}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray], targets: Sequence[str]) -> Shrinkage:
-        """Return what `tensors` wrote. Raises `ValueError` for a fraction outside 0 to 1."""
+        """Return the shrinkage stored by `tensors`. Raises `ValueError` for a factor outside 0 to 1."""
         factor = {name: float(tensors[f"kept.{name}"][0]) for name in targets}
         if not all(0 <= value <= 1 for value in factor.values()):
             raise ValueError(f"predictions of novel objects keep {factor}, not 0 to 1")
@@ -141,11 +141,11 @@ def fit_shrinkage(
     objects: Sequence[str],
     predict: Callable[[Bools], Mapping[str, Floats]],
 ) -> Shrinkage:
-    """Return the shrinkage that errs least on training objects left out one by one.
+    """Return the shrinkage with the least error on training objects that are left out one by one.
 
-    ``readings`` are (grasp, value) by target, device counts; ``predict`` returns what a model that was trained on the
-    grasps of a mask (grasp,) predicts for all others, by target (other grasp, value). Raises `UsageError` with fewer than
-    three objects.
+    ``readings`` are (grasp, value) by target, in device counts. ``predict`` gets a mask (grasp,), trains a model on
+    these grasps, and returns its predictions for all others by target (other grasp, value). Raises `UsageError` if
+    there are fewer than three objects.
     """
     names = np.asarray(objects)
     object_names = sorted(set(objects) - {""})
@@ -154,7 +154,7 @@ def fit_shrinkage(
             f"--shrink-novel needs training grasps of at least {MIN_OBJECTS} objects, not {len(object_names)}, since each "
             f"is left out once. Label objects, or leave out --shrink-novel."
         )
-    products = {name: [0.0, 0.0] for name in readings}  # prediction times truth, prediction squared
+    products = {name: [0.0, 0.0] for name in readings}  # sums of prediction times truth, and of prediction squared
     for name in object_names:
         in_training = names != name
         predicted = predict(in_training)
@@ -173,7 +173,7 @@ def fit_shrinkage(
 TASK = "touch"
 CONFIG, WEIGHTS, HISTORY, BASELINES = "config.json", "model.safetensors", "history.jsonl", "baselines.safetensors"
 FOREST, NETWORK = "forest", "network"
-SHRINKAGE = "shrinkage."  # begins the names of its tensors
+SHRINKAGE = "shrinkage."  # prefix of its tensors' names
 NEEDED = {
     **dict.fromkeys(("members", "targets", "objects"), list),
     "params": dict,
@@ -183,10 +183,10 @@ NEEDED = {
 
 @dataclass(frozen=True)
 class PredictedReading:
-    """The reading of both fingers, device counts; NaN for what the model does not predict.
+    """The reading of both fingers in device counts; NaN if the model does not predict it.
 
-    ``th`` is the thumb, ``mf`` the middle finger. A reading at rest is about 2,779 and 1,676 counts of ``pdc``, and 2,400
-    to 3,480 of each electrode; contact raises ``pdc`` and lowers the electrodes under it.
+    ``th`` is the thumb, ``mf`` the middle finger. At rest, ``pdc`` is about 2,779 and 1,676 counts, and each electrode
+    2,400 to 3,480. Contact raises ``pdc`` and lowers the electrodes under it.
     """
 
     pdc_th: float
@@ -197,22 +197,22 @@ class PredictedReading:
 
 @dataclass(frozen=True)
 class Predictor:
-    """A loaded model of touch; `model` adds what reads recordings."""
+    """A loaded touch model; `model` adds the functions that read recordings."""
 
     params: Params
     config: TouchConfig
     members: Sequence[members.Member]
     baselines: Baselines | None
-    chain: OpenedChain | None = None  # the stages that it was trained behind; None: unknown
-    shrinkage: Shrinkage | None = None  # shrinks predictions for objects that it was not trained on
+    chain: OpenedChain | None = None  # stages that the model was trained behind; None if unknown
+    shrinkage: Shrinkage | None = None  # shrinkage for novel objects
     quantiles: ReadingQuantiles | None = None  # None unless `tacpipe calibrate` wrote the model
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the model among these files, as `tacpipe train touch` wrote them.
+        """Return the model in the files that `tacpipe train touch` wrote.
 
-        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
-        that recordings went through the same.
+        ``chain`` contains the stages that it was trained behind, as listed in its manifest. Without it `predict` cannot
+        check that recordings passed through the same stages.
         """
         config: TouchConfig = model_files.tree(files, CONFIG, NEEDED)
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
@@ -239,15 +239,15 @@ class Predictor:
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
-        """Names of the targets that the model predicts."""
+        """Names of the predicted targets."""
         return tuple(self.config["targets"])
 
     def predict_grasps(self, grasps: Grasps) -> dict[str, Floats]:
-        """Return the predicted reading by target (grasp, value), device counts: the mean of the members.
+        """Return the predicted reading by target (grasp, value) in device counts: the mean over members.
 
-        A shrinkage applies to grasps of objects that the model was not trained on.
+        If the model has a shrinkage, it is applied to grasps of novel objects.
 
-        Raises `TacpipeError` if a grasp lacks what the model reads: colours, points, the wrist.
+        Raises `TacpipeError` if a grasp lacks inputs of the model: colours, points, the wrist.
         """
         by_target = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
         predicted = {target: by_target[target] for target in self.targets}
@@ -258,11 +258,14 @@ class Predictor:
         )
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ReadingQuantiles, list[int]]:
-        """Return `tacpipe.tasks.task.quantiles_of` of the model."""
+        """Return `tacpipe.tasks.task.quantiles_of` for this model."""
         return task.quantiles_of(self.quantiles, percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[PredictedReading]:
-        """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""
+        """Return the readings of several grasps on one cloud in one pass.
+
+        `model.TouchModel.predict` describes the arguments.
+        """
         for number, grasp in enumerate(grasps):
             check(f"Grasp {number}" if len(grasps) > 1 else "The grasp", cloud, grasp)
         count = len(grasps)

@@ -1,9 +1,9 @@
-"""Quantiles of predicted readings, for a model of any architecture: their fit, their coverage and their pinball loss.
+"""Fit quantiles of predicted readings for a model of any architecture, and compute their coverage and pinball loss.
 
-Grasps are few, so that no spread can be learned for each: a value's error is measured in units of its own standard
-deviation over training grasps, and of these units the quantiles are those of all values of a target together, each
-calibration grasp weighing the same: split conformal prediction with normalised errors (Papadopoulos, Gammerman and Vovk,
-2008), over groups (`tacpipe.metrics.calibration`).
+There are too few grasps to learn a spread for each one. So errors are divided by the value's standard deviation over
+training grasps, and quantiles are computed over all values of a target, with equal weight for each calibration grasp.
+This is split conformal prediction with normalised errors (Papadopoulos, Gammerman and Vovk, 2008), over groups
+(`tacpipe.metrics.calibration`).
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ Offsets = Mapping[str, Floats]  # target -> (level, value), device counts
 
 @dataclass(frozen=True)
 class ReadingQuantiles:
-    """Offsets of quantiles from a prediction: of the model, of the constant and of the object's mean."""
+    """Offsets of quantiles from the predictions of the model, the constant and the object mean."""
 
-    levels: Floats  # (level,), fractions in ascending order
+    levels: Floats  # (level,), fractions, ascending
     offsets: Mapping[str, Offsets]  # predictor -> offsets
 
     @property
     def percents(self) -> tuple[int, ...]:
-        """The levels of the quantiles in percent, ascending."""
+        """Quantile levels in percent, ascending."""
         return task.percents(self.levels)
 
     def quantiles(self, predicted: Readings, predictor: str = MODEL) -> dict[str, Floats]:
-        """Return quantiles by target (grasp, value, level), device counts, of what a predictor predicts."""
+        """Return the quantiles of a predictor's values by target (grasp, value, level), device counts."""
         offsets = self.offsets[predictor]
         return {target: values[..., None] + offsets[target].T for target, values in predicted.items()}
 
@@ -55,15 +55,15 @@ class ReadingQuantiles:
     def fit(
         cls, levels: Floats, training: Grasps, calibration: Grasps, predicted: Readings, *, promised: bool = False
     ) -> Self:
-        """Return quantiles of the errors of what a model ``predicted`` for the grasps of ``calibration``.
+        """Return quantiles of the errors of a model's ``predicted`` values for the ``calibration`` grasps.
 
-        Those of the constant and of the object's mean, the baselines, are empirical ones of ``training``. Raises
-        `TacpipeError` with too few calibration grasps to promise the levels.
+        Those of the baselines constant and object mean are empirical quantiles of ``training``. Raises `TacpipeError`
+        if there are too few calibration grasps to promise the levels.
         """
         model_offsets, constant_offsets, object_offsets = {}, {}, {}
         for target, values in predicted.items():
             training_values = training.readings[target]
-            unit = np.maximum(training_values.std(axis=0), 1.0)  # a count
+            unit = np.maximum(training_values.std(axis=0), 1.0)  # at least one count
             errors = (calibration.readings[target] - values) / unit
             model_offsets[target] = _quantiles(errors, levels, promised)[:, None] * unit
             constant_offsets[target] = np.quantile(training_values - training_values.mean(axis=0), levels, axis=0)
@@ -71,7 +71,7 @@ class ReadingQuantiles:
         return cls(levels, {MODEL: model_offsets, CONSTANT: constant_offsets, OBJECT_MEAN: object_offsets})
 
     def to_bytes(self) -> bytes:
-        """Return a file that `load` reads."""
+        """Return the file content that `load` reads."""
         tensors: dict[str, AnyArray] = {LEVELS: self.levels}
         for predictor, offsets in self.offsets.items():
             tensors |= {
@@ -82,7 +82,10 @@ class ReadingQuantiles:
 
     @classmethod
     def load(cls, content: bytes, targets: Sequence[str]) -> Self:
-        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` if shapes do not fit."""
+        """Return the quantiles stored by `to_bytes`.
+
+        Raises `TacpipeError` for another file, `ValueError` for wrong shapes.
+        """
         tensors = model_files.arrays(content, FILE)
         offsets = {name: dict(tensors_under(f"{name}.", tensors)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
         for by_target in offsets.values():
@@ -95,10 +98,10 @@ class ReadingQuantiles:
 def measures_by_predictor(
     fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, clusters: Sequence[str]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return measures of the quantiles of grasps that a mask (grasp,) chooses, by predictor, measure and target.
+    """Return quantile measures of the grasps selected by ``mask`` (grasp,), by predictor, measure and target.
 
-    ``pinball`` and ``width`` are in device counts; the interval of ``coverage`` is over ``clusters`` (grasp,), and
-    ``pinball_skill`` is over the constant with its empirical quantiles.
+    ``pinball`` and ``width`` are in device counts. The interval of ``coverage`` is over ``clusters`` (grasp,), and
+    ``pinball_skill`` is relative to the constant with its empirical quantiles.
     """
     measures: dict[str, dict[str, dict[str, float]]] = {}
     names = np.asarray(clusters)[mask]
@@ -116,10 +119,10 @@ def measures_by_predictor(
 def coverage(
     fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools
 ) -> bytes:
-    """Return ``coverage.parquet``: of grasps that a mask (grasp,) chooses a row a predictor and value.
+    """Return ``coverage.parquet`` with one row per grasp selected by ``mask`` (grasp,), predictor and value.
 
-    It states whether the true value lies in the band from the lowest to the highest quantile, how wide that is and the
-    pinball loss, both in device counts; ``is_known`` (grasp,) is whether the model knows the object.
+    Columns: whether the true value is in the band from the lowest to the highest quantile, and the width and pinball
+    loss of the band in device counts. ``is_known`` (grasp,) marks grasps of known objects.
     """
     import pyarrow as pa
 
@@ -158,7 +161,7 @@ def _sums(
     mask: Bools,
     clusters: np.ndarray[Any, np.dtype[np.str_]],
 ) -> list[Sums]:
-    """Return the sums over the values of each cluster of grasps, of a predictor and target."""
+    """Return the sums over the values of each cluster of grasps, for a predictor and target."""
     predictor, target = about
     bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
     truth = grasps.readings[target][mask]
@@ -171,7 +174,7 @@ def _sums(
 
 
 def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
-    """Return the quantile (level,) of errors (grasp, value), each grasp weighing the same."""
+    """Return the quantiles (level,) of errors (grasp, value), with equal weight for each grasp."""
     groups = np.repeat(np.arange(len(errors)), errors.shape[1])
     flat, middle = errors.ravel(), len(levels) // 2
     offsets = np.zeros(len(levels))
@@ -188,7 +191,7 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
 
 
 def _about_objects(values: Floats, objects: Sequence[str]) -> Floats:
-    """Return readings (grasp, value) less the mean of the grasps of the same object."""
+    """Return readings (grasp, value) minus the mean of the grasps of the same object."""
     deviations = np.empty_like(values)
     names = np.array(objects)
     for name in set(objects):

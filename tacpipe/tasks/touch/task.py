@@ -1,4 +1,4 @@
-"""The task ``touch``: which reading a planned grasp would give, from a point cloud."""
+"""Define the task ``touch``: predict the reading of a planned grasp from a point cloud."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
-OBJECTS, GRASPS = 1, 90  # objects of each of six families, grasps of each object
+OBJECTS, GRASPS = 1, 90  # objects per family, of six families; grasps per object
 
 
 def demo(output: Path) -> Demo:
-    """Return the commands from the simulation to the results, which write below ``output``."""
+    """Return the commands of the demo, from simulation to results, which write below ``output``."""
     names = ("pinched", "grasps", "grasps-split", "touch", "touch-results", "pointnet", "pointnet-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["grasps-split"]]
     simulation = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
-    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # the paper has 250 epochs and 750 points
+    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # the paper uses 250 epochs and 750 points
     commands = [
         ["simulate", "touch", *simulation, "-o", place["pinched"]],
         ["segment", "grasps", place["pinched"], "-o", place["grasps"]],
@@ -84,7 +84,7 @@ REQUIREMENTS = Requirements(
 
 
 class TouchTask(Task):
-    """Predicted readings of grasps."""
+    """Predict the readings of grasps."""
 
     name = "touch"
 
@@ -115,14 +115,14 @@ class TouchTask(Task):
         return predict(model.files, recordings, quantiles=request.quantiles)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> TouchModel:
-        """Return the model among ``files``, trained behind the stages of ``chain``."""
+        """Return the model in ``files``, trained behind the stages of ``chain``."""
         from tacpipe.tasks.touch.model import TouchModel
 
         return TouchModel.load(files, chain)
 
     @property
     def short_names(self) -> Mapping[str, str]:
-        """The first words of parts, and the names of targets."""
+        """Short names of result parts and targets."""
         from tacpipe.tasks.touch.headline import PARTS, TARGETS
 
         parts = {text: text.partition(" ")[0] for text in PARTS.values()}
@@ -130,32 +130,32 @@ class TouchTask(Task):
 
     @property
     def calibration(self) -> Calibration:
-        """Quantiles of each value of a reading."""
+        """Calibration by quantiles of each value of a reading."""
         from tacpipe.tasks.touch.model import calibrate
 
         return Calibration("quantiles", calibrate)
 
     @property
     def live(self) -> LiveTask:
-        """Rankings of candidate grasps on request."""
+        """Ranking of candidate grasps on request."""
         from tacpipe.tasks.touch.live.task import TouchLive
 
         return TouchLive()
 
     @property
     def report(self) -> TaskReport:
-        """Errors by target and object, and what the parts of a cloud contribute."""
+        """Report of errors by target and object, and of the contribution of each input."""
         from tacpipe.tasks.touch.report import TouchReport
 
         return TouchReport(self.name)
 
     @property
     def grasp_predictor(self) -> GraspPredictor:
-        """The 50 predicted values of a grasp on a cloud, device counts by column."""
+        """Function that predicts the 50 values of a grasp on a cloud, in device counts by column."""
         from tacpipe.tasks.touch.model import grasp_values
 
         return grasp_values
 
     def demo(self, output: Path) -> Demo:
-        """Return the chain on simulated grasps."""
+        """Return the demo on simulated grasps."""
         return demo(output)

@@ -1,4 +1,4 @@
-"""Train a model of touch: from grasps and params to its files."""
+"""Train a touch model: return its files for grasps and params."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-LEAVES = (2, 4, 8)  # rows of a leaf that are tried
+LEAVES = (2, 4, 8)  # leaf sizes to try
 
 
 @dataclass(frozen=True)
 class TrainingGrasps:
-    """The grasps that an architecture's ``fit`` learns from, and the ways to train that the task offers."""
+    """Grasps for the ``fit`` of an architecture, and the training methods that the task offers."""
 
     training: Grasps
     validation: Grasps | None
     targets: tuple[str, ...]
-    workspace: Path  # folder of the checkpoints of an interrupted training
+    workspace: Path  # folder for checkpoints, so that training can resume
 
     def grow_forests(self, params: Trees, model: FittedModel) -> None:
         """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets."""
@@ -71,14 +71,14 @@ class TrainingGrasps:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """The stored parts of a model, to which an architecture's ``fit`` adds."""
+    """The stored parts of a model, which the ``fit`` of an architecture extends."""
 
-    config: TouchConfig  # holds ``members``, one description for each member
+    config: TouchConfig  # its ``members`` contain one description per member
     tensors: dict[str, Tensor] = field(default_factory=dict)
     history: list[Line] = field(default_factory=list)
 
     def add_member(self, described: MemberDescription, tensors: Mapping[str, Tensor]) -> None:
-        """Add a member of the model: its description, and its tensors by name."""
+        """Add a member with its description and its tensors by name."""
         number = len(self.config["members"])
         self.config["members"].append(described)
         self.tensors.update({f"{number}.{name}": value.clone().contiguous() for name, value in tensors.items()})
@@ -92,11 +92,11 @@ def train(
 ) -> dict[str, bytes]:
     """Return the files of a model trained on the grasps of ``training``.
 
-    Whatever is fitted is fitted on training grasps alone, and on those of ``validation`` too where ``use_validation`` is
-    set and nothing is chosen by them. Raises `TacpipeError` if grasps lack what is to be read or predicted.
+    Everything is fitted on training grasps only; with ``use_validation`` also on those of ``validation``, unless they
+    select something. Raises `TacpipeError` if grasps lack an input or a target.
     """
     requested = CommaList().items(params.targets)
-    targets = tuple(target for target in biotac_sp.TARGETS if target in requested)  # always in one order
+    targets = tuple(target for target in biotac_sp.TARGETS if target in requested)  # fixed order
     training_grasps = grasps_of.read(training)
     if not len(training_grasps):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
@@ -116,7 +116,7 @@ def train(
 
 
 def _config(params: Params, targets: Sequence[str], training: Grasps, validation: Grasps | None) -> TouchConfig:
-    """Return the model's configuration before anything is learned."""
+    """Return the initial configuration of a model, before training."""
     stored = params_of.to_json(params)
     return {
         "task": TASK,
@@ -135,9 +135,9 @@ def _config(params: Params, targets: Sequence[str], training: Grasps, validation
 
 
 def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> None:
-    """Add one forest per target to ``model`` and, in a tree-ensemble, one that predicts all targets by the same cuts.
+    """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets with shared splits.
 
-    Each has the leaves of the least out-of-bag error.
+    The leaf size of each forest minimises the out-of-bag error.
     """
     training, targets = grasps.training, grasps.targets
     if params.coloured:
@@ -178,7 +178,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
 def _forests(
     params: Trees, rows: Floats, readings: Mapping[str, Floats], groups: Sequence[tuple[str, ...]]
 ) -> tuple[list[tuple[tuple[str, ...], Forest]], list[int]]:
-    """Return the forest of each group of targets, which predicts their values side by side, and the sizes of leaves."""
+    """Return a forest for each group of targets, which predicts their values as columns, and the leaf sizes."""
     forests, leaves = [], []
     for group in groups:
         values = np.concatenate([readings[target] for target in group], axis=1)
@@ -191,7 +191,7 @@ def _forests(
 
 
 def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
-    """Return the size of leaves whose trees err least on rows outside of the sample that each was grown on."""
+    """Return the leaf size with the least out-of-bag error."""
     fitting = [leaf for leaf in LEAVES if 2 * leaf <= len(rows)] or LEAVES[:1]
     if len(fitting) == 1:
         return fitting[0]
@@ -200,7 +200,7 @@ def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
 
 
 def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedModel) -> None:
-    """Add networks to ``model``: one for all targets or one for each, and as many of each as ``networks`` is."""
+    """Add networks to ``model``, ``networks`` of each: one for all targets, or one per target."""
     training, validation, targets = grasps.training, grasps.validation, grasps.targets
     if validation is None and params.chooses_by_validation:
         raise TacpipeError(
@@ -248,7 +248,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
 def _work(
     params: PointNetwork, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
 ) -> TouchWork:
-    """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
+    """Return the training of a network; the first of ``parts`` is for training, the second for validation."""
     training, watched = (
         ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(grasps, group))).to(device))
         for drawn, grasps in parts
@@ -261,8 +261,8 @@ def _built(params: PointNetwork, targets: Sequence[str], device: str) -> nn.Modu
 
 
 def _weights_learned(params: PointNetwork, targets: Sequence[str]) -> int:
-    """Return how many numbers a network learns; the running means of batches are none of them."""
-    with torch.device("meta"):  # shapes alone
+    """Return the number of trainable parameters of a network, without running means of batch normalisation."""
+    with torch.device("meta"):  # only shapes are needed
         return sum(weight.numel() for weight in members.network(params, targets).parameters())
 
 
@@ -271,7 +271,7 @@ def _side_by_side(grasps: Grasps, group: Sequence[str]) -> Floats:
 
 
 def _scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
-    """Return the scale of a network's output: the letter's ranges for its loss, else mean and spread of each value."""
+    """Return the output scale: fixed ranges for the letter's loss, otherwise mean and spread of each value."""
     if loss != "rmse":
         return Affine.fit(_side_by_side(training, group), "standard")
     ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])
@@ -279,7 +279,7 @@ def _scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
 
 
 def _weights(group: Sequence[str]) -> Tensor:
-    """Return how much each value counts (value,), so that every target counts the same; their mean is 1."""
+    """Return loss weights (value,) with mean 1 that give every target the same total weight."""
     shares = [1 / biotac_sp.width(target) for target in group for _ in range(biotac_sp.width(target))]
     weights = torch.tensor(shares)
     return weights / weights.mean()

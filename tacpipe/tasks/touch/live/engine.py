@@ -1,4 +1,4 @@
-"""Rank the candidate grasps of live requests, whose clouds and grasps are untrusted, with a model of touch."""
+"""Rank the candidate grasps of untrusted live requests with a touch model."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tacpipe.tasks.touch.live.messages import TouchDescription, TouchMessage
 from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
 
 NPZ = ".npz"
-MAX_NPZ_BYTES = 1 << 28  # limit of an NPZ file
+MAX_NPZ_BYTES = 1 << 28  # maximum size of an NPZ file
 
 
 def requested_grasps(record: Any) -> list[Grasp]:
-    """Return the candidates of a request. Raises `TacpipeError` if one cannot be, with its number."""
+    """Return the candidate grasps of a request. Raises `TacpipeError` with the index of an invalid candidate."""
     candidates = []
     for number, grasp in enumerate(record["grasps"]):
         wrist = None if grasp.get("wrist") is None else np.array(grasp["wrist"], np.float64)
@@ -41,9 +41,9 @@ def requested_grasps(record: Any) -> list[Grasp]:
 
 
 def requested_cloud(record: Any, folder: str, before: Cloud | None) -> Cloud:
-    """Return the cloud of a request: its points, those of a file within ``folder``, or of the request before.
+    """Return the cloud of a request: its inline points, a file in ``folder``, or ``before``, the previous request's cloud.
 
-    Raises `TacpipeError` if there is none, or it cannot be read.
+    Raises `TacpipeError` if there is no cloud or it cannot be read.
     """
     points_or_file = record.get("cloud")
     if points_or_file is None:
@@ -95,18 +95,18 @@ CONTACT, BALANCE, LEVEL = "contact", "balance", "level"
 
 
 class Criterion(NamedTuple):
-    """A criterion of a ranking: the higher the score, the better the grasp."""
+    """A ranking criterion; higher scores are better."""
 
-    text: str  # the criterion as the user gave it
-    score: Callable[[Floats], Floats]  # function of levels (grasp, finger) that returns scores (grasp,)
-    fingers: int  # fingers whose touch must be predicted
+    text: str  # criterion as entered by the user
+    score: Callable[[Floats], Floats]  # maps levels (grasp, finger) to scores (grasp,)
+    fingers: int  # number of fingers whose touch must be predicted
 
 
 def criterion(text: str) -> Criterion:
-    """Return the criterion that an option names. Raises `UsageError` for one that is none.
+    """Return the criterion of an option value. Raises `UsageError` if it is unknown.
 
-    ``contact`` is the mean of both fingers' levels, ``balance`` how little they differ, and ``level:0.4`` how near their
-    mean is to 0.4.
+    ``contact`` is the mean of both fingers' levels, ``balance`` their negative difference, and ``level:0.4`` the
+    closeness of their mean to 0.4.
     """
     name, colon, value = text.partition(":")
     if name == CONTACT and not colon:
@@ -125,10 +125,10 @@ def criterion(text: str) -> Criterion:
 
 
 def criterion_levels(touches: Sequence[PredictedReading]) -> Floats:
-    """Return how much each finger is touched (grasp, finger), thumb first: the mean of two fractions of fixed ranges.
+    """Return each finger's contact level (grasp, finger), thumb first: the mean of two fractions of fixed ranges.
 
-    They are how far the pressure rises within its range, and how far the electrodes fall within theirs, on average; 0 to 1
-    within the ranges of `tacpipe.channels.biotac_sp.RANGES`. What the model does not predict is left out; NaN for nothing.
+    These are the rise of the pressure and the mean fall of the electrodes, 0 to 1 within
+    `tacpipe.channels.biotac_sp.RANGES`. Values that the model does not predict are skipped; NaN if it predicts none.
     """
     by_finger = np.full((len(touches), 2), np.nan)
     for row, touch in enumerate(touches):
@@ -142,7 +142,7 @@ def criterion_levels(touches: Sequence[PredictedReading]) -> Floats:
 
 
 def rank_grasps(scores: Floats) -> list[int]:
-    """Return the place of each grasp, 1 for the highest score; of equal scores the first comes first.
+    """Return the rank of each grasp, 1 for the highest score; ties are ranked in input order.
 
     >>> rank_grasps(np.array([0.2, 0.9, 0.2]))
     [2, 1, 3]
@@ -153,15 +153,18 @@ def rank_grasps(scores: Floats) -> list[int]:
     return places.tolist()
 
 
-WAITING = 16  # requests that wait; of more the oldest are answered no more
+WAITING = 16  # maximum number of queued requests; older ones are dropped
 IDLE_NS = 5_000_000
 
 
 class TouchEngine(Engine):
-    """One live session of a model of touch."""
+    """A live session with a touch model."""
 
     def __init__(self, sensors: Mapping[str, Sensor], predictor: Predictor, criterion: Criterion) -> None:
-        """Take the rig's sensors. Raises `TacpipeError` if none gives requests, or the model predicts too little."""
+        """Store the rig's sensors.
+
+        Raises `TacpipeError` if no sensor sends requests, or the model lacks a target that the criterion needs.
+        """
         super().__init__(sensors)
         self.requests = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, GraspRequests)}
         if not self.requests:
@@ -176,28 +179,28 @@ class TouchEngine(Engine):
         self._predictor, self._criterion = predictor, criterion
         self._framers = {name: sensor.framer() for name, sensor in self.requests.items()}
         self._recorded_streams: set[str] = set()
-        self._waiting: deque[tuple[int, str, bytes]] = deque()  # arrival, stream, request
-        self._clouds: dict[str, Cloud] = {}  # the last one of each stream
+        self._waiting: deque[tuple[int, str, bytes]] = deque()  # arrival, stream and request
+        self._clouds: dict[str, Cloud] = {}  # latest cloud of each stream
 
     def describe(self, model: str) -> TouchDescription:
-        """Return what its messages are."""
+        """Return the description of the session's messages."""
         return TouchDescription(self._predictor.targets, self._criterion.text, model)
 
     def begin_recording(self, offset_ns: int) -> None:
-        """Await the streams of requests."""
+        """Expect request streams."""
         self._recorded_streams = set()
 
     def end_recording(self) -> None:
-        """Drop the requests that wait."""
+        """Drop queued requests."""
         super().end_recording()
         self._waiting.clear()
 
     def begin_stream(self, stream: str) -> None:
-        """Answer requests of a stream from now on."""
+        """Start to answer the requests of a stream."""
         self._recorded_streams.add(stream)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Keep the requests of a stream; of more than `WAITING` the oldest are dropped."""
+        """Queue the requests of a stream; beyond `WAITING`, the oldest are dropped."""
         if stream not in self.requests or stream not in self._recorded_streams or not self.running:
             return
         runs, _ = self._framers[stream].feed(chunks)
@@ -208,11 +211,11 @@ class TouchEngine(Engine):
             self.skipped += 1
 
     def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock."""
+        """Return the monotonic time of the next call of `step`."""
         return now_ns if self._waiting else now_ns + IDLE_NS
 
     def step(self, now_ns: int) -> list[TouchMessage]:
-        """Return the answer to the request that has waited longest."""
+        """Return the response to the oldest queued request."""
         if not self._waiting or self._offset_ns is None:
             return []
         t_ns, stream, text = self._waiting.popleft()
@@ -238,5 +241,5 @@ class TouchEngine(Engine):
 
 
 def values(touches: list[PredictedReading]) -> Any:
-    """Return touches as `touch_messages.COLUMNS` (grasp, value)."""
+    """Return predicted readings as an array (grasp, value) with the columns `touch_messages.COLUMNS`."""
     return np.array([[touch.pdc_th, touch.pdc_mf, *touch.e_th, *touch.e_mf] for touch in touches], np.float64)

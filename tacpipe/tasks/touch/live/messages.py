@@ -1,4 +1,4 @@
-"""Declare the messages of a session with a model of touch: the ranking of the candidate grasps of a request."""
+"""Define the messages of a session with a touch model: the ranking of a request's candidate grasps."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, Value, latency_values
 
-COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # values of a touch
-TOUCH = "touch"  # the recorded stream, one row per grasp
+COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # values of a reading
+TOUCH = "touch"  # name of the recorded stream; one row per grasp
 ORDER = ("request", "grasp", "rank")
 SCORES = ("score", "level_th", "level_mf")
 
@@ -76,29 +76,29 @@ DECLARATION = Declaration(
 
 
 class CandidateJson(TypedDict):
-    """A candidate of a request, in its message."""
+    """A candidate of a request, as JSON."""
 
     grasp: int
     rank: int
     score: float | None
     level_th: float | None
     level_mf: float | None
-    touch: dict[str, float | None]  # by column, device counts
+    touch: dict[str, float | None]  # column -> device counts
 
 
 @dataclass
 class TouchMessage(messages.Message):
-    """The ranking of the candidates of one request, or why there is none."""
+    """The ranking of a request's candidates, or the reason why it is missing."""
 
     seq: int
-    t_ns: int  # arrival of the request, UTC as the recording has it
-    request: int  # its number, as it was sent
+    t_ns: int  # arrival of the request, UTC time of the recording
+    request: int  # request number from the client
     criterion: str
-    touch: Floats | None = None  # (grasp, value), `COLUMNS` in device counts; NaN for what the model does not predict
+    touch: Floats | None = None  # (grasp, value) in the order of `COLUMNS`, device counts; NaN if not predicted
     levels: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # (grasp, finger)
     scores: Floats = field(default_factory=lambda: np.zeros(0))  # (grasp,)
     ranks: tuple[int, ...] = ()  # rank of each grasp, 1 for the best
-    cause: str = ""  # why nothing is ranked
+    cause: str = ""  # reason why there is no ranking
     made_from_t_ns: int = 0
     latency_ms: float = math.nan
     compute_ms: float = math.nan
@@ -108,23 +108,23 @@ class TouchMessage(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """True if candidates are ranked."""
+        """Whether there is a ranking."""
         return self.touch is not None
 
     @property
     def states(self) -> Mapping[str, str]:
-        """The best grasp of the request."""
+        """The best grasp of the request, for display."""
         best = f"grasp {self.ranks.index(1)} of {len(self.ranks)}" if self.ranks else "unknown"
         return {f"request {self.request}": best}
 
     @property
     def best(self) -> int | None:
-        """The number of the best grasp."""
+        """Index of the best grasp."""
         return self.ranks.index(1) if self.ranks else None
 
     @property
     def candidates(self) -> list[CandidateJson] | None:
-        """Each grasp as JSON has it."""
+        """All grasps, as JSON."""
         return None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))]
 
     def _candidate(self, row: int) -> CandidateJson:
@@ -142,7 +142,7 @@ class TouchMessage(messages.Message):
 
     @property
     def best_grasp(self) -> Float32s:
-        """The best grasp with its score and levels, and how many grasps there are (5,)."""
+        """Index, score and levels of the best grasp, and the number of grasps (5,)."""
         best = self.best
         if best is None:
             return np.array([-1, np.nan, np.nan, np.nan, 0], np.float32)
@@ -150,7 +150,7 @@ class TouchMessage(messages.Message):
 
     @property
     def order(self) -> Int64s:
-        """Request, number and rank of each grasp (grasp, 3)."""
+        """Request number, index and rank of each grasp (grasp, 3)."""
         return np.array([[self.request, row, rank] for row, rank in enumerate(self.ranks)], np.int64)
 
     @property
@@ -165,22 +165,22 @@ class TouchMessage(messages.Message):
 
 @dataclass(frozen=True)
 class TouchDescription(messages.Description):
-    """Describes the messages of a session with a model of touch."""
+    """Description of the messages of a session with a touch model."""
 
     targets: tuple[str, ...]
     criterion: str
     model: str
-    rate_hz: float = 0.0  # one answer per request
+    rate_hz: float = 0.0  # 0, because there is one response per request
     declaration: ClassVar[Declaration] = DECLARATION
     answers: ClassVar[str] = "rankings"
 
     @property
     def sizes(self) -> Sizes:
-        """The names of the predicted values."""
+        """Names of the predicted values."""
         return Sizes(COLUMNS)
 
     def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+        """Return the description as a dict for JSON and msgpack."""
         return {
             "version": VERSION,
             "kind": "description",

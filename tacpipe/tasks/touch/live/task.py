@@ -1,4 +1,4 @@
-"""Run models of touch live: their settings, the plan of a session, and its engine."""
+"""Run touch models live: settings, session plan and engine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TouchSettings(TaskSettings):
-    """Settings of a session with a model of touch."""
+    """Settings of a session with a touch model."""
 
     rank: str = "contact"  # Criterion of the ranking: contact (default), balance, level:0.4
 
@@ -35,7 +35,7 @@ class TouchLive(LiveTask):
         return SessionPlan(rig, settings.task, {TOUCH: {"channels": list(COLUMNS)}, "latency": {}})
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> TouchEngine:
-        """Return the engine, which ranks the candidates of each request. Raises `UsageError` for an unknown criterion."""
+        """Return the engine that ranks the candidates of each request. Raises `UsageError` for an unknown criterion."""
         from tacpipe.tasks.touch.live.engine import TouchEngine, criterion
         from tacpipe.tasks.touch.predictor import Predictor
 

@@ -1,4 +1,4 @@
-"""Report results on touch."""
+"""Report touch results."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class TouchReport(TaskReport):
     predictor_names = headlines.BASELINES
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
-        """Return the runs of results that hold predictions of grasps which the model has not seen."""
+        """Return the runs of results that contain predictions for unseen grasps."""
         return methods.read_runs(results)
 
     def uses(self, dataset: Dataset) -> bool:
-        """Return whether a dataset holds grasps, which are drawn."""
+        """Return whether a dataset contains grasps, which the report draws."""
         return figures.holds_grasps(dataset)
 
     def columns(
@@ -84,7 +84,7 @@ class TouchReport(TaskReport):
         return text, verdict
 
     def folds(self, context: Context) -> list[Fold]:
-        """Return what touch has of its own."""
+        """Return the sections that are specific to touch."""
         methods = context.methods
         if not methods:
             return figures.cloud_folds(context.others, {})
@@ -112,7 +112,7 @@ class TouchReport(TaskReport):
         ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about these numbers."""
+        """Return the caveats of these numbers."""
         methods = context.methods
         if not methods:
             return []
@@ -125,7 +125,7 @@ class TouchReport(TaskReport):
         ]
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return more columns of the table of runs."""
+        """Return additional columns of the table of runs."""
         trained = run.details.trained
         rsquared = []
         for known_objects in (True, False):

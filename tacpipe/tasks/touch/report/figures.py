@@ -1,4 +1,4 @@
-"""Draw pressures, electrodes, clouds with their grasps, and losses by epoch."""
+"""Draw pressures, electrodes, clouds with grasps, and losses by epoch."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 
 PRESSURES = ("pdc_th", "pdc_mf")
-MAX_GRASPS = 800  # grasps of a figure
+MAX_GRASPS = 800  # maximum number of grasps in a figure
 
 
 def pressure_folds(method: Method) -> list[Fold]:
-    """Return a chart a finger, of the first run, or nothing if the method predicts no pressure."""
+    """Return one chart per finger for the first run; empty if the method predicts no pressure."""
     rows = method.details[0].predictions
     drawn = [_pressure_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)]
     return fold("The pressure, predicted and true", Charts(drawn), about=method.name) if drawn else []
@@ -72,7 +72,7 @@ def _pressure_chart(method: Method, target: str) -> Chart:
 
 
 FINGERS = ("e_th", "e_mf")
-PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # drawn grasps, ordered by error
+PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # title -> quantile of the error
 FINGERTIPS = (
     "Fingertips are seen on the pad, the skin rolled out flat, the tip up. R² is about the mean of these grasps: 1 is "
     "perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact lies on a few electrodes: a mean over 24 "
@@ -85,16 +85,16 @@ COLOURS = (
 
 @dataclass(frozen=True)
 class DrawnGrasp:
-    """A grasp that is drawn, and why."""
+    """A grasp to draw, and the reason."""
 
     place: str
-    row: int  # row among all grasps that could be drawn
+    row: int  # row among all candidate grasps
     recording: str
     error: float  # RMSE over the electrodes of both fingers, fraction of the range
 
 
 def electrode_folds(method: Method) -> list[Fold]:
-    """Return the electrodes' R² and some grasps, or nothing if the method predicts no electrodes."""
+    """Return charts of the electrodes' R² and of some grasps; empty if the method predicts no electrodes."""
     fingers = [target for target in FINGERS if target in predicted_targets(method)]
     if not fingers:
         return []
@@ -112,9 +112,9 @@ def electrode_folds(method: Method) -> list[Fold]:
 
 
 def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
-    """Return the grasps of a run at the median, the best and the worst decile by the electrodes' error.
+    """Return the grasps of a run with the median, best-decile and worst-decile error of the electrodes.
 
-    Of grasps that err alike the first by name comes first, so the same results choose the same grasps.
+    Ties are resolved by name, so the choice is reproducible.
     """
     fingers = [target for target in FINGERS if target in rows.targets]
     if not fingers or not len(rows.recordings):
@@ -133,7 +133,7 @@ def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
 
 
 def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
-    """Return the R² of each electrode on known or on novel objects, or None if there are none."""
+    """Return the R² of each electrode on known or on novel objects; None if there are no such objects."""
     rows: list[charts.DataRow] = []
     for target in fingers:
         scores_by_electrode = predictions.r2_by_electrode(paper.predictions_of_runs(method), target, known_objects)
@@ -148,7 +148,7 @@ def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Ch
 
 
 def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequence[str]) -> Chart:
-    """Return true next to predicted electrodes of one grasp."""
+    """Return a chart of the true and predicted electrodes of one grasp."""
     tips: list[charts.DataRow] = []
     errors = []
     for target in fingers:
@@ -170,7 +170,7 @@ def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequ
 
 
 def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[charts.DataRow]:
-    """Return the electrodes of one fingertip, its skin rolled out flat, the tip up, coloured from -1 to 1."""
+    """Return the electrodes of one fingertip with its skin unrolled, tip up, coloured from -1 to 1."""
     places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
     return [
         {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
@@ -180,7 +180,7 @@ def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: s
 
 
 def draw_fingertips(rows: Sequence[charts.DataRow]) -> charts.Spec:
-    """Return fingertips next to each other, of rows that `tip` gave."""
+    """Return a chart of fingertips next to each other, from the rows of `fingertip`."""
     spec = charts.plane(rows, list(dict.fromkeys(str(row["panel"]) for row in rows)), size=520, columns=4)
     spec["usermeta"] |= {"panel": 200, "least": 170}
     return spec
@@ -188,9 +188,9 @@ def draw_fingertips(rows: Sequence[charts.DataRow]) -> charts.Spec:
 
 CLOUD, GRASP = "cloud", "grasp"
 MAX_CLOUDS = 3
-NEAR_MM = 10.0  # distance to a grasp point: about where a fingertip of 6.7 mm radius lies
-POINTS = 700  # points of a cloud that are drawn
-VIEWS = {"from the camera": 0, "from the side": 2}  # coordinate that runs across; down is y in both
+NEAR_MM = 10.0  # distance to a contact point that is highlighted; a fingertip has a radius of 6.7 mm
+POINTS = 700  # number of drawn points per cloud
+VIEWS = {"from the camera": 0, "from the side": 2}  # view -> index of the horizontal axis; y is vertical
 CLOUD_COLOURS = (
     "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the cloud, "
     "though a finger may touch it."
@@ -198,14 +198,14 @@ CLOUD_COLOURS = (
 
 
 def holds_grasps(dataset: Dataset) -> bool:
-    """Return whether a dataset holds clouds with grasps."""
+    """Return whether a dataset contains clouds with grasps."""
     return any(_has_grasp(shard) for shard in dataset.recordings.values())
 
 
 def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[Fold]:
-    """Return the clouds of ``chosen`` grasps, stated with the words next to their names; nothing without any dataset.
+    """Return charts of the clouds of ``chosen`` grasps (name -> description); empty without datasets.
 
-    Where none of them is there, the first grasps are drawn.
+    If none of them is in the datasets, the first grasps are drawn.
     """
     shards = {name: shard for dataset in datasets for name, shard in dataset.recordings.items() if _has_grasp(shard)}
     if not shards:
@@ -249,14 +249,14 @@ def _cloud_chart(shard: Recording, words: str) -> Chart:
     return Chart(about, charts.plane(rows, list(VIEWS), size=9), caption)
 
 
-ALL = "all"  # stands where one network predicts all targets
+ALL = "all"  # name of a network that predicts all targets
 UNWATCHED = (
     " Where no grasps were kept for validation, it is the loss on those of training, evaluated after each epoch."
 )
 
 
 def loss_charts(methods: Sequence[Method]) -> list[Chart]:
-    """Return validation losses of one method an architecture, a chart a target; none without epochs."""
+    """Return validation losses of one method per architecture, one chart per target; empty if no run has epochs."""
     drawn, shown_methods = [], one_per_architecture(methods)
     for target in (*biotac_sp.TARGETS, ALL):
         curves = context.curves_of_methods(
@@ -271,7 +271,7 @@ def loss_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def figure_8(methods: Sequence[Method]) -> list[Chart]:
-    """Return Figure 8 in the paper's form: both losses of its network, of most epochs, or None if it was not run."""
+    """Return Figure 8 of the paper: both losses of its network with the most epochs; empty if it was not run."""
     candidates = [
         (method, target)
         for method in methods
@@ -298,9 +298,9 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
 
 
 def losses_by_epoch(result: TouchResult, target: str, name: str) -> list[float]:
-    """Return a loss of the network of one target by epoch, or the mean of several networks, or empty if none states it.
+    """Return a loss by epoch of one target's network, averaged over several networks; empty if it was not logged.
 
-    The mean ends where the first network does. NaN stands where an epoch does not state the loss.
+    The mean ends with the shortest network. Epochs without the loss are NaN.
     """
     networks: dict[object, list[float]] = {}
     for line in result.history:
@@ -320,6 +320,6 @@ def _loss_curves(method: Method, target: str, name: str) -> list[list[float]]:
 
 
 def _unwatched_note(methods: Sequence[Method]) -> str:
-    """Return what must be stated where some runs had no validation grasps."""
+    """Return a note on runs without validation grasps."""
     runs = [run for method in methods for run in method.details if run.history]
     return UNWATCHED if any(run.config.get("counts", {}).get("val") == 0 for run in runs) else ""

@@ -1,4 +1,4 @@
-"""Read results on touch as runs of methods, and write their names and what must be stated next to an error."""
+"""Read touch results as runs of methods; name the methods and describe the conditions of their errors."""
 
 from __future__ import annotations
 
@@ -30,47 +30,47 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-USUAL = ("split", "simulated")  # settings that no name states: parts of questions
-_NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
+USUAL = ("split", "simulated")  # settings that are not part of a method's name, but of the question
+_NO_METHOD = ("seed", "run_label", "baselines")  # may differ between runs of one method; the label is shown as split
 
 
 class TouchResult(context.ReportResult[TouchConfig]):
-    """One result on touch."""
+    """A touch result."""
 
     STAGE = "train.touch"
     SETS = ("vision2tactile",)
 
     @cached_property
     def predictions(self) -> GraspPredictions:
-        """The predictions for each grasp that the model has not seen."""
+        """Predictions for each unseen grasp."""
         return predictions.read_predictions(self.dataset.recordings[PREDICTIONS])
 
     @property
     def architecture(self) -> str:
-        """The kind of model."""
+        """Architecture of the model."""
         stored = self.config.get("architecture", self.given.get("architecture", ""))
         return str(params_of.with_current_names(self.STAGE, {"architecture": stored})["architecture"])
 
     @property
     def split(self) -> str:
-        """How grasps were parted into those of training and others, in words, or empty if nobody stated."""
+        """Description of how grasps were split, or empty if not recorded."""
         return str(self.config.get("split", ""))
 
     @property
     def trained(self) -> int | None:
-        """How many grasps the weights were fitted to."""
+        """Number of grasps that the weights were fitted to."""
         return self.config.get("counts", {}).get("train")
 
     @cached_property
     def settings(self) -> Settings:
-        """All that makes its method: params but the seed, the split of its grasps, and whether these were simulated."""
+        """Settings that define the method: params except the seed, the split, and whether grasps were simulated."""
         params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
-        if self.architecture != PAPER:  # the others take nothing more from it
+        if self.architecture != PAPER:  # other architectures ignore the params below
             params["colour"] = str(params.pop("inputs", "")).startswith("rgb")
         if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
-            params.pop("wrist", None)  # nothing reads it
-        if not params.get("multi_target", True):  # trees are one model of all targets
-            params.pop("targets", None)  # one network a target: others beside it change nothing
+            params.pop("wrist", None)  # unused
+        if not params.get("multi_target", True):  # forests are one model of all targets
+            params.pop("targets", None)  # one network per target: the other targets have no effect
         if self.published and self.epochs_of_paper:
             params[SHORTENED] = self.epochs_of_paper
             params.pop("epochs")
@@ -78,9 +78,9 @@ class TouchResult(context.ReportResult[TouchConfig]):
 
 
 def method_names(results: Sequence[TouchResult]) -> list[str]:
-    """Return what the method of each result is called.
+    """Return the name of each result's method.
 
-    A name states what a method does without, colour, and the settings in which it differs from most methods of its
+    A name contains an omitted input (colour) and the settings that differ from those of most methods of the same
     architecture.
     """
     keys = [json.dumps(settings.settings, sort_keys=True) for settings in results]
@@ -98,9 +98,10 @@ def method_names(results: Sequence[TouchResult]) -> list[str]:
 
 
 def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
-    """Return how the grasps of results were parted, and whether they were simulated: what is a question of its own.
+    """Return the questions: split of the grasps, and whether they were simulated.
 
-    Recorded grasps come before simulated ones, then what the default method was run on, then the most targets and runs.
+    Recorded grasps precede simulated ones; then splits are sorted by use of the default method, number of targets and
+    runs.
     """
     by_split: dict[tuple[str, bool], list[TouchResult]] = {}
     for result in results:
@@ -121,7 +122,7 @@ def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
 
 
 def grouped_by_split(methods: Sequence[Method]) -> list[list[Method]]:
-    """Return methods that were trained and evaluated on grasps parted in the same way, in the order of `splits`."""
+    """Return methods grouped by the split of their grasps, in the order of `ordered_splits`."""
     order = ordered_splits([result for method in methods for result in method.details])
     return [
         [method for method in methods if (method.settings["split"], method.settings["simulated"]) == key]
@@ -130,12 +131,12 @@ def grouped_by_split(methods: Sequence[Method]) -> list[list[Method]]:
 
 
 def default_method(methods: Sequence[Method]) -> Method:
-    """Return the method that represents the project's own: the default with most runs, or else that with most runs."""
+    """Return the method that represents the project: the default, or any if it was not run, with the most runs."""
     return max(methods, key=lambda candidate: (candidate.settings["architecture"] == DEFAULT, len(candidate.runs)))
 
 
 def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
-    """Return one method an architecture: that with most runs, of several one that reads colour, then the shortest name."""
+    """Return one method per architecture: most runs, then one that reads colour, then the shortest name."""
 
     def place(result_of_split: Method) -> tuple[int, bool, int, str]:
         return (
@@ -152,13 +153,13 @@ def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
 
 
 def predicted_targets(*methods: Method) -> tuple[str, ...]:
-    """Return what any run of some methods predicts, in the order of tables."""
+    """Return the targets that any run of these methods predicts, in table order."""
     available = {target for method in methods for result in method.details for target in result.predictions.targets}
     return tuple(target for target in biotac_sp.TARGETS if target in available)
 
 
 def _first_names(settings: Settings) -> list[str]:
-    """Return what a kind of model is called by what it reads; marks that distinguish methods of a kind come behind."""
+    """Return the model names based on inputs; suffixes that distinguish methods follow them."""
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
         return ["trees on geometry and colour" if coloured else "trees on geometry"]
@@ -170,10 +171,9 @@ def _first_names(settings: Settings) -> list[str]:
 
 
 def _usual_settings(alike: Sequence[tuple[Settings, int]]) -> list[tuple[str, Scalar]]:
-    """Return the setting that most methods have, or of several such that of most runs, by name, given methods and runs.
+    """Return the most common setting by name, given (settings, number of runs); ties are resolved by runs.
 
-    All splits are usual, and so are simulated grasps: these have headings of their own. What is called by its colour has no
-    mark of it.
+    Splits and simulated grasps are never marked, because they have their own headings. Colour is part of the base name.
     """
     usual = []
     for name in sorted({name for settings, _ in alike for name in settings}):
@@ -188,9 +188,9 @@ def _usual_settings(alike: Sequence[tuple[Settings, int]]) -> list[tuple[str, Sc
     return usual
 
 
-EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # values of all tables of the paper; Figure 8 has 1,000 epochs
+EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # values of all tables in the paper; Figure 8 has 1,000 epochs
 FINGER_NAMES = {"e_th": "thumb", "e_mf": "middle finger"}
-BASELINES = {  # rows that every table has
+BASELINES = {  # rows of every table
     CONSTANT: "constant: the mean of training",
     OBJECT_MEAN: "mean of the object",
     NEAREST_IN_TIME: "mean of the nearest in time",
@@ -199,11 +199,11 @@ RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
 )
-IN_A_ROW = 0.75  # fraction of successive grasps: from here on, objects were not taken by turns
+IN_A_ROW = 0.75  # fraction of successive grasps of the same object above which objects were not interleaved
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these grasps cannot show, next to every table of errors, or empty if nothing is known against them."""
+    """Return a warning on what these grasps cannot show, for every table of errors; empty if there is none."""
     if methods and all(method.simulated for method in methods):
         return context.SIMULATED
     counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]
@@ -214,7 +214,7 @@ def caution(methods: Sequence[Method]) -> str:
 
 
 def baseline_name(predictor: str) -> str:
-    """Return what a table calls a predictor that is not a model's own.
+    """Return the table name of a predictor other than the model.
 
     >>> baseline_name("object_mean"), baseline_name("nearest_neighbours")
     ('mean of the object', 'nearest neighbours')
@@ -223,7 +223,7 @@ def baseline_name(predictor: str) -> str:
 
 
 def short_r2(value: float) -> str:
-    """Return R² where there is little room.
+    """Return R² as short text.
 
     >>> [short_r2(value) for value in (0.456, -0.02, -3.04, -1234.5)]
     ['0.46', '−0.02', '−3.0', '< −9']
@@ -234,12 +234,12 @@ def short_r2(value: float) -> str:
 
 
 def split_name(described: str) -> str:
-    """Return how grasps were parted, where somebody stated so."""
+    """Return the split of the grasps in words, if it was recorded."""
     return described.replace("-", " ").replace("_", " ") or "one split"
 
 
 def describe_split(described: str, simulated: bool) -> str:
-    """Return how grasps were parted and whether they were simulated.
+    """Return the split of the grasps in words, and whether they were simulated.
 
     >>> describe_split("by-day", True), describe_split("simulated", True), describe_split("", False)
     ('by day, simulated', 'simulated', 'one split')
@@ -249,7 +249,7 @@ def describe_split(described: str, simulated: bool) -> str:
 
 
 def describe_schedule(run: TouchResult) -> str:
-    """Return how a run was trained, and whether that is the paper's way."""
+    """Return the training schedule of a run in words, and whether it is that of the paper."""
     if not run.history:
         return "fitted without epochs"
     params = run.params
@@ -263,7 +263,7 @@ def describe_schedule(run: TouchResult) -> str:
 
 
 def describe_training(methods: Sequence[Method]) -> str:
-    """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
+    """Return the preset, the number of runs and the number of training grasps of a table's methods, in words."""
     runs = [run for schedule in methods for run in schedule.details]
     described = [
         f"{count} run{'s' if count > 1 else ''}: {schedule}"
@@ -275,7 +275,7 @@ def describe_training(methods: Sequence[Method]) -> str:
 
 
 def format_span(counts: Sequence[int]) -> str:
-    """Return the least and the largest of sorted counts.
+    """Return the minimum and maximum of sorted counts as text.
 
     >>> format_span([412, 9000]), format_span([7])
     ('412 to 9,000', '7')
@@ -284,7 +284,7 @@ def format_span(counts: Sequence[int]) -> str:
 
 
 def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
-    """Return the runs of results that hold predictions of grasps which the model has not seen."""
+    """Return the runs of results that contain predictions for unseen grasps."""
     all_results = [TouchResult(result) for result in drop_duplicates(results) if PREDICTIONS in result.recordings]
     with_unseen_grasps = [result for result in all_results if len(result.predictions.recordings)]
     splits = ordered_splits(with_unseen_grasps)

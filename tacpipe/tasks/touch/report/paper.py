@@ -1,4 +1,4 @@
-"""Compare methods in the tables of the paper (RA-L 2020), with the printed numbers next to ours."""
+"""Compare methods in tables of the paper's form (RA-L 2020), with the published numbers next to ours."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ POINT_COUNTS: Mapping[object, tuple[float, float]] = {  # Table II
     500: (0.02790, 0.00115),
     750: (0.02717, 0.00134),
 }
-EPOCH_S: Mapping[object, int] = {250: 8, 500: 14, 750: 21}  # Table II: seconds per epoch
+EPOCH_S: Mapping[object, int] = {250: 8, 500: 14, 750: 21}  # Table II, seconds per epoch
 NORMALISATIONS: Mapping[object, tuple[float, float]] = {  # Table III
     "none": (0.01859, 0.00065),
     "sphere": (0.01183, 0.00073),
@@ -55,13 +55,13 @@ ROTATIONS: Mapping[object, tuple[float, float]] = {  # Table IV
 
 @dataclass(frozen=True)
 class Final:
-    """RMSE on the test set and on novel objects, as fractions of the target's range and in device counts."""
+    """RMSE on the test set and on novel objects, in fractions of the target's range and in device counts."""
 
     test: float
     test_counts: int
     novel: float
     novel_counts: int
-    change: int  # percent
+    change: int  # in percent
 
 
 TEST_AND_NOVEL: Mapping[str, Final] = {  # Figures 10 and 11
@@ -82,16 +82,16 @@ SCALES = (
 )
 
 
-ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # rows of a table in the paper's form
+ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # rows of a table in the form of the paper
 
 
 def tables_by_object(methods: Sequence[Method]) -> list[Table]:
-    """Return errors and skill by object of one method an architecture, or None if no object was evaluated."""
+    """Return tables of errors and skill by object, with one method per architecture; empty if there are no objects."""
     return [object_table for method in one_per_architecture(methods) if (object_table := _table_by_object(method))]
 
 
 def score_cells(scored: Score | None) -> list[str | Cell]:
-    """Return what a table in the paper's form states of a score, as `ROWS` names it."""
+    """Return the cells of a score in the rows `ROWS`."""
     if scored is None:
         return [NONE] * len(ROWS)
     error = blocks.with_sd(scored.each.mean, scored.each.sd)
@@ -107,7 +107,7 @@ def score_cells(scored: Score | None) -> list[str | Cell]:
 
 
 def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | None) -> list[tuple[str, Score | None]]:
-    """Return the mandatory baselines and any others that some methods' results hold, by what a table calls them."""
+    """Return the mandatory baselines and any others in the methods' results: table name and score."""
     runs_by_method = {method.name: predictions_of_runs(method) for method in methods}
     other_predictors = {
         name for runs in runs_by_method.values() for run in runs for name in run.predicted if name != MODEL
@@ -117,13 +117,13 @@ def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | 
         holding = [
             runs for runs in runs_by_method.values() if any(target in run.predicted.get(predictor, ()) for run in runs)
         ]
-        most_runs = max(holding, key=len, default=[])  # runs of one method: a split has the same for all
+        most_runs = max(holding, key=len, default=[])  # runs of one method: all of a split have the same baselines
         rows.append((baseline_name(predictor), predictions.score(most_runs, target, known_objects, predictor)))
     return rows
 
 
 def predictions_of_runs(method: Method) -> list[GraspPredictions]:
-    """Return what the runs of a method predicted."""
+    """Return the predictions of each run of a method."""
     return [result.predictions for result in method.details]
 
 
@@ -147,7 +147,7 @@ def _table_by_object(method: Method) -> Table | None:
 
 
 def _object_cells(runs: Sequence[GraspPredictions], target: str, known_objects: bool) -> list[str | Cell]:
-    """Return the RMSE on an object, above that of its mean where there is one, and the skill over the constant."""
+    """Return the RMSE on an object with that of the object mean, if any, below it, and the skill over the constant."""
     scored, mean = (predictions.score(runs, target, known_objects, predictor) for predictor in (MODEL, OBJECT_MEAN))
     if scored is None:
         return [NONE, NONE]
@@ -155,21 +155,21 @@ def _object_cells(runs: Sequence[GraspPredictions], target: str, known_objects: 
     return [Cell(blocks.fixed(scored.rmse, 4), below, scored.rmse), blocks.signed(scored.skill.mean)]
 
 
-TARGET = "pdc_th"  # target on which the paper compares settings
+TARGET = "pdc_th"  # target for which the paper compares settings
 
 
 @dataclass(frozen=True)
 class Form:
-    """A table of the paper: which setting varies, its values, and what was printed."""
+    """A table of the paper: the varied setting, its values, and the published numbers."""
 
-    number: str  # number of the table or figure in the paper
+    number: str  # number of the table or figure
     title: str
     setting: str
-    names: Mapping[object, str]  # name of a row, by the setting's value
+    names: Mapping[object, str]  # setting's value -> row name
     printed: Mapping[object, tuple[float, float]] = field(default_factory=dict)  # mean and sd of the RMSE
     printed_s: Mapping[object, int] = field(default_factory=dict)  # seconds per epoch
-    drawn: bool = False  # True: the paper has a figure and no table
-    also: tuple[str, ...] = ()  # settings that only some of the values have
+    drawn: bool = False  # True if the paper has a figure instead of a table
+    also: tuple[str, ...] = ()  # settings that only some values have
 
 
 FORMS = (
@@ -238,16 +238,16 @@ ESTIMATED = (
 
 
 def setting_tables(methods: Sequence[Method]) -> list[Block]:
-    """Return the tables of which at least two rows were run, or None if there is none."""
+    """Return the tables with at least two evaluated rows."""
     described = [block for form in FORMS for block in _setting_table(form, methods)]
     published = all(block.published for block in methods)
     return [*described, *([SmallPrint(SCALES)] if published and described else [])]
 
 
 def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Method]:
-    """Return the methods of a table by their setting: of the paper's network, alike but for it.
+    """Return the methods of a table by value of its setting: variants of the paper's network that differ only in it.
 
-    Of several such families the one with most rows is given, then that with most runs.
+    If there are several such families, the one with the most rows, then with the most runs, is returned.
     """
     alike: dict[str, dict[object, Method]] = {}
     for method in methods:
@@ -262,7 +262,7 @@ def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Meth
 
 
 def score_on_target(method: Method) -> Score | None:
-    """Return how a method does on what the paper compares settings on."""
+    """Return the score of a method on the target for which the paper compares settings."""
     return predictions.score(predictions_of_runs(method), TARGET, True)
 
 
@@ -326,7 +326,7 @@ PARTS = ("RMSE over runs", "R²", "skill")
 
 
 def generalisation_tables(methods: Sequence[Method]) -> list[Block]:
-    """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
+    """Return tables of the paper's network and of the default method, for those that predicted two or more targets."""
     described = []
     for architecture in (PAPER, DEFAULT):
         pairs = _pairs([block for block in methods if block.settings["architecture"] == architecture])
@@ -335,9 +335,9 @@ def generalisation_tables(methods: Sequence[Method]) -> list[Block]:
 
 
 def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
-    """Return pairs of methods, one evaluated on known objects and one on novel ones, that are the same or differ in split.
+    """Return pairs of methods, evaluated on known and on novel objects, that are equal or differ only in split.
 
-    The paper trains anew, on all grasps of known objects, for novel ones.
+    For novel objects the paper trains a new network on all grasps of known objects.
     """
     known_methods, novel = (
         [first for first in methods if len(_scored_targets(first, known_objects)) > 1]
@@ -352,7 +352,7 @@ def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
 
 
 def _pair_order(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
-    """Return how much a pair states: targets, then runs; of two that state as much, one method on both."""
+    """Return the sort key of a pair: number of targets, then runs, then whether both are the same method."""
     known_method, novel = pair
     common = set(_scored_targets(known_method, True)) & set(_scored_targets(novel, False))
     return len(common), len(known_method.runs) + len(novel.runs), known_method is novel
@@ -411,7 +411,7 @@ def _pair_cells(test: Score | None, novel: Score | None) -> list[str | Cell]:
 
 
 def _part_cells(scored: Score | None) -> list[str | Cell]:
-    """Return what `PARTS` name."""
+    """Return the cells of a score in the columns `PARTS`."""
     error, counts, *more_cells = score_cells(scored)[: len(PARTS) + 1]
     return [_above_counts(error, str(counts)) if scored else NONE, *more_cells]
 

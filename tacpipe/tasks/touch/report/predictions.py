@@ -1,4 +1,4 @@
-"""Read what a model and its baselines predicted for unseen grasps, and score it."""
+"""Read the predictions of a model and its baselines for unseen grasps, and score them."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 Touch = Mapping[str, Floats]  # target -> (grasp, value), device counts
 
-UNNAMED = "unnamed"  # an object of which no recording states the name
+UNNAMED = "unnamed"  # name of objects without a label
 
 
 @dataclass(frozen=True)
 class GraspPredictions:
-    """One row a grasp, those of training left out."""
+    """Predictions with one row per grasp; training grasps are excluded."""
 
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
@@ -40,7 +40,7 @@ class GraspPredictions:
 
     @property
     def in_a_row(self) -> tuple[int, int]:
-        """How many grasps, in the order of time, follow one of the same object, and how many follow any."""
+        """Number of grasps that follow one of the same object in time order, and number that follow any grasp."""
         if self.t_ns is None or len(self.t_ns) < 2 or len(set(self.objects.tolist())) < 2:
             return 0, 0
         ordered = self.objects[np.argsort(self.t_ns, kind="stable")]
@@ -48,15 +48,15 @@ class GraspPredictions:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The targets that the model predicts, in the order of tables."""
+        """Predicted targets, in table order."""
         return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
     def of(self, known_objects: bool | None) -> GraspPredictions:
-        """Return the rows of known or of novel objects, or all."""
+        """Return the rows of known objects, of novel objects, or, with None, of all."""
         return self if known_objects is None else self.rows(self.known == known_objects)
 
     def rows(self, chosen: AnyArray) -> GraspPredictions:
-        """Return some rows, stated by a mask (grasp,) or by their numbers."""
+        """Return the rows selected by a mask (grasp,) or by indices."""
         predicted = {
             name: {target: values[chosen] for target, values in touch.items()} for name, touch in self.predicted.items()
         }
@@ -68,7 +68,7 @@ class GraspPredictions:
 
 
 def read_predictions(shard: Recording) -> GraspPredictions:
-    """Return what the recording ``predictions`` of a result states of grasps that its model has not seen."""
+    """Return the predictions for unseen grasps in the recording ``predictions`` of a result."""
     grasps = shard.table(GRASPS)
     targets_by_stream = {name: _read_targets(shard.table(name)) for name in shard.streams if name != GRASPS}
     predictions = GraspPredictions(
@@ -83,7 +83,7 @@ def read_predictions(shard: Recording) -> GraspPredictions:
 
 
 def _read_targets(table: pa.Table) -> Touch:
-    """Return the targets that a stream holds in full."""
+    """Return the targets whose columns are all in a stream."""
     columns = {target: biotac_sp.value_columns(target) for target in biotac_sp.TARGETS}
     return {
         target: np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64)
@@ -94,27 +94,27 @@ def _read_targets(table: pa.Table) -> Touch:
 
 @dataclass(frozen=True)
 class Score:
-    """The errors of one predictor on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
+    """The errors of one predictor on one target, in fractions of the target's range (`biotac_sp.RANGES`)."""
 
     target: str
-    rmse: float  # global, over the grasps of all runs
-    each: Spread  # spread of the RMSE of single runs
-    batch_mean: float  # mean over runs of the mean RMSE of batches
+    rmse: float  # pooled over the grasps of all runs
+    each: Spread  # distribution of the RMSE over runs
+    batch_mean: float  # mean over runs of the batch-mean RMSE
     mae: float
     r2: float
     skill: Estimate  # over the constant
-    grasps: int  # each counted once
+    grasps: int  # number of distinct grasps
     objects: int
     runs: int
 
     @property
     def counts(self) -> float:
-        """The RMSE in device counts."""
+        """RMSE in device counts."""
         return to_counts(self.target, self.rmse)
 
 
 def to_counts(target: str, fraction: float) -> float:
-    """Return a fraction of a target's range in device counts.
+    """Convert a fraction of a target's range to device counts.
 
     >>> to_counts("pdc_th", 0.1)
     90.0
@@ -124,11 +124,11 @@ def to_counts(target: str, fraction: float) -> float:
 
 
 class _TargetRows(NamedTuple):
-    """The rows that a run reports on a target."""
+    """The rows of a run that contain a target."""
 
     true: AnyFloats  # (grasp, value), normalised
     predicted: AnyFloats  # (grasp, value)
-    constant: AnyFloats  # (grasp, value), or NaN if the result holds none
+    constant: AnyFloats  # (grasp, value); NaN if the result has no constant
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
 
@@ -136,10 +136,11 @@ class _TargetRows(NamedTuple):
 def score(
     runs: Sequence[GraspPredictions], target: str, known_objects: bool | None, predictor: str = MODEL
 ) -> Score | None:
-    """Return how a predictor does, from the predictions of runs on known or on novel objects, or on all; None without any.
+    """Return the errors of a predictor over runs, on known, novel or all objects; None if there are no predictions.
 
-    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
-    where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
+    Grasps of all runs are pooled. The skill's interval comes from resampling grasps, with the predictions of all runs
+    for each, if objects are known. Otherwise it comes from resampling objects, because it concerns the next unseen
+    object.
     """
     parts = _rows(runs, target, known_objects, predictor)
     if not parts:
@@ -160,7 +161,7 @@ def score(
 
 
 def r2_by_electrode(runs: Sequence[GraspPredictions], target: str, known_objects: bool | None) -> AnyFloats | None:
-    """Return the R² of each electrode, (value,), pooled over runs, or None if nothing is stated of the target."""
+    """Return the R² of each electrode (value,), pooled over runs; None if there are no predictions of the target."""
     parts = _rows(runs, target, known_objects, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 
@@ -168,7 +169,7 @@ def r2_by_electrode(runs: Sequence[GraspPredictions], target: str, known_objects
 def _rows(
     runs: Sequence[GraspPredictions], target: str, known_objects: bool | None, predictor: str
 ) -> list[_TargetRows]:
-    """Return what each run states that holds the target, the predictor and such objects."""
+    """Return the rows of each run that contains the target, the predictor and such objects."""
     parts = []
     for rows in (run.of(known_objects) for run in runs):
         predicted = rows.predicted.get(predictor, {})
@@ -187,7 +188,7 @@ def _pooled(parts: Sequence[_TargetRows]) -> _TargetRows:
 
 
 def _skill(rows: _TargetRows, clusters: NDArray[np.str_]) -> Estimate:
-    """Return the skill over the constant on rows where there is one."""
+    """Return the skill over the constant on rows that have one."""
     defined = ~np.isnan(rows.constant).any(axis=1)
     model, baseline = (
         regression.squared_sums(rows.true[defined], values[defined]) for values in (rows.predicted, rows.constant)

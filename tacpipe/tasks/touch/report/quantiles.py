@@ -1,4 +1,4 @@
-"""The section on quantiles of predicted touch: coverage, by target and electrode, of known and novel objects."""
+"""Report quantiles of predicted touch: coverage by target and electrode, on known and novel objects."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ EXPLAINED = (
     "band of the right coverage is best, which the pinball loss measures (lower is better)."
 )
 ELECTRODES = "Coverage in percent. Blue: more than asked for; orange: less."
-STRONGEST = 0.2  # difference of coverage that has the strongest colour
+STRONGEST = 0.2  # coverage error with the most saturated colour
 
 
 def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return how good quantiles are, of calibrated models; nothing without any."""
+    """Return sections on the quality of quantiles of calibrated models; empty if there are none."""
     folds: list[Fold] = []
     has_several_splits = (
         len(ordered_splits([electrode_chart for method in methods for electrode_chart in method.details])) > 1
@@ -78,24 +78,24 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def measure_bands(rows: pd.DataFrame, known_objects: bool) -> dict[tuple[str, str], Band]:
-    """Return the worth of each predictor's band on each target, over grasps of known objects or over novel objects."""
+    """Return the measures of each predictor's band on each target, over known or novel objects."""
     return calibration.measure_bands(rows, "target", "recording" if known_objects else "object", CONSTANT)
 
 
 def coverage_by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
-    """Return the fraction of grasps whose value lies in the model's band, of each electrode of a finger (electrode,)."""
+    """Return the fraction of grasps whose value is in the model's band, for each electrode of a finger (electrode,)."""
     model_rows = rows[(rows.target == target) & (rows.predictor == MODEL)]
     coverage: AnyFloats = model_rows.groupby("value")["covered"].mean().sort_index().to_numpy(float)
     return coverage
 
 
 def _split_of(method: Method) -> tuple[str, bool]:
-    """Return how the grasps of a method were parted, and whether they were simulated."""
+    """Return the split of a method's grasps, and whether they were simulated."""
     return str(method.settings["split"]), bool(method.settings["simulated"])
 
 
 def _read_coverage(method: Method) -> pd.DataFrame | None:
-    """Return a row a value, predictor, grasp and run of a method, or None if none of its runs is of a calibrated model."""
+    """Return one row per value, predictor, grasp and run of a method; None if none of its runs has a calibrated model."""
     import pandas as pd
 
     files = [result.dataset.files[COVERAGE] for result in method.details if COVERAGE in result.dataset.files]
@@ -103,7 +103,7 @@ def _read_coverage(method: Method) -> pd.DataFrame | None:
 
 
 def _coverage_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart:
-    """Return the coverage of each predictor on each target."""
+    """Return a chart of the coverage of each predictor on each target."""
     bands = measure_bands(rows, known_objects)
     targets = [name for name in headlines.TARGETS if (name, MODEL) in bands]
     dots = []
@@ -117,7 +117,7 @@ def _coverage_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> 
 
 
 def _coverage_rows(rows: pd.DataFrame, known_objects: bool) -> list[Sequence[str | Cell]]:
-    """Return the rows of the table: a target and predictor each."""
+    """Return the table rows, one per target and predictor."""
     bands = measure_bands(rows, known_objects)
     rows_shown: list[Sequence[str | Cell]] = []
     for target in (name for name in headlines.TARGETS if (name, MODEL) in bands):
@@ -138,14 +138,14 @@ def _coverage_rows(rows: pd.DataFrame, known_objects: bool) -> list[Sequence[str
 
 
 def _with_interval(values: Sequence[float], digits: int) -> Cell:
-    """Return a number above its interval, where that is defined."""
+    """Return a cell with a number and its interval below, if defined."""
     mean, low, high = values
     below = "" if np.isnan(low) else f"{blocks.fixed(low, digits)} to {blocks.fixed(high, digits)}"
     return Cell(blocks.fixed(mean, digits), below, mean)
 
 
 def _electrode_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart | None:
-    """Return the coverage of each electrode on the fingertips; None without electrodes."""
+    """Return a chart of the coverage of each electrode on the fingertips; None if there are no electrodes."""
     tips: list[charts.DataRow] = []
     for target in (finger for finger in figures.FINGERS if (rows.target == finger).any()):
         coverage = coverage_by_electrode(rows, target)
