@@ -302,7 +302,7 @@ class V4l2Link(Descriptor):
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         entries: Arrived = []
-        while True:
+        for _ in range(BUFFERS):  # frames may come as fast as they are encoded
             try:
                 filled = BUFFER.unpack(self.device.call(DQBUF, self._buffer(0)))
             except BlockingIOError:
@@ -313,6 +313,7 @@ class V4l2Link(Descriptor):
                 raise self.lost("it was unplugged" if error.errno == errno.ENODEV else str(error.strerror)) from error
             entries.append(self._entry(filled))
             self._queue(filled[0])
+        return entries
 
     def _entry(self, filled: tuple[Any, ...]) -> tuple[int, bytes]:
         """Return the frame of a buffer with its stamp."""

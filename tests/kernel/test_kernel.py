@@ -84,7 +84,7 @@ def test_a_camera_is_found_by_its_name(camera_result: dict[str, Any]) -> None:
 
 def test_frames_have_the_numbers_and_stamps_of_the_kernel(camera_result: dict[str, Any]) -> None:
     numbers, stamps_ns = camera_result["numbers"], camera_result["stamps_ns"]
-    assert len(numbers) == guest.FRAMES
+    assert len(numbers) >= guest.FRAMES
     assert numbers == sorted(set(numbers))
     assert stamps_ns == sorted(set(stamps_ns))
     assert stamps_ns[-1] < camera_result["now_ns"]
@@ -114,7 +114,7 @@ def test_what_a_camera_does_not_send_is_refused(camera_result: dict[str, Any]) -
     assert "the camera does not send mjpeg; it sends " in refused["mjpeg"] and "YUYV" in refused["mjpeg"]
     assert "pixels instead of 333 x 180" in refused["size"]
     assert "led cannot be set to 3" in refused["led"]
-    assert "is held by" in refused["busy"]
+    assert "/dev/video0 is in use by" in refused["busy"]
 
 
 def test_a_camera_that_goes_away_is_lost(camera_result: dict[str, Any]) -> None:
