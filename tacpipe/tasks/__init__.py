@@ -1,1 +1,1 @@
-"""One question a file: how its model is trained and evaluated."""
+"""Train and evaluate the model of each task; one module or package per task."""

@@ -1,7 +1,7 @@
-"""Open the recordings that a model is to predict, and list those that it was trained on.
+"""Open recordings for prediction by a model, and record the digests of its training recordings.
 
-Opened datasets go through the stages that the model was trained behind. ``trained_on`` of a configuration holds digests by
-name: evaluation reports these recordings separately, and calibration refuses them.
+Opened datasets pass through the stages that the model was trained behind. ``trained_on`` of a configuration maps
+recording names to digests: evaluation reports these recordings separately, and calibration refuses them.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OpenedChain:
-    """The stages that a model was trained behind, and what they fitted: those of the opened ``model``."""
+    """The stages that a model was trained behind, with their fitted parts: those of the opened ``model``."""
 
     model: Dataset
 
     @property
     def steps(self) -> Sequence[Step]:
-        """The stages one by one, as manifests name them."""
+        """The single stages, as listed in manifests."""
         return self.model.source.chain
 
 
 def open_for_model(recordings: Dataset | Recording, chain: OpenedChain | None) -> Dataset:
-    """Return a dataset, or the one of a recording alone, after the stages of ``chain``; None: as it is.
+    """Return a dataset, or a dataset of one recording, after the stages of ``chain``; unchanged if that is None.
 
-    Those stages that it has not been through yet are run, as ``tacpipe predict`` does. Raises `UsageError` for anything
-    else than a dataset or a recording, and where it went through other stages.
+    Missing stages are run, as by ``tacpipe predict``. Raises `UsageError` for anything other than a dataset or a
+    recording, and if it passed through other stages.
     """
     if isinstance(recordings, Recording):
         recordings = recordings.alone
@@ -69,7 +69,7 @@ def _check(expected: Sequence[Step], recordings: Dataset) -> None:
 
 
 def _command(step: Step) -> str:
-    """Return the command of a link of a chain, with the params that are not the default."""
+    """Return the command of a step of a chain, with the params that differ from their defaults."""
     from tacpipe.plugins import params, registry
 
     usual = params.to_input(params.from_json(registry.load(step["stage"]), {}))
@@ -82,7 +82,7 @@ def _command(step: Step) -> str:
 
 
 def merge_trained_on(*parts: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the digests of recordings by name; each part holds pairs of name and digest."""
+    """Return the digests of recordings by name, from parts with pairs of name and digest."""
     return {name: digest for part in parts for name, digest in part}
 
 
@@ -92,7 +92,7 @@ def trained_on_datasets(*parts: Dataset) -> dict[str, str]:
 
 
 def add_earlier(digests: Mapping[str, str], earlier: Mapping[str, str]) -> dict[str, str]:
-    """Return the digests of a training by name, and those of the model that it began from under marked names.
+    """Return a training's digests by name, and those of the initial model under marked names.
 
     >>> add_earlier({"a": "1"}, {"a": "1", "b": "2"})
     {'b of the model before': '2', 'a': '1'}
@@ -103,9 +103,9 @@ def add_earlier(digests: Mapping[str, str], earlier: Mapping[str, str]) -> dict[
 
 
 def add_calibration(digests: Mapping[str, str], calibration: Mapping[str, str]) -> dict[str, str]:
-    """Return the digests of a training by name, and those that the model was calibrated on.
+    """Return a training's digests by name, and those of the calibration recordings.
 
-    A calibration recording whose name belongs to another recording of the training gets a marked name.
+    A calibration recording gets a marked name if the training has another recording of the same name.
 
     >>> add_calibration({"a": "1"}, {"a": "2", "b": "3", "c": "1"})
     {'a': '1', 'a of calibration': '2', 'b': '3'}

@@ -1,10 +1,11 @@
-"""The interface between tacpipe and a task: what is predicted, from which recordings, and how that is evaluated.
+"""Define the interface between tacpipe and a task: its targets, its recordings and its evaluation.
 
-A package brings a task with an entry point of the group ``tacpipe.tasks`` that names a subclass of `Task`. The commands
-``tacpipe train``, ``evaluate``, ``predict``, ``calibrate``, ``report``, ``live`` and ``demo`` work for every such task.
+A package adds a task with an entry point in the group ``tacpipe.tasks`` that refers to a subclass of `Task`. The
+commands ``tacpipe train``, ``evaluate``, ``predict``, ``calibrate``, ``report``, ``live`` and ``demo`` work for every
+such task.
 
-The module of the subclass is imported to print the help of ``tacpipe train NAME`` and to answer from the cache. It imports
-torch, pandas and pyarrow inside of its methods only.
+The module of the subclass is imported for the help of ``tacpipe train NAME`` and on cache hits, so it must import
+torch, pandas and pyarrow only inside its methods.
 """
 
 from __future__ import annotations
@@ -29,139 +30,139 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import AnyStage, Requirements, Result
     from tacpipe.tasks.recordings import OpenedChain
 
-Files = Mapping[str, bytes]  # the files of a model by name
+Files = Mapping[str, bytes]  # model files by name
 GraspPredictor = Callable[[Any, "Cloud", "Grasp"], dict[str, float]]
 
 
 class ModelConfig(TypedDict):
-    """The parts of ``config.json`` that models of all tasks have."""
+    """Fields of ``config.json`` that are common to the models of all tasks."""
 
     task: str
     architecture: str
-    params: dict[str, Scalar]  # as `tacpipe.plugins.params` stores them
-    trained_on: dict[str, str]  # digests of recordings by name
+    params: dict[str, Scalar]  # stored by `tacpipe.plugins.params`
+    trained_on: dict[str, str]  # recording name -> digest
 
 
 class LoadedModel(Protocol):
-    """A model in memory, as `tacpipe.load` returns it."""
+    """A model in memory, as returned by `tacpipe.load`."""
 
     @property
     def predict(self) -> Callable[..., Any]:
-        """A function of a dataset or a recording that returns the table of ``tacpipe predict``."""
+        """Function that takes a dataset or a recording and returns the table of ``tacpipe predict``."""
         ...
 
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """The predictions that are requested of a model."""
+    """Options of a prediction."""
 
-    steps: Sequence[int]  # steps ahead, ascending, for tasks that predict a future
-    quantiles: Sequence[int] = ()  # percent, ascending
-    probabilities: bool = False  # True if calibrated probabilities are added
-    allow_look_ahead: bool = False  # causal predictions: accept a model that was trained on rows that look ahead
+    steps: Sequence[int]  # steps ahead, ascending, for tasks that predict the future
+    quantiles: Sequence[int] = ()  # in percent, ascending
+    probabilities: bool = False  # True to add calibrated probabilities
+    allow_look_ahead: bool = False  # for causal predictions: accept a model that was trained on rows with look-ahead
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A task's way to measure how uncertain its models are."""
+    """How the models of a task are calibrated."""
 
-    states: Literal["quantiles", "probabilities"]  # the field of `PredictionRequest` that a calibrated model answers
-    # Returns the files of a model, which are given, with those that state its uncertainty, measured on recordings with the
-    # role train and with the role val.
+    states: Literal["quantiles", "probabilities"]  # the field of `PredictionRequest` that calibrated models support
+    # Returns the files of the given model, extended by its uncertainty. This is measured on two datasets, with the
+    # recordings of the role train and of the role val.
     calibrate: Callable[[Files, CalibrationRequest, Dataset, Dataset], dict[str, bytes]]
 
 
 class Demo(NamedTuple):
-    """The part of `tacpipe demo` that shows a task."""
+    """A task's part of `tacpipe demo`."""
 
-    commands: list[list[str]]  # commands in their order, each without the leading ``tacpipe``
-    results: list[str]  # paths of results that the page shows
-    datasets: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
-    # commands from the emulated rig's ``recordings`` below the output to ``results``; empty without such a part
+    commands: list[list[str]]  # commands in order, without the leading ``tacpipe``
+    results: list[str]  # paths of the results on the page
+    datasets: Sequence[str] = ()  # paths of datasets on the page that are not results
+    # commands from the emulated rig's ``recordings`` below the output to ``results``; empty if there are none
     recorded: Sequence[list[str]] = ()
-    shortened: Sequence[str] = ()  # models that are trained for a part of their schedule, each with that part
+    shortened: Sequence[str] = ()  # models that are trained for a fraction of their schedule, each with that fraction
 
 
 class Task(ABC):
-    """A task. The abstract members are required; every property without a body in the subclass is an absent capability."""
+    """A task. Abstract members are required; each property that a subclass does not override is an absent capability."""
 
-    name: ClassVar[str]  # the name in the entry point
-    # A stage whose function is in the module of the subclass: its signature, params, version and requirements are those of
-    # ``tacpipe train NAME``. Its result holds ``config.json`` with ``task``, `name`, and ``trained_on``, the digests of the
-    # recordings that the model has seen by name.
+    name: ClassVar[str]  # name of the entry point
+    # A stage whose function is in the module of the subclass. Its signature, params, version and requirements are those
+    # of ``tacpipe train NAME``. Its result contains ``config.json`` with ``task``, which is `name`, and ``trained_on``,
+    # the digests by name of the training recordings.
     train: ClassVar[AnyStage]
 
     @property
     def params(self) -> Any:
-        """The dataclass of the options of ``tacpipe train``, or a union with one dataclass per architecture."""
+        """Dataclass of the options of ``tacpipe train``, or a union with one dataclass per architecture."""
         return self.train.params
 
     @property
     def requirements(self) -> Requirements | None:
-        """The streams, quantities and labels that recordings must have, or None if the task does not state them."""
+        """Streams, quantities and labels that recordings must have; None if the task does not declare them."""
         return self.train.requirements
 
     @abstractmethod
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
-        """Return ``metrics.json``, errors by recording and the headline of a model next to its baselines."""
+        """Return ``metrics.json``, errors by recording, and the headline of a model and its baselines."""
 
     @abstractmethod
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return a table of predictions for each recording, or one of all."""
+        """Return one table of predictions per recording, or one table for all recordings."""
 
     @abstractmethod
     def load(self, files: Files, chain: OpenedChain | None = None) -> LoadedModel:
-        """Return the model among ``files``, which may be untrusted, trained behind the stages of ``chain``."""
+        """Return the model in ``files``, which may be untrusted, trained behind the stages of ``chain``."""
 
     @property
     def short_names(self) -> Mapping[str, str]:
-        """Names in ``summary.json`` of the parts and targets of headlines; others are written as they are."""
+        """Short names in ``summary.json`` of parts and targets of headlines; other names are written in full."""
         return {}
 
     @property
     def calibration(self) -> Calibration | None:
-        """How uncertainty is measured, or None if it is not."""
+        """Calibration of uncertainty; None if the task has none."""
         return None
 
     @property
     def live(self) -> LiveTask | None:
-        """The task's part of a live session, or None if its models do not run live."""
+        """The task's part of live sessions; None if its models do not run live."""
         return None
 
     @property
     def report(self) -> TaskReport | None:
-        """How results are compared and drawn; None: by their headlines. Its package does not import torch."""
+        """Comparison and drawing of results; None to compare headlines only. Its package must not import torch."""
         return None
 
     @property
     def grasp_predictor(self) -> GraspPredictor | None:
-        """A function of a loaded model, a cloud and a grasp that returns predicted values by column with their unit.
+        """Function of a loaded model, a cloud and a grasp that returns predicted values by column, with units.
 
-        ``tacpipe candidates`` calls it, or None if models predict recordings only.
+        It is called by ``tacpipe candidates``; None if the models predict only recordings.
         """
         return None
 
     def demo(self, output: Path) -> Demo | None:
-        """Return the task's part of ``tacpipe demo``, which writes below ``output``, or None if it has no part."""
+        """Return the task's part of ``tacpipe demo``, which writes below ``output``; None if it has none."""
         return None
 
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """The uncertainty that a trained model is to state."""
+    """Options of the calibration of a trained model."""
 
-    quantiles: tuple[int, ...]  # percent, ascending
-    promise: bool  # True if bands must hold in a new recording with at least their level
-    false_unknown: float  # fraction of slides of learned classes that may be answered unknown
+    quantiles: tuple[int, ...]  # in percent, ascending
+    promise: bool  # True if bands must have at least their nominal coverage in a new recording
+    false_unknown: float  # allowed fraction of slides of learned classes that are classified as unknown
     seed: int
 
 
 class Levelled(Protocol):
-    """The uncertainty of a model, as quantiles of some levels."""
+    """Uncertainty of a model by quantiles."""
 
     @property
     def percents(self) -> tuple[int, ...]:
-        """The levels in percent, ascending."""
+        """Quantile levels in percent, ascending."""
         ...  # a protocol has no body
 
 
@@ -169,7 +170,7 @@ Uncertain = TypeVar("Uncertain", bound=Levelled)
 
 
 def percents(levels: AnyFloats) -> tuple[int, ...]:
-    """Return levels, which are fractions, in percent.
+    """Convert levels from fractions to percent.
 
     >>> import numpy as np
     >>> percents(np.array([0.1, 0.5, 0.9]))
@@ -179,9 +180,9 @@ def percents(levels: AnyFloats) -> tuple[int, ...]:
 
 
 def quantiles_of(uncertainty: Uncertain | None, requested: Sequence[int]) -> tuple[Uncertain, list[int]]:
-    """Return the uncertainty of a model, and the indices of the ``requested`` quantiles, in percent.
+    """Return a model's uncertainty, and the indices of the ``requested`` quantiles in percent.
 
-    Raises `TacpipeError` if the model has none, or not these.
+    Raises `TacpipeError` if the model has no uncertainty or lacks one of these quantiles.
     """
     if uncertainty is None:
         raise TacpipeError(
