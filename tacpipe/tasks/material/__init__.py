@@ -1,5 +1,6 @@
-"""The material under the finger, classified from one slide of a tactile sensor, learned jointly across unlike sensors.
+"""Classify the material under the finger from one slide of a tactile sensor, with joint learning across different sensors.
 
-A slide is the table of frames that ``tacpipe segment slides`` keeps of a recording. Each sensor has its own reader;
-networks may be trained so that slides of the same material get the same latents, whichever sensor recorded them.
+A slide is the table of frames that ``tacpipe segment slides`` extracts from a recording. Each sensor has its own
+reader. Networks can be trained so that slides of the same material have the same latents, whichever sensor recorded
+them.
 """

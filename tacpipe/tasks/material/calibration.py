@@ -1,4 +1,4 @@
-"""Give a trained classifier calibrated probabilities and the answer ``unknown``, and evaluate both."""
+"""Calibrate the probabilities of a trained classifier, add the answer ``unknown``, and evaluate both."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 def calibrate(
     model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, validation: Dataset
 ) -> dict[str, bytes]:
-    """Return the files of a classifier whose probabilities are calibrated on validation slides, with a threshold of unknown.
+    """Return the files of a classifier with probabilities and a threshold of unknown calibrated on validation slides.
 
-    Raises `TacpipeError` if the model learned from these validation slides, where a sensor has none, and for too few.
+    Raises `TacpipeError` if the model was trained on these slides, a sensor has none, or there are too few.
     """
     classifier = Classifier.load(model)
     training_by_sensor, validation_by_sensor = (classifier.read(part, labelled=True) for part in (training, validation))
@@ -81,7 +81,7 @@ def calibrate(
 
 
 def _errors(scores: Any, labels: Any, temperature: float) -> dict[str, float]:
-    """Return the expected calibration error on the slides that the temperature was fitted on, before it and after."""
+    """Return the expected calibration error before and after scaling by the temperature, on the slides it was fitted on."""
     errors = {}
     for name, divisor in (("before", 1.0), ("after", temperature)):
         probabilities = calibration.probabilities(scores, divisor)
@@ -95,7 +95,7 @@ def _with_learned_labels(classifier: Classifier, slides: Slides, held_out: set[i
 
 
 def _check(classifier: Classifier, training: BySensor, validation: BySensor) -> None:
-    """Refuse sensors without slides, and validation slides that the model learned from."""
+    """Raise `TacpipeError` for sensors without slides, and for validation slides that the model was trained on."""
     for part, role in ((training, "train"), (validation, "val")):
         missing = sorted(set(classifier.layouts) - set(part))
         if missing:
@@ -118,18 +118,18 @@ ANSWERS = "answers.csv"
 
 @dataclass
 class Answers:
-    """The answers of a calibrated classifier for slides, by sensor; empty if it is not calibrated."""
+    """Answers of a calibrated classifier for slides, by sensor; empty if it is not calibrated."""
 
     classifier: Classifier
-    labels: Mapping[str, str] = field(default_factory=dict)  # recording to its label as text
+    labels: Mapping[str, str] = field(default_factory=dict)  # recording -> its label as text
     calibration: dict[str, ProbabilityMeasures] = field(default_factory=dict)
     unknown: dict[str, UnknownMeasures] = field(default_factory=dict)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
     def add(self, slides: Slides, in_training: Bools) -> Bools:
-        """Measure slides of one sensor, of known classes and of others, and return which are of known ones (slide,).
+        """Evaluate slides of one sensor, and return a mask (slide,) of those of known classes.
 
-        Slides that were ``in_training`` (slide,) in training or validation do not count.
+        Slides that are ``in_training`` (slide,), for training or validation, are excluded from the measures.
         """
         classifier, sensor = self.classifier, slides.layout.sensor
         is_known = np.isin(slides.materials, classifier.classes)
@@ -192,7 +192,7 @@ class Answers:
             )
 
     def metrics(self) -> MaterialMetrics:
-        """Return what ``metrics.json`` states of the answers."""
+        """Return the entries of ``metrics.json``."""
         metrics: MaterialMetrics = {}
         if self.calibration:
             metrics["calibration"] = self.calibration
@@ -201,7 +201,7 @@ class Answers:
         return metrics
 
     def files(self) -> dict[str, bytes]:
-        """Return ``answers.csv``: a row a slide: class named, its probability, score of known, answer, label."""
+        """Return ``answers.csv`` with one row per slide: best class, its probability, score of known, answer, label."""
         if not self.classifier.calibrations:
             return {}
         text = io.StringIO()
@@ -212,7 +212,7 @@ class Answers:
 
 
 def _stated(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) -> StatedProbabilities:
-    """Return how the probabilities of scores (slide, class), divided by a temperature, fit the slides' labels (slide,)."""
+    """Return how the softmax of scores (slide, class) / temperature fits the slides' labels (slide,)."""
     probabilities = calibration.probabilities(scores, divisor)
     confidence = probabilities.max(axis=1)
     return {
@@ -224,7 +224,7 @@ def _stated(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) ->
 
 
 def _add_false_unknown(measures: UnknownMeasures, refused: Bools) -> None:
-    """Add the fraction of slides of learned classes that are refused (slide,), with Wilson's interval over slides."""
+    """Add the fraction of refused slides (slide,) of learned classes, with Wilson's interval over slides."""
     if len(refused):
         low, high = wilson(int(refused.sum()), len(refused))
         measures["false_unknown"], measures["false_unknown_n"] = float(refused.mean()), len(refused)
@@ -232,10 +232,10 @@ def _add_false_unknown(measures: UnknownMeasures, refused: Bools) -> None:
 
 
 def _add_false_known(measures: UnknownMeasures, answered: Bools, materials: Sequence[str]) -> None:
-    """Add the fraction of slides of other classes that are answered with a class (slide,).
+    """Add the fraction of slides of other classes that are assigned to a class (slide,).
 
-    Its interval is over materials, because the rate is about materials that nobody has seen, and slides of one are alike.
-    It is left out if these are fewer than `MIN_CLUSTERS`.
+    Its interval is over materials, because the rate concerns unseen materials and slides of one material are similar.
+    It is omitted if there are fewer than `MIN_CLUSTERS` materials.
     """
     if not len(answered):
         return

@@ -1,4 +1,4 @@
-"""A trained classifier of materials, as it lies in a model's files."""
+"""A trained classifier of materials, loaded from model files."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.training.scaling import Affine
 
 TASK = "material"
-CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
-MAX_FRAMES = 100_000  # longest slide
+CHOSEN = ".chosen"  # suffix of the name of a readout's selection values, which may be NaN
+MAX_FRAMES = 100_000  # maximum length of a slide
 NEEDED = {
     **dict.fromkeys(("classes", "quantities"), list),
     **dict.fromkeys(("sensors", "params", "trained_on"), dict),
@@ -53,34 +53,34 @@ Baseline = Level | ReadoutModel | FittedEstimator
 
 @dataclass(frozen=True)
 class ReaderOutput:
-    """Predictions of a reader for slides."""
+    """A reader's predictions for slides."""
 
     scores: Float32s  # (slide, class), in the order of the model's classes
     latents: Float32s | None  # (slide, latent)
 
 
 class Reader(ABC):
-    """A fitted model of one sensor."""
+    """Fitted model of one sensor."""
 
-    GIVES_LIKELIHOODS: ClassVar[bool] = False  # True: the softmax of scores are probabilities, if uncertain ones
+    GIVES_LIKELIHOODS: ClassVar[bool] = False  # True if the softmax of scores is a probability, possibly uncalibrated
 
     @property
     def any_length(self) -> bool:
-        """True if slides of fewer frames than in training are read, too."""
+        """Whether slides shorter than in training are accepted."""
         return False
 
     @abstractmethod
     def read(self, frames: Float32s) -> ReaderOutput:
-        """Return scores, and latents if it has any, of slides (slide, time, channel) in device counts."""
+        """Return scores, and latents if available, of slides (slide, time, channel) in device counts."""
 
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
-        """Return the scores (slide, class) of latents by what another sensor learned. Needs a reader with latents."""
+        """Return the scores (slide, class) of latents by another sensor's classifier; requires a reader with latents."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class NetworkReader(Reader):
-    """A network of one sensor and the scaling in front of it."""
+    """Network of one sensor and its input scaling."""
 
     GIVES_LIKELIHOODS: ClassVar[bool] = True
     network: Network
@@ -88,7 +88,7 @@ class NetworkReader(Reader):
 
     @property
     def any_length(self) -> bool:
-        """True if the network reads slides of fewer frames than in training, too."""
+        """Whether the network accepts slides shorter than in training."""
         return bool(getattr(self.network, "ANY_LENGTH", False))
 
     def read(self, frames: Float32s) -> ReaderOutput:
@@ -105,12 +105,12 @@ class NetworkReader(Reader):
         return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
-        """Return the scores (slide, class) that the classifier of a partner gives to latents of this sensor."""
+        """Return the scores (slide, class) of this sensor's latents by a partner's classifier."""
         assert isinstance(partner, NetworkReader)
         return partner.scores_of(latents)
 
     def scores_of(self, latents: Float32s) -> Float32s:
-        """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
+        """Return the scores (slide, class) of latents, possibly of another sensor, by this sensor's classifier."""
         device = next(self.network.parameters()).device
         self.network.eval()
         with torch.no_grad():
@@ -120,14 +120,14 @@ class NetworkReader(Reader):
 
 @dataclass(frozen=True)
 class ReadoutReader(Reader):
-    """Features and a linear readout of one sensor."""
+    """Features and linear readout of one sensor."""
 
     fitted: ReadoutModel
     classes: tuple[int, ...]
 
     @property
     def any_length(self) -> bool:
-        """True if slides of fewer frames than in training are read, too: by statistics over time."""
+        """Whether slides shorter than in training are accepted; true for statistics over time."""
         return self.fitted.ANY_LENGTH
 
     def read(self, frames: Float32s) -> ReaderOutput:
@@ -147,18 +147,18 @@ class SpectraReader(Reader):
     classes: tuple[int, ...]
 
     def read(self, frames: Float32s) -> ReaderOutput:
-        """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
+        """Return log-likelihoods, and spectra as latents, of slides (slide, time, channel) in device counts."""
         spectra = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
         return ReaderOutput(spread(self.transfer.learned.scores(spectra), self.transfer.classes, self.classes), spectra)
 
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
-        """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
+        """Return the scores (slide, class) of spectra by the classes learned from other sensors only."""
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
 @dataclass(frozen=True)
 class EstimatorReader(Reader):
-    """An estimator of one sensor."""
+    """Estimator of one sensor."""
 
     fitted: FittedEstimator
     classes: tuple[int, ...]
@@ -169,10 +169,10 @@ class EstimatorReader(Reader):
 
 
 class Classifier:
-    """Readers of one or more sensors that predict the material of a slide; `model` adds what reads recordings."""
+    """Readers of one or more sensors that predict a slide's material; `model` adds the functions that read recordings."""
 
     def __init__(self, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> None:
-        self.chain = chain  # the stages that it was trained behind; None: unknown
+        self.chain = chain  # stages that the model was trained behind; None if unknown
         config: MaterialConfig = model_files.tree(files, CONFIG, NEEDED)
         self.config = config
         self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
@@ -196,10 +196,10 @@ class Classifier:
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the classifier of a model's files. Raises `TacpipeError` if they are of another task.
+        """Return the classifier in a model's files. Raises `TacpipeError` if they are of another task.
 
-        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
-        that recordings went through the same.
+        ``chain`` contains the stages that it was trained behind, as listed in its manifest. Without it `predict` cannot
+        check that recordings passed through the same stages.
         """
         if CONFIG not in files:
             raise TacpipeError(
@@ -217,7 +217,7 @@ class Classifier:
         return classifier
 
     def _try(self) -> None:
-        """Read a slide of noise of each sensor, and raise where a part does not fit another."""
+        """Read a slide of noise of each sensor, so that incompatible parts raise an error."""
         if not self.layouts or not self.classes or len({*self.classes}) != len(self.classes):
             raise ValueError(f"there are {len(self.layouts)} sensors and {len(self.classes)} classes")
         if self.naming.names and not set(self.classes) <= set(range(len(self.naming.names))):
@@ -234,33 +234,33 @@ class Classifier:
                 raise ValueError(f"slides of {name} get scores of {shapes}, not of {len(self.classes)} classes")
 
     def probabilities(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
-        """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
+        """Return the probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
-        Of a model that `tacpipe calibrate` made, scores are divided by the temperature first that makes them frequencies.
-        Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
-        material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
-        scale: there it only orders the classes. See `predict` for the arguments.
+        For a model from `tacpipe calibrate`, scores are first divided by the temperature, so that probabilities match
+        observed frequencies. Networks are trained to output class probabilities. For ``spectra`` the result is the
+        posterior under equal priors. Scores of ``minirocket`` and ``statistics`` are distances to class means without a
+        fixed scale, so their softmax only ranks the classes. `predict` describes the arguments.
         """
         return self.probabilities_of(self.scores(slides, sensor), self._sensor(sensor))
 
     def probabilities_of(self, scores: Float32s, sensor: str) -> Float32s:
-        """Return the probabilities (slide, class) that scores (slide, class) of slides of a sensor state."""
+        """Return the probabilities (slide, class) for scores (slide, class) of a sensor's slides."""
         probabilities = (
             self.calibrations[sensor].probabilities(scores) if self.calibrations else calibration.probabilities(scores)
         )
         return probabilities.astype(np.float32)
 
     def answers(self, slides: Float32s | Floats, sensor: str = "") -> list[str]:
-        """Return the name of the class of each slide, or ``unknown``, of a model that `tacpipe calibrate` made.
+        """Return the class name of each slide, or ``unknown``, for a model from `tacpipe calibrate`.
 
-        See `predict` for the arguments. Raises `UsageError` for another model.
+        `predict` describes the arguments. Raises `UsageError` for an uncalibrated model.
         """
         frames = np.asarray(slides, np.float32)
         scores = self.scores(frames, sensor)
         return self.answered(scores, frames[None] if frames.ndim == 2 else frames, self._sensor(sensor))
 
     def answered(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
-        """Return the answers for slides (slide, time, channel) of a sensor, whose scores (slide, class) are known."""
+        """Return the answers for slides (slide, time, channel) of a sensor, from their scores (slide, class)."""
         if not self.calibrations:
             raise UsageError(
                 "The model has no calibrated probabilities and no answer unknown. Run `tacpipe calibrate MODEL DATASET "
@@ -270,7 +270,7 @@ class Classifier:
         return [UNKNOWN_ANSWER if no else str(name) for no, name in zip(refused, names, strict=True)]
 
     def is_unknown(self, scores: Float32s, frames: Float32s, sensor: str) -> Bools:
-        """Return which slides are like no class (slide,), by the threshold of their sensor; none without a calibration."""
+        """Return a mask (slide,) of slides below the sensor's threshold of known classes; all False if uncalibrated."""
         sensor_calibration = self.calibrations.get(sensor)
         return (
             np.zeros(len(scores), dtype=bool)
@@ -279,7 +279,7 @@ class Classifier:
         )
 
     def _sensor(self, sensor: str) -> str:
-        """Return the sensor of slides: the one that is named, or the only one."""
+        """Return the sensor of slides: ``sensor`` or, if that is empty, the only one."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
                 f"The model knows the sensors {', '.join(self.layouts)}; name the one that recorded the slides."
@@ -299,7 +299,7 @@ class Classifier:
         return self.readers[layout.sensor].read(frames).scores
 
     def layout(self, sensor: str) -> SlideLayout:
-        """Return the layout of a sensor's slides. Raises `TacpipeError` if the model does not know the sensor."""
+        """Return the layout of a sensor's slides. Raises `TacpipeError` if the model has no such sensor."""
         if sensor not in self.layouts:
             raise TacpipeError(
                 f"The model does not know the sensor {sensor}; it was trained on {', '.join(self.layouts)}. "
@@ -310,11 +310,10 @@ class Classifier:
     def read(
         self, recordings: Dataset, *, labelled: bool = False, advance: Callable[..., None] | None = None
     ) -> dict[str, Slides]:
-        """Return the slides of a dataset by sensor, as this model reads them.
+        """Return the slides of a dataset by sensor, with the channels of this model.
 
-        Those of other sensors are left out where the model was trained for named ones, and refused where it was trained
-        for all that there were. ``advance`` is called after each. Raises `TacpipeError` for what
-        `tacpipe.tasks.material.slides.read` refuses.
+        Slides of other sensors are skipped if the model was trained for named sensors; otherwise they raise an error.
+        ``advance`` is called after each slide. Raises `TacpipeError` as `tacpipe.tasks.material.slides.read`.
         """
         only = tuple(self.layouts) if self.params.sensors else ()
         present_sensors = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
@@ -327,7 +326,7 @@ class Classifier:
         return by_sensor
 
     def check(self, slides: Slides) -> None:
-        """Raise `TacpipeError` if slides are of another layout than those that the model was trained on."""
+        """Raise `TacpipeError` if the layout of slides differs from that of the training slides."""
         layout = self.layout(slides.layout.sensor)
         if not layout.alike(slides.layout):
             raise TacpipeError(
@@ -336,13 +335,13 @@ class Classifier:
             )
 
     def best_classes(self, scores: Float32s) -> Int64s:
-        """Return the number of the class of the highest score of each slide (slide,)."""
+        """Return the class number with the highest score of each slide (slide,)."""
         best: Int64s = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
         return best
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of ``classes``, as the labels of the recordings have them."""
+        """Names of ``classes``, as in the labels of recordings."""
         return tuple(map(self.naming.name, self.classes))
 
     def partner(self, sensor: str) -> str:
@@ -354,16 +353,16 @@ class Classifier:
 
 @dataclass(frozen=True)
 class StoredClassifier:
-    """The files of a classifier, and the ways to read them that the task offers to architectures."""
+    """Files of a classifier, and the loaders that the task offers to architectures."""
 
     files: Mapping[str, bytes]
     config: MaterialConfig
     layouts: Mapping[str, SlideLayout]
     classes: tuple[int, ...]
-    weights: str = WEIGHTS  # name of the file that `networks` and readouts are read from
+    weights: str = WEIGHTS  # name of the file with the weights of networks and readouts
 
     def readouts(self, kind: type[ReadoutModel]) -> dict[str, Reader]:
-        """Return features with a linear readout by sensor."""
+        """Return the features with linear readouts by sensor."""
         arrays = model_files.arrays(self.files[self.weights], self.weights, but=CHOSEN)
         return {
             name: ReadoutReader(kind.from_tensors(tensors_under(f"{name}.", arrays)), self.classes)
@@ -371,7 +370,7 @@ class StoredClassifier:
         }
 
     def spectra(self) -> dict[str, Reader]:
-        """Return spectra over spatial frequency by sensor."""
+        """Return the spectra over spatial frequency by sensor."""
         arrays, stored = model_files.arrays(self.files[self.weights], self.weights), self.config["spectra"]
         bands = Bands(stored["way_m"], np.array(stored["edges_per_m"]))
         return {
@@ -386,7 +385,7 @@ class StoredClassifier:
         }
 
     def networks(self, params: Params) -> dict[str, Reader]:
-        """Return the networks that ``params`` build by sensor."""
+        """Return the networks by sensor, built by ``params``."""
         tensors = model_files.tensors(self.files[self.weights], self.weights)
         readers: dict[str, Reader] = {}
         for name in self.layouts:
@@ -403,7 +402,7 @@ class StoredClassifier:
         return {name: EstimatorReader(estimator, self.classes) for name, estimator in fitted.items()}
 
     def shuffled_estimators(self, params: Estimator) -> dict[str, Baseline]:
-        """Return the estimators that were fitted to shuffled labels by sensor."""
+        """Return the estimators fitted to shuffled labels by sensor."""
         return {**self._estimators(params, SHUFFLED_ESTIMATORS)}
 
     def baseline(self, name: str, kind: type[Level | ReadoutModel]) -> dict[str, Baseline]:
@@ -417,7 +416,7 @@ class StoredClassifier:
 
 
 def spread(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:
-    """Return scores of ``scored_classes`` as columns of all ``classes``; classes without a score have -inf.
+    """Return scores of ``scored_classes`` as columns of all ``classes``, with -inf for classes without a score.
 
     >>> spread(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()
     [[1.0, -inf, 2.0]]

@@ -1,8 +1,8 @@
-"""Check the estimators and networks that architectures build, and store fitted estimators of scikit-learn without pickle.
+"""Check the estimators and networks that architectures build, and store scikit-learn estimators without pickle.
 
-A file of skops is a zip of a description, JSON, and of arrays. It is written so that the same estimator has the same bytes,
-and read only where each type in it is one that skops validates (most of scikit-learn, numpy and scipy), or of the package
-of the architecture, which is installed code, or named by it.
+A skops file is a zip archive of a JSON description and arrays. It is written so that equal estimators have equal bytes.
+It is loaded only if each of its types is validated by skops (most of scikit-learn, numpy and scipy), belongs to the
+architecture's package, which is installed code, or is listed by the architecture.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from tacpipe.tasks.material.losses import Network
 from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
 
 SCHEMA = "schema.json"
-WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all members of a zip
-TRIED = 2  # slides
-MIN_PROBABILITY = 1e-12  # probability
-MAX_UNPACKED_BYTES = 2**31  # bytes that a file may unpack to
+WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all archive members
+TRIED = 2  # number of slides for a trial
+MIN_PROBABILITY = 1e-12  # lower bound of probabilities before the logarithm
+MAX_UNPACKED_BYTES = 2**31  # maximum unpacked size of a file
 
 
 @dataclass(frozen=True)
 class FittedEstimator:
-    """A fitted estimator and what it reads of a slide."""
+    """A fitted estimator and the definition of its features."""
 
     estimator: Any
     features: Callable[[Float32s], Float32s]
 
     @classmethod
     def fit(cls, params: Estimator, frames: Float32s, materials: Int64s) -> Self:
-        """Return the estimator that ``params`` build, fitted on slides (slide, time, channel) and their classes (slide,).
+        """Return the estimator of ``params``, fitted on slides (slide, time, channel) with classes (slide,).
 
-        Raises `TacpipeError` if features or scores are not what `Estimator` states.
+        Raises `TacpipeError` if features or scores do not have the form required by `Estimator`.
         """
         fitted = cls(params.build(params.seed), params.features)
         fitted.estimator.fit(fitted._features(frames), materials)
@@ -54,13 +54,14 @@ class FittedEstimator:
 
     @property
     def classes(self) -> tuple[int, ...]:
-        """The classes that it scores, in order."""
+        """Classes that it scores, in order."""
         return tuple(int(number) for number in self.estimator.classes_)
 
     def scores(self, frames: Float32s) -> Float32s:
-        """Return the score of each class for slides (slide, time, channel), (slide, class).
+        """Return the score of each class (slide, class) for slides (slide, time, channel).
 
-        Probabilities become their logarithms, whose softmax they are. Raises `TacpipeError` for another shape.
+        Probabilities are converted to logarithms, so that their softmax restores them. Raises `TacpipeError` for
+        another shape.
         """
         read = self._features(frames)
         if hasattr(self.estimator, "predict_proba"):
@@ -88,7 +89,7 @@ class FittedEstimator:
 
 
 def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
-    """Return fitted estimators by sensor as the bytes of a file. Raises `TacpipeError` for what cannot be read back."""
+    """Return the file content of fitted estimators by sensor. Raises `TacpipeError` if it could not be read back."""
     with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import dumps, get_untrusted_types
         from skops.io.exceptions import UnsupportedTypeException
@@ -110,7 +111,7 @@ def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
 def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEstimator]:
     """Return the estimators by sensor in the file ``name``.
 
-    Raises `TacpipeError` if it is not such a file, and where it has types that the architecture does not trust.
+    Raises `TacpipeError` if it is not a skops file, or has types that the architecture does not trust.
     """
     with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import get_untrusted_types, loads
@@ -136,16 +137,17 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEs
 
 
 def _refused(types: Iterable[str], params: Estimator) -> str:
-    """Return those of the types that neither the architecture's package has nor the architecture trusts, as text."""
+    """Return, as text, the types that are neither in the architecture's package nor trusted by it."""
     package = type(params).__module__.partition(".")[0]
     foreign = [name for name in types if name not in params.TRUSTED and not _is_defined_in(package, name)]
     return listed([plain(name, 100) for name in foreign]) if foreign else ""
 
 
 def _is_defined_in(package: str, name: str) -> bool:
-    """Return whether a type or function is a package's own, and not one that its modules import from elsewhere.
+    """Return whether a type or function is defined in a package, rather than imported by one of its modules.
 
-    A file may name anything that a module of the package holds, as ``package.module.run`` of ``from subprocess import run``.
+    Without this check a file could refer to any name in a module, e.g. ``package.module.run`` after
+    ``from subprocess import run``.
     """
     if name.partition(".")[0] != package:
         return False
@@ -157,7 +159,7 @@ def _is_defined_in(package: str, name: str) -> bool:
 
 
 def _canonical(content: bytes) -> bytes:
-    """Return a file of skops with numbers in place of addresses of memory and without times, so that it repeats."""
+    """Return a skops file without times and with sequential numbers for memory addresses, so that it is reproducible."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {member: file.read(member) for member in file.namelist()}
     numbers: dict[Any, int] = {}
@@ -174,7 +176,7 @@ def _canonical(content: bytes) -> bytes:
 
 
 def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
-    """Return a description whose ``__id__`` are counted from 1 in the order in which they come, and files named by them."""
+    """Return a description with ``__id__`` numbered from 1 in order of occurrence, and the file names to match."""
     if isinstance(node, list):
         return [_renumbered(child, numbers) for child in node]
     if not isinstance(node, Mapping):
@@ -190,15 +192,17 @@ def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
 
 
 def _member(name: str, numbers: dict[Any, int]) -> str:
-    """Return the name of a member, which skops makes of an address."""
+    """Return a member's name with its number instead of the memory address from skops."""
     stem, dot, ending = name.partition(".")
     return f"{numbers.setdefault(int(stem), len(numbers) + 1)}{dot}{ending}" if stem.isdigit() else name
 
 
 def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Network:
-    """Return the network that ``params`` build for a sensor, of random weights; a plain one wrapped, to be called as others.
+    """Return the network of ``params`` for a sensor, with random weights.
 
-    Raises `TacpipeError` if they build something else.
+    A plain network is wrapped in the common interface.
+
+    Raises `TacpipeError` if the params build anything else.
     """
     network = params.build(shape) if isinstance(params, NetworkParams) else None
     if not isinstance(network, nn.Module):
@@ -210,7 +214,7 @@ def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Netwo
 
 @torch.no_grad()
 def check_network(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
-    """Raise `TacpipeError` if a network returns something else than scores for ``slides`` (slide, time, channel)."""
+    """Raise `TacpipeError` if a network does not return scores for ``slides`` (slide, time, channel)."""
     training = network.training
     output = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
     network.train(training)

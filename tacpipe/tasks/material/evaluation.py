@@ -1,4 +1,4 @@
-"""Evaluation of a classifier of materials: on every slide, next to its baselines, with intervals."""
+"""Evaluate a classifier of materials on every slide, next to its baselines, with intervals."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
 
 
 def accuracy(correct: Mapping[str, Bools]) -> SensorAccuracy:
-    """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
+    """Return accuracy, correct and total number, and 95 % Wilson interval by sensor; sensors without slides are omitted.
 
-    Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
-    of labels.
+    Accuracy is the fraction of correct predictions. Equation (4) of the paper, taken literally, would be a mean squared
+    difference of labels.
 
     >>> import numpy as np
     >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
@@ -56,13 +56,13 @@ def accuracy(correct: Mapping[str, Bools]) -> SensorAccuracy:
 
 
 def chance(counts: Mapping[str, int], classes: int) -> ChanceAccuracy:
-    """Return what guessing one of ``classes`` gets, by sensor."""
+    """Return the accuracy of guessing one of ``classes`` by sensor."""
     shares = {sensor: 1 / classes for sensor, count in counts.items() if count}
     return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
 
 
 def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> MaterialScores:
-    """Return the scores of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,)."""
+    """Return the scores of predictors; ``right`` contains masks of correct slides (slide,) by predictor and sensor."""
     counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
     skill = disagreements = None
     if MEAN_LEVEL in right:
@@ -78,7 +78,7 @@ def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> MaterialS
 
 
 def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:
-    """Return how often each sensor's slides of a material were given each name, as CSV."""
+    """Return the confusion counts of each sensor's slides as CSV."""
     counts: dict[tuple[str, Any, Any], int] = {}
     for key in zip(sensors, materials, predicted, strict=True):
         counts[key] = counts.get(key, 0) + 1
@@ -94,27 +94,28 @@ PREDICTIONS = "predictions"
 
 @dataclass
 class Evaluated:
-    """The slides of one sensor and the predictions for them."""
+    """Slides of one sensor and the predictions for them."""
 
     slides: Slides
-    in_training: Bools  # (slide,): the model was trained on it
+    in_training: Bools  # (slide,), whether the model was trained on it
     output: ReaderOutput
-    predicted: dict[str, Int64s]  # predictor -> the material it names (slide,)
-    held_out: Bools  # (slide,): its material's label was not learned by this sensor
-    zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's names: of all materials, of held-out ones
-    counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
+    predicted: dict[str, Int64s]  # predictor -> predicted material (slide,)
+    held_out: Bools  # (slide,), whether this sensor did not learn its material's label
+    zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's predictions: among all, held-out
+    counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,), whether it is evaluated
 
     def is_right(self, predictor: str, chosen: Bools) -> Bools:
-        """Return which of the chosen slides a predictor named rightly."""
+        """Return which of the chosen slides a predictor classified correctly."""
         is_right: Bools = (self.predicted[predictor] == self.slides.materials)[chosen]
         return is_right
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return metrics, confusions and predictions of a model, its files given, on slides, next to its baselines.
+    """Return metrics, confusions and predictions of a model and its baselines on slides.
 
-    Every slide counts. Slides that the model was trained or chosen on are recognised by their digests and reported
-    apart, under ``seen``. Raises `TacpipeError` if slides have no label or are not what the model reads.
+    ``model`` contains the files of the model. Every slide counts. Slides used for training or model selection are
+    recognised by their digests and reported under ``seen``. Raises `TacpipeError` if slides have no label or do not fit
+    the model.
     """
     classifier = Classifier.load(model)
     trained_on = set(classifier.config["trained_on"].values())
@@ -127,7 +128,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             for name, recording in recordings.recordings.items()
         },
     )
-    with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
+    with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # read, then classify
         for sensor, slides in _read(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
             if is_learned.any() or not classifier.calibrations:
@@ -171,7 +172,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 
 def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
-    """Return labelled slides; of a calibrated classifier their classes may be others than those that it knows."""
+    """Return labelled slides; with a calibrated classifier their classes may be unknown to it."""
     key = classifier.naming.key
     all_labelled = all(shard.attributes.get(key) is not None for shard in recordings.recordings.values())
     return classifier.read(recordings, labelled=not (classifier.calibrations and all_labelled), advance=advance)
@@ -192,7 +193,7 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
     params = classifier.params
-    mapped = bool(params.aligned_sensor)  # all have the frozen sensor's classifier already
+    mapped = bool(params.aligned_sensor)  # all sensors already have the frozen sensor's classifier
     if classifier.config.get("joint") and output.latents is not None and not mapped:
         predicted[SWAPPED] = _exchanged(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
@@ -204,7 +205,7 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
     counted = np.ones(len(slides), bool)
     if batch := params.dropped_beyond:
-        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
+        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer slides than a batch are all counted
     evaluated = Evaluated(
         slides,
         np.array([digest in trained_on for digest in slides.digests], bool),
@@ -219,10 +220,10 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
 
 
 def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
-    """Return the materials that the classifier of another sensor gives latents, in this sensor's names of materials.
+    """Return the materials predicted by another sensor's classifier, in terms of this sensor's materials.
 
-    Sensors that were aligned by permuted classes share a space in which one's material lies where another's does; the
-    name is then taken back through that permutation.
+    Sensors aligned with permuted classes share a space in which each material has the position of its partner.
+    Predictions are then mapped back by the inverse permutation.
     """
     scores = _partner_scores(classifier, sensor, latents)
     materials = classifier.best_classes(scores)
@@ -246,14 +247,14 @@ def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> F
 
 
 def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]) -> tuple[Int64s, Int64s]:
-    """Return the materials that another sensor's classifier names: among all materials, and among those held out."""
+    """Return another sensor's predictions: among all materials, and among held-out ones only."""
     scores = _partner_scores(classifier, sensor, latents)
     is_held_out = np.isin(classifier.classes, held_out)
     return classifier.best_classes(scores), classifier.best_classes(np.where(is_held_out, scores, -np.inf))
 
 
 def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> MaterialScores:
-    """Return the metrics on the slides that the model has seen, or on those it has not."""
+    """Return the metrics on seen or on unseen slides."""
     chosen = {
         sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
     }
@@ -270,7 +271,7 @@ def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen
 
 
 def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> list[headline.Headline]:
-    """Return how the model compares with its baselines on the slides of each sensor that it has not seen."""
+    """Return comparisons of the model with its baselines on each sensor's unseen slides."""
     sensor_headlines = []
     for sensor, result in evaluated.items():
         chosen = ~result.in_training & result.counted & ~result.held_out
@@ -288,7 +289,7 @@ def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> li
 
 
 def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> ZeroShotAccuracy | None:
-    """Return how well another sensor's classifier names materials whose labels a sensor did not learn."""
+    """Return the accuracy of another sensor's classifier on materials whose labels a sensor did not learn."""
     correct, correct_among_held_out, chances = {}, {}, {}
     for sensor, result in evaluated.items():
         if result.zero_shot is None:
@@ -309,9 +310,9 @@ def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Ze
 def predictions_table(
     evaluated: Mapping[str, Evaluated], classifier: Classifier, sessions: Mapping[str, Attribute] | None = None
 ) -> pa.Table:
-    """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
+    """Return one row per slide: its description, all predictions, and the model's scores and latents.
 
-    ``sessions`` maps a slide to its session, where one is recorded.
+    ``sessions`` maps slides to their sessions, if recorded.
     """
     names_for, count = classifier.naming.names_for, {sensor: len(result.slides) for sensor, result in evaluated.items()}
     columns: list[tuple[pa.Field, Any]] = [
@@ -340,7 +341,7 @@ def predictions_table(
 
 
 def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return a column of scores a material."""
+    """Return one column of scores per material."""
     about = {"quantity": "score"}
     return [
         (pa.field(f"score_{name.zfill(2)}", pa.float32(), metadata=about), scores[:, number])
@@ -349,7 +350,7 @@ def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Fie
 
 
 def latent_columns(latents: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return a column a latent."""
+    """Return one column per latent."""
     about = {"quantity": "latent"}
     return [
         (pa.field(f"z{number + 1:02d}", pa.float32(), metadata=about), latents[:, number])

@@ -1,4 +1,4 @@
-"""Compute the headline of materials, the accuracy on a sensor's slides, and number the classes of their labels."""
+"""Compute the headline of materials, the accuracy on a sensor's slides, and number the classes of labels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 TASK = "material"
 CHANCE = "chance"
-# predictors that are baselines; others are controls or the model's own
+# baselines; other predictors are controls or the model itself
 BASELINES = {"mean_level": "mean level alone", "level_only": "same readout of the level alone"}
 
 
@@ -40,10 +40,10 @@ def headline(
     model: str = "model",
     runs: int = 1,
 ) -> Headline | None:
-    """Return how a method compares with its baselines on the slides of a sensor.
+    """Return the comparison of a method with its baselines on a sensor's slides.
 
-    ``right`` holds, by predictor, then by seed and slide, how often the slide was classified right and how often at all.
-    Guessing among ``classes`` counts as a baseline too.
+    ``right`` contains, by predictor and then by seed and slide, the numbers of correct and of all classifications.
+    Guessing among ``classes`` is an additional baseline.
     """
     model_sums = _sums(right.get(model, {}))
     baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
@@ -79,7 +79,7 @@ MEASURE = Measure(
 
 
 class SensorAccuracy(TypedDict):
-    """How often a predictor names slides rightly, by sensor, with the 95 % Wilson interval."""
+    """Accuracy of a predictor by sensor, with the 95 % Wilson interval."""
 
     accuracy: dict[str, float]
     correct: dict[str, int]
@@ -89,26 +89,26 @@ class SensorAccuracy(TypedDict):
 
 
 class ChanceAccuracy(TypedDict):
-    """The accuracy of guesses by sensor."""
+    """Accuracy of guessing by sensor."""
 
     accuracy: dict[str, float]
     n: dict[str, int]
 
 
 class HeldOutAccuracy(SensorAccuracy):
-    """Accuracy on materials whose labels a sensor did not learn, and that of guesses."""
+    """Accuracy on materials whose labels a sensor did not learn, and that of guessing."""
 
     chance: dict[str, float]
 
 
 class ZeroShotAccuracy(HeldOutAccuracy):
-    """Accuracy out of all materials, and out of those held out alone."""
+    """Accuracy among all materials, and among the held-out ones only."""
 
     among_held_out: NotRequired[HeldOutAccuracy]
 
 
 class StatedProbabilities(TypedDict):
-    """How the stated probabilities of learned classes fit the slides."""
+    """How well predicted probabilities of learned classes fit the slides."""
 
     calibration_error: float
     log_loss: float
@@ -117,7 +117,7 @@ class StatedProbabilities(TypedDict):
 
 
 class ProbabilityMeasures(TypedDict):
-    """The probabilities of a sensor's classes before calibration and after."""
+    """Probabilities of a sensor's classes before and after calibration."""
 
     n: int
     temperature: float
@@ -126,9 +126,9 @@ class ProbabilityMeasures(TypedDict):
 
 
 class UnknownMeasures(TypedDict):
-    """The answers of a calibrated classifier for slides of learned classes and of others, of one sensor.
+    """Answers of a calibrated classifier for one sensor's slides of learned and of other classes.
 
-    Rates have their number of slides and the ends of their 95 % interval.
+    Rates include their number of slides and the bounds of their 95 % interval.
     """
 
     rule: str
@@ -148,16 +148,16 @@ class UnknownMeasures(TypedDict):
 
 @dataclass(frozen=True)
 class MaterialScores:
-    """Accuracy of all predictors on some slides, by sensor."""
+    """Accuracy of all predictors on a set of slides, by sensor."""
 
     predictors: dict[str, SensorAccuracy]
     chance: ChanceAccuracy
     slides: dict[str, int]
-    skill: dict[str, float] | None  # fraction of the mean level's wrong names that the model gets right
-    mcnemar: dict[str, float] | None  # exact probability of disagreements so unequal if both were as good
+    skill: dict[str, float] | None  # fraction of the mean level's errors that the model corrects
+    mcnemar: dict[str, float] | None  # exact p-value of McNemar's test
 
     def to_json(self) -> Json:
-        """Return the scores as ``metrics.json`` has them."""
+        """Return the scores as they are stored in ``metrics.json``."""
         compared = {"skill": self.skill, "mcnemar": {"model_vs_mean_level": self.mcnemar}}
         return {
             **self.predictors,
@@ -168,26 +168,26 @@ class MaterialScores:
 
 
 class MaterialMetrics(TypedDict, total=False):
-    """The parts of ``metrics.json`` next to `MaterialScores`; those without slides are left out."""
+    """Entries of ``metrics.json`` besides `MaterialScores`; entries without slides are omitted."""
 
-    calibration: dict[str, ProbabilityMeasures]  # by sensor
-    unknown: dict[str, UnknownMeasures]  # by sensor
+    calibration: dict[str, ProbabilityMeasures]  # sensor -> measures
+    unknown: dict[str, UnknownMeasures]  # sensor -> measures
     zero_shot: ZeroShotAccuracy
 
 
-UNKNOWN = -1  # stands where a slide has no label
+UNKNOWN = -1  # number of a slide without a label
 
 
 @dataclass(frozen=True)
 class Naming:
-    """The label of a recording that names its class, and the classes in order; without names they are whole numbers."""
+    """Label key that contains the class, and the class names in order; without names, classes are whole numbers."""
 
     key: str = KEY
     names: tuple[str, ...] = ()
 
     @classmethod
     def from_labels(cls, key: str, labels: Iterable[Attribute]) -> Naming:
-        """Return the naming of these labels: whole numbers from 0 stay, any other labels are sorted and numbered as text.
+        """Return the naming of labels: whole numbers from 0 are kept, any others are sorted and numbered as text.
 
         >>> Naming.from_labels("material", [3, 1]).names, Naming.from_labels("object", ["cup", None, "can"]).names
         ((), ('can', 'cup'))
@@ -198,7 +198,7 @@ class Naming:
         return cls(key, tuple(sorted({label_text(label) for label in present})))
 
     def number(self, label: Attribute) -> int:
-        """Return the number of a label, `UNKNOWN` for none. Raises `TacpipeError` for one that has no number."""
+        """Return the number of a label, or `UNKNOWN` for None. Raises `TacpipeError` for a label without a number."""
         if label is None:
             return UNKNOWN
         if not self.names:
@@ -210,11 +210,11 @@ class Naming:
         return self.names.index(label_text(label))
 
     def read(self, word: str) -> int:
-        """Return the number of a class that an option names. Raises `ValueError` if there is none of this name."""
+        """Return the number of a class from an option. Raises `ValueError` if there is no class of this name."""
         return self.names.index(word) if self.names else int(word)
 
     def name(self, number: int) -> str:
-        """Return the name of a class, as messages and columns have it.
+        """Return the name of a class for messages and columns.
 
         >>> Naming().name(3), Naming("material", ("cork", "felt")).name(1)
         ('3', 'felt')
@@ -222,13 +222,13 @@ class Naming:
         return self.names[number] if self.names else str(number)
 
     def names_for(self, numbers: Int64s) -> NDArray[Any]:
-        """Return the names of classes (slide,): text, or the numbers where these are the names."""
+        """Return the names of classes (slide,): text, or numbers if the classes have no names."""
         if not self.names:
             return numbers
         return np.array([self.names[number] if number >= 0 else "" for number in numbers.tolist()], dtype=np.str_)
 
     def write(self, config: StoredNaming) -> None:
-        """Add the naming to a model's configuration: nothing of whole numbers under the usual key."""
+        """Add the naming to a model's configuration; whole numbers under the default key add nothing."""
         if self.key != KEY:
             config["label"] = self.key
         if self.names:
@@ -240,11 +240,11 @@ class Naming:
         return cls(str(config.get("label", KEY)), tuple(map(str, config.get("names", ()))))
 
 
-NUMBERS = Naming()  # whole numbers, under the usual key
+NUMBERS = Naming()  # whole numbers, under the default key
 
 
 def label_text(label: Attribute) -> str:
-    """Return a label as text: true and false as they are written in YAML.
+    """Return a label as text; booleans are written as in YAML.
 
     >>> label_text(True), label_text(3), label_text("cork")
     ('true', '3', 'cork')
@@ -253,7 +253,7 @@ def label_text(label: Attribute) -> str:
 
 
 def label_field(name: str, values: AnyArray, quantity: str) -> tuple[pa.Field, list[Any]]:
-    """Return a column of classes and its values: int32 where they are whole numbers, else text, or nothing if unknown."""
+    """Return a column of classes and its values: int32 for whole numbers, otherwise text; unknown classes are null."""
     import pyarrow as pa
 
     about = {"quantity": quantity}

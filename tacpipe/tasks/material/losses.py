@@ -1,8 +1,8 @@
-"""The joint learning of networks on slides: batches of slides of unlike sensors, and losses.
+"""Learn networks jointly on slides: batches of slides of different sensors, and losses.
 
-The losses are reconstruction, classification, and alignment with other sensors. No slide of one sensor belongs to one of
-another; all that a pair shares is its material. So the latents are drawn together by labels, and a pairing of *other*
-materials serves as the control: see `permuted_classes`.
+The losses are reconstruction, classification, and alignment with other sensors. Slides of different sensors do not
+correspond to each other; a pair shares only its material. So latents are aligned by labels, and pairs of *different*
+materials are the control: see `permuted_classes`.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from tacpipe.models.recurrent_autoencoder import (
 from tacpipe.training.following import Line, Validated
 from tacpipe.training.loop import precise
 
-NONE = -1  # stands where a sensor has no slide in a row of a batch, and for the class of a slide without label
+NONE = -1  # index of a missing slide in a row of a batch, and class of a slide without label
 PAIRINGS = ("random", "fixed", "permuted")
-EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of the batches for a subsampled sensor: 1 of how many that is
+EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of batches for a subsampled sensor -> it learns from each n-th batch
 
 
 @dataclass(frozen=True)
 class BatchPairs:
-    """How the slides of all sensors are distributed over the batches of each epoch."""
+    """Distribution of the slides of all sensors over the batches of each epoch."""
 
     classes: Mapping[str, Tensor]  # sensor -> class of each slide, from 0; NONE for slides without label
     batch: int
-    pairing: str = "random"  # random: other pairs every epoch; fixed: drawn once; permuted: random, of other classes
-    shuffle: bool = True  # other batches every epoch; without, pairs are fixed as well
-    drop_last: bool = False  # leave out the batch that is not full
-    subsample_sensor: str = ""  # sensor that learns from a part of the batches alone
+    pairing: str = "random"  # random: new pairs in each epoch; fixed: drawn once; permuted: random, of other classes
+    shuffle: bool = True  # new batches in each epoch; without, pairs are fixed as well
+    drop_last: bool = False  # omit the last batch if it is not full
+    subsample_sensor: str = ""  # sensor that learns only from a subset of the batches
     subsample_percent: int = 100  # percentage of the batches
-    partners: Mapping[int, int] | None = None  # class of the first sensor -> class of the others, of permuted pairs
-    seed: int = 0  # seed of the pairs and orders that are drawn once
+    partners: Mapping[int, int] | None = None  # class of the first sensor -> class of the others, for permuted pairs
+    seed: int = 0  # seed of pairs and orders that are drawn once
 
     def __post_init__(self) -> None:
-        """Refuse options that do not fit."""
+        """Raise an error for incompatible options."""
         if self.pairing not in PAIRINGS:
             raise TacpipeError(f"pairing is {self.pairing!r}; it must be {', '.join(PAIRINGS)}.")
         if self.subsample_percent not in (100, 90, *EVERY):
@@ -63,10 +63,10 @@ class BatchPairs:
             )
 
     def epoch(self) -> list[dict[str, Tensor]]:
-        """Return the batches of an epoch: for each sensor the slide in every row of the batch, NONE where it has none.
+        """Return the batches of an epoch: for each sensor the slide in each row of the batch, or NONE.
 
-        What is random comes from torch's generator, and what is drawn once from ``seed``. Rows without any slide are
-        left out, and so are batches without.
+        Random choices use torch's generator; choices that are drawn once use ``seed``. Rows and batches without slides
+        are omitted.
         """
         rows = self._rows()  # (sensor, row)
         size = self.batch
@@ -83,7 +83,7 @@ class BatchPairs:
         return slide_batches
 
     def _rows(self) -> Tensor:
-        """Return the slide of each sensor in every row (sensor, row), in the order of the epoch."""
+        """Return the slide of each sensor in each row (sensor, row), in the order of the epoch."""
         seeded = torch.Generator().manual_seed(self.seed)
         pairs = None if self.pairing != "fixed" and self.shuffle else seeded
         rows = self._paired(pairs)
@@ -91,7 +91,7 @@ class BatchPairs:
         return rows[:, order]
 
     def _paired(self, generator: torch.Generator | None) -> Tensor:
-        """Return rows (sensor, row) of one class each, those without label at the end, alone in their rows."""
+        """Return rows (sensor, row) of one class each, followed by rows with a single slide without label."""
         blocks = []
         first = next(iter(self.classes.values()))
         all_classes = sorted({int(c) for classes in self.classes.values() for c in set(classes.tolist()) if c != NONE})
@@ -111,10 +111,10 @@ class BatchPairs:
 
 
 def visited(number: int, percent: int) -> bool:
-    """Return whether a subsampled sensor learns from the batch of this number, from 0.
+    """Return whether a subsampled sensor learns from the batch with this number, from 0.
 
-    The published code takes batches whose number is a multiple of 2, 4, 6 or 9 for 50, 25, 17 and 11 %, and so 288, 160,
-    96 and 64 of 576 slides. No such number gives 90 %; here each tenth batch is left out, which gives 512.
+    The published code uses batches whose number is a multiple of 2, 4, 6 or 9 for 50, 25, 17 and 11 %, i.e. 288, 160,
+    96 and 64 of 576 slides. No multiple gives 90 %; here each tenth batch is skipped, which leaves 512.
 
     >>> [32 * sum(visited(i, percent) for i in range(18)) for percent in (100, 90, 50, 25, 17, 11)]
     [576, 512, 288, 160, 96, 64]
@@ -125,9 +125,9 @@ def visited(number: int, percent: int) -> bool:
 
 
 def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
-    """Return another class for each class, all different and none its own: the partners of a permuted pairing.
+    """Return a different partner class for each class, for permuted pairs; all partners are distinct.
 
-    Raises `TacpipeError` with fewer than two classes.
+    Raises `TacpipeError` for fewer than two classes.
     """
     if len(classes) < 2:
         raise TacpipeError(f"{len(classes)} material cannot be paired with another one; permuted needs two or more.")
@@ -136,7 +136,7 @@ def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
 
 
 def _side_by_side(members: Sequence[Tensor]) -> Tensor:
-    """Return what may be of unlike lengths as rows of one tensor, NONE at the end of the shorter."""
+    """Stack index tensors as rows of one tensor, padding the shorter ones with NONE."""
     longest = max(map(len, members))
     block = torch.full((len(members), longest), NONE)
     for row, indices in zip(block, members, strict=True):
@@ -145,36 +145,36 @@ def _side_by_side(members: Sequence[Tensor]) -> Tensor:
 
 
 Network = RecurrentAutoencoder | RecurrentClassifier
-TEMPERATURE = 0.1  # the published temperature of the contrastive loss
-CHUNK = 128  # slides that go through a network at once where nothing is learned
+TEMPERATURE = 0.1  # published temperature of the contrastive loss
+CHUNK = 128  # slides per forward pass without gradients
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the losses (the paper's section IV: 0.01, 1, 1), and the first epoch that aligns latents."""
+    """Weights of the losses (0.01, 1, 1 in section IV of the paper), and the first epoch with alignment."""
 
     reconstruction: float = 0.01
     classification: float = 1.0
-    alignment: float = 1.0  # 0: sensors are learned independently
-    align_from: int = 20  # first epoch, from 0, in which the alignment counts
-    # Aligns pairs of one row, or each slide with all of its class, in contrast to others
+    alignment: float = 1.0  # 0 to train sensors independently
+    align_from: int = 20  # first epoch with alignment, from 0
+    # pairs: align slides in the same row; contrast: align slides of one class against all others
     alignment_loss: str = "pairs"
 
     def __post_init__(self) -> None:
-        """Refuse an unknown alignment loss."""
+        """Raise an error for an unknown alignment loss."""
         if self.alignment_loss not in ("pairs", "contrast"):
             raise TacpipeError(f"alignment_loss is {self.alignment_loss!r}; it must be pairs or contrast.")
 
 
 @dataclass(frozen=True)
 class ScaledSlides:
-    """Slides of one sensor as a network reads them."""
+    """Slides of one sensor as network input."""
 
     frames: Tensor  # (slide, time, channel), scaled
-    classes: Tensor  # (slide,), from 0; NONE where there is no label
+    classes: Tensor  # (slide,), from 0; NONE if unlabelled
 
     def batch(self, chosen: Tensor) -> Tensor:
-        """Return the frames of some slides (time, slide, channel)."""
+        """Return the frames of the chosen slides (time, slide, channel)."""
         return self.frames[chosen].transpose(0, 1).contiguous()
 
 
@@ -194,13 +194,13 @@ class _EpochSums:
 
 
 class JointWork:
-    """Networks of one or more sensors, learned side by side and, where ``weights.alignment`` is above 0, jointly.
+    """Training of networks of one or more sensors, jointly if ``weights.alignment`` is above 0.
 
-    Each sensor's network lowers the mean squared error of its reconstructed slides and the negative log-likelihood of
-    their classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other
-    sensors' slides in the same row of the batch (Gao et al. 2020, section IV). The network of ``frozen_sensor`` is not
-    trained: the latents of others are aligned to its own, without their classes. Joint networks are chosen together, by
-    the mean validation accuracy over sensors, others each by its own; of equals the later epoch.
+    Each sensor's network minimises the mean squared reconstruction error and the negative log-likelihood of the
+    classes. From epoch ``align_from`` it also minimises the mean squared difference between its latents and those of
+    other sensors' slides in the same row of the batch (Gao et al. 2020, section IV). The network of ``frozen_sensor``
+    is not trained: other sensors' latents are aligned to its latents, without using their classes. Joint networks are
+    selected together by mean validation accuracy over sensors, others separately; ties select the later epoch.
     """
 
     def __init__(
@@ -218,16 +218,16 @@ class JointWork:
 
     @property
     def joint(self) -> bool:
-        """True if latents of unlike sensors are aligned."""
+        """Whether latents of different sensors are aligned."""
         return self.weights.alignment > 0 and len(self.training) > 1
 
     def batches(self, epoch: int) -> list[dict[str, Tensor]]:
-        """Return the batches of an epoch: for each sensor the slide of every row."""
+        """Return the batches of an epoch: for each sensor the slide in each row."""
         self._sums = _EpochSums()
         return self.pairs.epoch()
 
     def loss(self, model: nn.Module, batch: Mapping[str, Tensor], epoch: int) -> tuple[Tensor, int]:
-        """Return the sum of all losses of a batch, and its rows."""
+        """Return the sum of all losses of a batch, and its number of rows."""
         output, total = {}, torch.zeros(())
         for sensor, rows in batch.items():
             chosen = rows[rows != NONE]
@@ -243,7 +243,7 @@ class JointWork:
         return total, max(int((rows != NONE).sum()) for rows in batch.values())
 
     def _sensor_losses(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[NetworkOutput, Tensor]:
-        """Return the output of a network for some slides, and its own losses."""
+        """Return the output of a sensor's network for the chosen slides, and its losses without alignment."""
         slides, weights = self.training[sensor], self.weights
         frames, classes = slides.batch(chosen), slides.classes[chosen]
         if sensor == self.frozen_sensor:
@@ -256,7 +256,7 @@ class JointWork:
         if labelled.any():
             loss = nn.functional.cross_entropy(output.scores[labelled], classes[labelled])
             self._sums.add(f"{sensor}.classification", loss, int(labelled.sum()))
-            if not self.frozen_sensor:  # a sensor that is aligned to a frozen one learns without classes
+            if not self.frozen_sensor:  # a sensor aligned to a frozen one does not use its classes
                 total = total + weights.classification * loss
         if output.frames is not None:
             loss = nn.functional.mse_loss(output.frames, frames)
@@ -265,7 +265,7 @@ class JointWork:
         return output, total
 
     def _alignment(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
-        """Return the mean squared difference of latents in rows that two sensors share, averaged over their pairs."""
+        """Return the mean squared difference of latents in rows shared by two sensors, averaged over pairs of sensors."""
         pair_losses = []
         for sensor, partner in combinations(output, 2):
             latents, valid = zip(
@@ -281,11 +281,11 @@ class JointWork:
         return mean
 
     def _contrast(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
-        """Return the contrastive loss between slides of the same row's class, of two sensors, and all others.
+        """Return the contrastive loss between two sensors' slides of the same class, against all others.
 
-        The supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2) between
-        sensors: cosines of latents over a temperature, one term for each slide and direction. A row's class is that of
-        its first sensor, so that permuted pairs are drawn together as they are paired.
+        This is the supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2)
+        between sensors: cosine similarities of latents divided by a temperature, with one term per slide and direction.
+        A row has the class of its first sensor, so that permuted pairs are aligned as paired.
         """
         first = next(iter(batch))
         classes = torch.where(batch[first] != NONE, self.training[first].classes.cpu()[batch[first]], NONE)
@@ -313,7 +313,7 @@ class JointWork:
         return torch.stack(losses).mean() if losses else None
 
     def _by_row(self, rows: Tensor, output: NetworkOutput, sensor: str) -> tuple[Tensor, Tensor]:
-        """Return latents (row, latent), and which rows hold a slide with a label."""
+        """Return latents (row, latent), and a mask of rows with a labelled slide."""
         filled = rows != NONE
         latents = output.latents.new_zeros(len(rows), output.latents.shape[1])
         latents[filled.to(latents.device)] = output.latents
@@ -322,7 +322,7 @@ class JointWork:
         return latents, valid.to(latents.device)
 
     def watch(self, model: nn.Module) -> Validated:
-        """Return the epoch's losses, and losses and accuracy of each sensor on its validation slides."""
+        """Return the epoch's training losses, and losses and accuracy of each sensor on its validation slides."""
         evaluated = {
             sensor: self._evaluated(model.get_submodule(sensor), slides) for sensor, slides in self.validation.items()
         }
@@ -347,7 +347,7 @@ class JointWork:
         if self.drop_last:
             labelled = labelled[
                 : len(labelled) // self.pairs.batch * self.pairs.batch or None
-            ]  # fewer than one count all
+            ]  # fewer slides than a batch are all counted
         right = loss = reconstruction = 0.0
         for first in range(0, len(labelled), CHUNK):
             batch = labelled[first : first + CHUNK]
@@ -363,7 +363,7 @@ class JointWork:
         return {**measures, "reconstruction": reconstruction / count} if decodes else measures
 
     def ranks(self, line: Line) -> dict[str, tuple[float, ...]]:
-        """Return the error rate on validation slides, of equals the later epoch being better."""
+        """Return the error rate on validation slides as the rank of an epoch; ties select the later epoch."""
         wrong = {sensor: 1 - measures["accuracy"] for sensor, measures in line["val"].items()}
         later = -line["epoch"]
         if self.joint:

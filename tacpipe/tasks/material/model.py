@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 def predict(
     model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = (), *, probabilities: bool = False
 ) -> Result:
-    """Return one table, ``predictions``: a row a slide with the material named, all scores, and latents where there are.
+    """Return one table, ``predictions``: one row per slide with material, all scores and, if available, latents.
 
-    Slides need no label; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError`
-    where the recordings are not what the model reads.
-    ``probabilities`` adds, of a calibrated model, a ``probability_…`` of each class and the ``answer``: a name or unknown.
+    Slides need no label. ``steps`` is for tasks that predict over time and has no effect here. For a calibrated model,
+    ``probabilities`` adds a ``probability_…`` of each class and the ``answer``, a name or unknown. Raises
+    `TacpipeError` if the recordings do not fit the model.
     """
     table = predictions(Classifier.load(model), recordings, probabilities=probabilities)
     return Result({PREDICTIONS: RecordingOutput(table)})
 
 
 def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: bool = False) -> pa.Table:
-    """Return the table of `predict`, which raises the same errors."""
+    """Return the table of `predict`; raises the same errors."""
     names: list[str] = []
     sensors: list[str] = []
     outputs = []
@@ -68,7 +68,7 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
 
 
 def probability_columns(classifier: Classifier, probabilities: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return a column of calibrated probabilities a material."""
+    """Return one column of calibrated probabilities per material."""
     return [
         (
             pa.field(f"probability_{name.zfill(2)}", pa.float32(), metadata={"quantity": "probability"}),
@@ -79,7 +79,7 @@ def probability_columns(classifier: Classifier, probabilities: Float32s) -> list
 
 
 class MaterialModel(Classifier):
-    """Predicts the material of slides: of recordings, or of arrays."""
+    """Predicts the material of slides, from recordings or from arrays."""
 
     @overload
     def predict(self, recordings: Dataset | Recording, /, *, probabilities: bool = False) -> pa.Table: ...
@@ -95,21 +95,19 @@ class MaterialModel(Classifier):
         *,
         probabilities: bool = False,
     ) -> pa.Table | NDArray[Any]:
-        """Return the material of slides: of a dataset or one of its recordings as a table, of arrays as an array.
+        """Return the material of slides: a table for a dataset or recording, an array for arrays.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict`
-        writes: a row a slide with ``recording``, ``sensor``, ``material`` (int32, or text where labels are), a
-        ``score_…`` of each class and, of networks, the latents ``z…``; with ``probabilities``, of a model that `tacpipe
-        calibrate` made, a ``probability_…`` of each class and the ``answer``, a name or unknown.
-        ``.to_pandas()`` makes a frame of it. Scores of
-        a dataset are those of the command to the last bit; those of one recording alone may differ in the last digits
-        of a float32, because slides are computed together. Raises `UsageError` if the recordings did not go through
-        the stages that the model was trained behind.
+        writes: one row per slide with ``recording``, ``sensor``, ``material`` (int32, or text if labels are text), a
+        ``score_…`` of each class and, for networks, the latents ``z…``. For a model from `tacpipe calibrate`,
+        ``probabilities`` adds a ``probability_…`` of each class and the ``answer``, a name or unknown. Convert it to a
+        data frame with ``.to_pandas()``. Scores of a dataset equal those of the command exactly; those of a single
+        recording may differ in the last digits of float32, because slides are computed in batches. Raises `UsageError`
+        if the recordings did not pass through the stages that the model was trained behind.
 
-        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them
-        of a recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64, or
-        text where labels are. Raises `TacpipeError` for another shape than the model was trained on, and for values
-        that are not finite.
+        **Arrays**: ``slides`` are device counts (slide, time, channel), or one slide (time, channel) as returned by
+        `frames`; ``sensor`` may be omitted if the model has only one. Returns materials (slide,), int64, or text if
+        labels are text. Raises `TacpipeError` if the shape differs from that of training, or values are not finite.
         """
         if isinstance(slides, Dataset | Recording):
             return predictions(self, open_for_model(slides, self.chain), probabilities=probabilities)
@@ -118,7 +116,7 @@ class MaterialModel(Classifier):
     def frames(self, recording: Recording) -> tuple[Float32s, str]:
         """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
 
-        The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.
+        The channels are the columns ``layouts[sensor].channels``. Raises as `predict`.
         """
         ((sensor, slides),) = self.read(open_for_model(recording, self.chain)).items()
         return slides.frames[0], sensor

@@ -1,4 +1,4 @@
-"""Train classifiers of materials: networks, one per sensor or joint or aligned to a frozen one, and fitted readouts."""
+"""Train classifiers of materials: networks, separate, joint or aligned to a frozen one, and fitted readouts."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def train_network(
     workspace: Path,
     init: Mapping[str, bytes] | None,
 ) -> dict[str, bytes]:
-    """Return the files of networks, one per sensor, trained on ``training_slides`` and chosen on ``validation_slides``.
+    """Return the files of networks, one per sensor, trained on ``training_slides`` and selected on ``validation_slides``.
 
-    ``config`` is completed. Raises `TacpipeError` if a sensor has no slide to choose by or, learned jointly, lacks
-    materials, and `UsageError` for a model to begin with that does not fit.
+    Completes ``config``. Raises `TacpipeError` if a sensor has no validation slides or, for joint learning, lacks
+    materials, and `UsageError` if the initial model is incompatible.
     """
     missing = sorted(set(training_slides) - set(validation_slides))
     if missing:
@@ -130,7 +130,7 @@ def train_network(
 
 
 def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
-    """Return the class that each is paired with across sensors, where that is another one."""
+    """Return each class's partner across sensors for permuted pairs; None for other pairs."""
     if params.pairing_method == "permuted":
         return permuted_classes(range(classes), params.seed)
     return None
@@ -168,7 +168,7 @@ def _describe(
 
 
 def _files(trained: loop.Trained, config: MaterialConfig, params: NetworkParams) -> dict[str, bytes]:
-    """Return the files of trained networks: the weights that were selected, and the last ones next to them."""
+    """Return the files of trained networks: the selected weights, and those of the last epoch."""
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
     files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: history_bytes(trained.history)}
     if params.select == "best":
@@ -199,7 +199,7 @@ def _scaled(
     device: str,
     place: int,
 ) -> ScaledSlides:
-    """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
+    """Return slides as network input; held-out classes and classes without training slides have no label."""
     name = slides.layout.sensor
     numbers = {
         material: number
@@ -214,7 +214,7 @@ def _scaled(
 
 
 def _same_materials(training_slides: BySensor, naming: Naming) -> None:
-    """Refuse joint learning where a sensor lacks a material that another has."""
+    """Raise an error for joint learning if a sensor lacks a material that another has."""
     materials = {
         name: {int(material) for material in sensor_slides.materials} for name, sensor_slides in training_slides.items()
     }
@@ -229,7 +229,7 @@ def _same_materials(training_slides: BySensor, naming: Naming) -> None:
 
 
 def _same_space(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> None:
-    """Refuse a model of --init that does not know the sensor or the same materials."""
+    """Raise an error if the --init model lacks the frozen sensor or has other materials."""
     if frozen_sensor not in slides:
         raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
     if not start.params.ALIGNS_SENSORS:
@@ -255,7 +255,7 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
 def _built(
     params: NetworkParams, shapes: Mapping[str, AutoencoderShape], start: Classifier | None, frozen: str
 ) -> nn.ModuleDict:
-    """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
+    """Return the networks by sensor; that of ``frozen`` is copied and frozen, and all others use its classifier."""
     built = nn.ModuleDict(
         {name: cast(nn.Module, estimators.build_network(params, shape)) for name, shape in shapes.items()}
     )
@@ -272,7 +272,7 @@ def _built(
 
 
 def _validation(history: Sequence[Line], joint: bool) -> BestEpochs:
-    """Return the epoch that each sensor's weights come from, and the accuracy at that epoch."""
+    """Return the epoch of each sensor's weights, and the validation accuracy at that epoch."""
 
     def chosen(sensor: str) -> Line:
         sensors = list(history[0]["val"]) if joint else [sensor]
@@ -286,7 +286,7 @@ def _validation(history: Sequence[Line], joint: bool) -> BestEpochs:
 
 
 def _network_baselines(trained: Classifier, training_slides: BySensor, params: Params) -> bytes:
-    """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
+    """Return the mean-level baseline, and a readout of the networks' latents fitted to shuffled labels."""
     arrays: dict[str, np.ndarray] = {}
     for place, (name, slides) in enumerate(training_slides.items()):
         latents = trained.readers[name].read(slides.frames).latents
@@ -299,14 +299,14 @@ def _network_baselines(trained: Classifier, training_slides: BySensor, params: P
 
 @dataclass(frozen=True)
 class TrainingSlides:
-    """The slides and settings that an architecture's ``fit`` learns from, and the ways to train that the task offers."""
+    """Slides and settings for the ``fit`` of an architecture, and the training methods that the task offers."""
 
-    config: MaterialConfig  # the model's configuration as far as the data determine it
+    config: MaterialConfig  # the model's configuration, as far as the data determine it
     training: BySensor
     validation: BySensor
     naming: Naming
-    workspace: Path  # folder of the checkpoints of an interrupted training
-    init: Mapping[str, bytes] | None  # the files of the model of ``--init``
+    workspace: Path  # folder for checkpoints, so that training can resume
+    init: Mapping[str, bytes] | None  # files of the ``--init`` model
 
     def fit_rockets(self, params: Minirocket) -> dict[str, bytes]:
         """Return the files of random convolutions and a readout for each sensor."""
@@ -317,7 +317,7 @@ class TrainingSlides:
         return readouts.statistics(params, self.config, self.training, self.validation)
 
     def fit_spectra(self, params: Spectra) -> dict[str, bytes]:
-        """Return the files of spectra, by which sensors learn materials from one another."""
+        """Return the files of spectra, through which sensors learn materials from each other."""
         excluded = slides_of.held_out_materials(params.hold_out, self.config["classes"], self.training, self.naming)
         return readouts.spectra(params, self.config, self.training, self.validation, excluded)
 
@@ -337,11 +337,11 @@ def train(
     workspace: Path,
     init: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return the files of a model trained on the slides of ``training`` and, for networks, chosen on ``validation``.
+    """Return the files of a model trained on the slides of ``training``; networks are selected on ``validation``.
 
-    Whatever is fitted is fitted on training slides alone; a readout in closed form needs none to choose by, and learns
-    from validation slides too where ``use_validation`` is set.
-    Raises `TacpipeError` if slides lack labels, differ in layout or, learned jointly, in materials.
+    Everything is fitted on training slides only. A closed-form readout needs no validation slides; with
+    ``use_validation`` it is fitted on them as well. Raises `TacpipeError` if slides lack labels, differ in layout or,
+    for joint learning, in materials.
     """
     _check(params, init)
     only = CommaList().items(params.sensors)
@@ -386,13 +386,13 @@ def train(
 
 
 def _naming(key: str, *parts: Dataset | None) -> Naming:
-    """Return the naming of the labels ``key`` of all recordings to learn from or to choose by."""
+    """Return the naming of the labels ``key`` of all training and validation recordings."""
     shards = [shard for part in parts if part is not None for shard in part.recordings.values()]
     return Naming.from_labels(key, (shard.attributes.get(key) for shard in shards))
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
-    """Refuse a model to begin with where nothing is learned from it, and a frozen sensor without one."""
+    """Raise an error for an unused initial model, and for a frozen sensor without an initial model."""
     if init is not None and not params.ALIGNS_SENSORS:
         able = " or ".join(aligning_architectures())
         raise UsageError(

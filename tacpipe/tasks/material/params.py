@@ -1,6 +1,6 @@
-"""How a classifier of materials is built and trained: the params of `tacpipe train material`, one class an architecture.
+"""Params of `tacpipe train material`, which define how a classifier is built and trained; one class per architecture.
 
-Classes of other packages extend `Estimator` or `NetworkParams`, whose methods state what a classifier reads and returns.
+Classes of other packages extend `Estimator` or `NetworkParams`, whose methods define a classifier's inputs and outputs.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ if TYPE_CHECKING:
     from tacpipe.tasks.material.losses import Weights
     from tacpipe.tasks.material.network_training import TrainingSlides
 
-MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of every architecture
+MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of all architectures
 LEVEL_VIEWS: Mapping[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # baselines of statistics
-KEY = "material"  # the label that names classes, unless params name another
-# the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
+KEY = "material"  # default label key of classes
+# from the paper's text; its code has no header for BioTac, and PyTorch ignores its dropout in a single-layer LSTM
 _PAPER_TEXT: Mapping[str, Scalar] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
-_ALIGNED_RECONSTRUCTION = 0.05  # weight in networks that are aligned to a frozen one: that of the published script
+_ALIGNED_RECONSTRUCTION = 0.05  # weight for networks aligned to a frozen one, from the published script
 HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(min_items=1)], between=";")]
 
 
 @dataclass(frozen=True)
 class MaterialModelParams(ABC):
-    """Params that every classifier of materials has."""
+    """Params of all classifiers of materials."""
 
-    ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
-    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # read where the param ``quantities`` is empty
-    ALIGNS_SENSORS: ClassVar[bool] = False  # True: networks can be aligned to the frozen one of the model of --init
-    IS_READOUT: ClassVar[bool] = False  # True: one linear readout per sensor, fitted in closed form
+    ARCHITECTURES: ClassVar[str] = "material"  # name of the task in entry points
+    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # default of the param ``quantities``
+    ALIGNS_SENSORS: ClassVar[bool] = False  # True if networks can be aligned to the frozen one of the --init model
+    IS_READOUT: ClassVar[bool] = False  # True for one linear readout per sensor, fitted in closed form
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
     # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)
@@ -89,27 +89,27 @@ class MaterialModelParams(ABC):
 
     @property
     def aligned_sensor(self) -> str:
-        """The sensor of the model of ``--init`` whose network stays frozen, or empty if none does."""
+        """Sensor of the ``--init`` model whose network stays frozen; empty if there is none."""
         return ""
 
     @abstractmethod
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
-        """Return the files of a model that learned from ``slides``: ``config.json`` and what the classifier reads.
+        """Return the files of a model trained on ``slides``: ``config.json`` and the classifier's parameters.
 
         `Estimator` and `NetworkParams` implement it for the estimators and networks that an architecture builds.
         """
 
     @property
     def dropped_beyond(self) -> int:
-        """The size of a batch if slides beyond the last full one are left out in evaluation, too; else 0."""
+        """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
         return 0
 
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return the model of each sensor that ``fit`` stored: networks, if an architecture states nothing else."""
+        """Return the fitted reader of each sensor; networks, unless an architecture overrides it."""
         return stored.networks(self)
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return the stored baselines by name and sensor, apart from that by the mean level."""
+        """Return the stored baselines by name and sensor, without the mean level."""
         from tacpipe.models.readout import Level
 
         return {PERMUTED_LABELS: stored.baseline(PERMUTED_LABELS, Level)}
@@ -117,7 +117,7 @@ class MaterialModelParams(ABC):
 
 @dataclass(frozen=True)
 class Minirocket(MaterialModelParams):
-    """Random convolutions and a linear readout, of each sensor alone: the best classifier that we know."""
+    """Random convolutions and a linear readout per sensor: our most accurate classifier."""
 
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
@@ -139,7 +139,7 @@ class Minirocket(MaterialModelParams):
         return stored.readouts(MinirocketClassifier)
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return the same model, fitted to shuffled labels."""
+        """Return the same model fitted to shuffled labels."""
         from tacpipe.models.minirocket import MinirocketClassifier
 
         return {PERMUTED_LABELS: stored.baseline(PERMUTED_LABELS, MinirocketClassifier)}
@@ -147,7 +147,7 @@ class Minirocket(MaterialModelParams):
 
 @dataclass(frozen=True)
 class Statistics(MaterialModelParams):
-    """Statistics of each channel and a linear readout, of each sensor alone: for sensors with few slides."""
+    """Statistics of each channel and a linear readout per sensor, for sensors with few slides."""
 
     # statistics: statistics of each channel and a linear readout, for few slides
     architecture: Literal["statistics"] = "statistics"
@@ -166,7 +166,7 @@ class Statistics(MaterialModelParams):
         return stored.readouts(StatisticsClassifier)
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return the same model, fitted to shuffled labels, to the level only and to what remains without it."""
+        """Return the same model fitted to shuffled labels, to the level only, and to slides without their level."""
         from tacpipe.models.readout import StatisticsClassifier
 
         names = (PERMUTED_LABELS, *LEVEL_VIEWS)
@@ -175,7 +175,7 @@ class Statistics(MaterialModelParams):
 
 @dataclass(frozen=True)
 class Spectra(MaterialModelParams):
-    """Spectra over spatial frequency, by which sensors learn materials from one another."""
+    """Spectra over spatial frequency, through which sensors learn materials from each other."""
 
     # spectra: power over spatial frequency
     architecture: Literal["spectra"] = "spectra"
@@ -186,7 +186,7 @@ class Spectra(MaterialModelParams):
     speeds: Annotated[str, Assignments(PositiveFloat)] = "biotac=0.025,roboskin=0.05"
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
-        """Return the files of spectra, by which sensors learn materials from one another."""
+        """Return the files of spectra, through which sensors learn materials from each other."""
         return slides.fit_spectra(self)
 
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
@@ -196,16 +196,16 @@ class Spectra(MaterialModelParams):
 
 @dataclass(frozen=True)
 class Estimator(MaterialModelParams, ABC):
-    """An estimator of scikit-learn over features of a slide, of each sensor alone; an architecture extends it."""
+    """A scikit-learn estimator per sensor on features of a slide; base class for architectures."""
 
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
-    # types that skops does not validate and a stored estimator may hold nevertheless, as sklearn.tree._tree.Tree
+    # types, such as sklearn.tree._tree.Tree, that a stored estimator may contain although skops does not validate them
     TRUSTED: ClassVar[Sequence[str]] = ()
 
     def features(self, frames: Float32s) -> Float32s:
-        """Return what the estimator reads of slides (slide, time, channel) in device counts: (slide, feature), finite.
+        """Return finite features (slide, feature) of slides (slide, time, channel) in device counts.
 
-        Without a method of its own an architecture reads every frame: (slide, time · channel).
+        By default these are all frames: (slide, time · channel).
         """
         flat: Float32s = frames.reshape(len(frames), -1)
         return flat
@@ -219,26 +219,26 @@ class Estimator(MaterialModelParams, ABC):
         return stored.estimators(self)
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return estimators that were fitted to shuffled labels."""
+        """Return estimators fitted to shuffled labels."""
         return {PERMUTED_LABELS: stored.shuffled_estimators(self)}
 
     @abstractmethod
     def build(self, seed: int) -> Any:
-        """Return the estimator, not fitted: a classifier of scikit-learn, or a pipeline that ends with one.
+        """Return an unfitted estimator: a scikit-learn classifier, or a pipeline that ends with one.
 
-        It has ``fit(features, classes)`` with features (slide, feature), float32, and classes (slide,), int64, numbers of
-        materials; and ``predict_proba`` or ``decision_function``, which gives a score of each class (slide, class), the
-        highest for the class that is named. ``seed`` is for its ``random_state``.
+        It has ``fit(features, classes)`` with features (slide, feature), float32, and material numbers (slide,), int64;
+        and ``predict_proba`` or ``decision_function``, which return a score of each class (slide, class), highest for
+        the predicted class. ``seed`` is for its ``random_state``.
 
-        The task reads slides, splits them by the split's roles, fits one estimator a sensor on training slides alone (and
-        those of validation, if ``use_validation`` is set), fits the baselines and permuted labels, stores it without
-        pickle (skops: what that validates, types of the architecture's own package, and `TRUSTED`), and evaluates.
+        The task reads slides, splits them by role, fits one estimator per sensor on training slides (with
+        ``use_validation`` also on validation slides), fits the baselines and permuted labels, stores them without
+        pickle (skops: validated types, types of the architecture's package, and `TRUSTED`), and evaluates.
         """
 
 
 @dataclass(frozen=True)
 class NetworkParams(MaterialModelParams, ABC):
-    """Params that networks for slides have in common; an architecture extends it."""
+    """Params of all networks for slides; base class for architectures."""
 
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # sensor that learns from a part of the batches alone; needs --no-shuffle
@@ -270,17 +270,17 @@ class NetworkParams(MaterialModelParams, ABC):
 
     @property
     def dropped_beyond(self) -> int:
-        """The size of a batch if slides beyond the last full one are left out in evaluation, too; else 0."""
+        """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
         return self.batch if self.drop_last else 0
 
     @property
     def learns_jointly(self) -> bool:
-        """Whether the latents of unlike sensors are aligned."""
+        """Whether the latents of different sensors are aligned."""
         return False
 
     @property
     def pairing_method(self) -> Literal["random", "fixed", "permuted"]:
-        """How slides of unlike sensors are paired."""
+        """How slides of different sensors are paired."""
         return "random"
 
     def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
@@ -290,30 +290,31 @@ class NetworkParams(MaterialModelParams, ABC):
         return AutoencoderShape(channels=channels, classes=classes, header=header, hidden=self.hidden)
 
     def loss_weights(self, *, joint: bool) -> Weights:
-        """Return the weights of the terms of the loss; ``joint`` states whether several sensors learn."""
+        """Return the loss weights; ``joint`` is True if several sensors are trained."""
         from tacpipe.tasks.material.losses import Weights
 
         return Weights(alignment=0.0)
 
     @abstractmethod
     def build(self, shape: AutoencoderShape) -> nn.Module:
-        """Return a sensor's network, of random weights (`tacpipe.models.recurrent_autoencoder.AutoencoderShape`).
+        """Return a sensor's network with random weights (`tacpipe.models.recurrent_autoencoder.AutoencoderShape`).
 
-        **A plain network** is called with slides (time, slide, ``shape.channels``), float32, scaled as ``scaling`` states,
-        and returns scores (slide, ``shape.classes``), which the negative log-likelihood of their softmax is lowered of.
+        **A plain network** is called with slides (time, slide, ``shape.channels``), float32, scaled as selected by
+        ``scaling``, and returns scores (slide, ``shape.classes``). Training minimises the negative log-likelihood of
+        their softmax.
 
-        **A network with a method ``classify``** returns a `tacpipe.models.recurrent_autoencoder.NetworkOutput` (latents,
-        scores and reconstructed frames or None), takes ``decode=False``, and has ``classify(latents)``, which returns
-        scores: sensors can then be compared in their latents.
+        **A network with a method ``classify``** returns a `tacpipe.models.recurrent_autoencoder.NetworkOutput`
+        (latents, scores, and reconstructed frames or None), accepts ``decode=False``, and has ``classify(latents)``,
+        which returns scores. The latents of sensors can then be compared.
 
-        Of either kind, what is returned for a slide depends on that slide alone.
+        In both cases the result for a slide must not depend on other slides.
 
-        The task reads and scales slides, trains (Adam, epochs chosen by validation accuracy, checkpoints that resume,
+        The task reads and scales slides, trains (Adam, epochs selected by validation accuracy, resumable checkpoints,
         bfloat16), stores weights as safetensors, fits the baselines and permuted labels, and evaluates.
         """
 
     def check(self) -> None:
-        """Refuse a subsampled sensor whose batches are shuffled, and a percentage without a sensor."""
+        """Raise an error for a subsampled sensor with shuffled batches, and for a percentage without a sensor."""
         if self.subsample_sensor and self.shuffle:
             raise UsageError(
                 f"subsample_sensor is {self.subsample_sensor} and batches are shuffled, so that this sensor would learn "
@@ -328,7 +329,7 @@ class NetworkParams(MaterialModelParams, ABC):
 
 @dataclass(frozen=True)
 class Raec(NetworkParams):
-    """The paper's recurrent autoencoder with a classifier, learned jointly for unlike sensors or for each alone."""
+    """The paper's recurrent autoencoder with a classifier, trained jointly for different sensors or separately."""
 
     # raec: the paper's recurrent autoencoder
     architecture: Literal["raec"] = "raec"
@@ -353,7 +354,7 @@ class Raec(NetworkParams):
     dropout: Dropout = 0.0
     PRESETS: ClassVar[Presets] = {
         "paper": _PAPER_TEXT,
-        "authors": {  # the published code with its quirks; to be given slides of the layout authors
+        "authors": {  # the published code with its quirks, for slides of the layout authors
             "epochs": 2000,
             "pairing": "fixed",
             "shuffle": False,
@@ -367,17 +368,17 @@ class Raec(NetworkParams):
 
     @property
     def aligned_sensor(self) -> str:
-        """The sensor of the model of ``--init`` whose network stays frozen, or empty if none does."""
+        """Sensor of the ``--init`` model whose network stays frozen; empty if there is none."""
         return self.frozen_sensor
 
     @property
     def learns_jointly(self) -> bool:
-        """Whether the latents of unlike sensors are aligned."""
+        """Whether the latents of different sensors are aligned."""
         return self.joint
 
     @property
     def pairing_method(self) -> Literal["random", "fixed", "permuted"]:
-        """How slides of unlike sensors are paired."""
+        """How slides of different sensors are paired."""
         return self.pairing
 
     def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
@@ -391,7 +392,7 @@ class Raec(NetworkParams):
         )
 
     def loss_weights(self, *, joint: bool) -> Weights:
-        """Return the weights of the terms of the loss; ``joint`` states whether several sensors learn."""
+        """Return the loss weights; ``joint`` is True if several sensors are trained."""
         from tacpipe.tasks.material.losses import Weights
 
         return Weights(
@@ -409,7 +410,7 @@ class Raec(NetworkParams):
         return RecurrentAutoencoder(shape)
 
     def check(self) -> None:
-        """Refuse options of joint learning without it."""
+        """Raise an error for options of joint learning without joint learning."""
         super().check()
         if not self.joint:
             given = [(name, getattr(self, name)) for name in ("frozen_sensor", "pairing", "alignment_loss")]
@@ -424,7 +425,7 @@ class Raec(NetworkParams):
 
 @dataclass(frozen=True)
 class XLSTM(NetworkParams):
-    """The recurrent classifier without decoder that the paper compares with, of each sensor alone."""
+    """The recurrent classifier without decoder that the paper compares with, trained separately per sensor."""
 
     # x-lstm: the paper's classifier without decoder
     architecture: Literal["x-lstm"] = "x-lstm"
@@ -447,7 +448,7 @@ Params = MaterialModelParams  # params of any architecture
 
 
 class StoredNaming(TypedDict):
-    """The naming of classes in a model's configuration; nothing of whole numbers under the usual key."""
+    """Naming of classes in a model's configuration; empty for whole numbers under the default key."""
 
     label: NotRequired[str]
     names: NotRequired[list[str]]
@@ -476,14 +477,14 @@ class StoredShape(TypedDict):
 
 
 class BestEpochs(TypedDict):
-    """The epoch that each sensor's weights come from, and the validation accuracy at that epoch."""
+    """Epoch of each sensor's weights, and the validation accuracy at that epoch."""
 
     epoch: dict[str, int]
     accuracy: dict[str, float]
 
 
 class SpectraDescription(TypedDict):
-    """The bands of spectra over spatial frequency, and the speed of each sensor's slides."""
+    """Frequency bands of spectra, and the speed of each sensor's slides."""
 
     way_m: float
     edges_per_m: list[float]
@@ -491,7 +492,7 @@ class SpectraDescription(TypedDict):
 
 
 class UnknownDescription(TypedDict):
-    """The calibration of a sensor's probabilities and of its threshold of unknown."""
+    """Calibration of a sensor's probabilities and of its threshold of unknown."""
 
     slides: int
     temperature: float
@@ -499,26 +500,26 @@ class UnknownDescription(TypedDict):
     threshold: float
     false_unknown: float
     auroc_left_out: dict[Literal["probability", "distance"], float]
-    calibration_error: dict[str, float]  # before and after
+    calibration_error: dict[str, float]  # before and after calibration
 
 
 class MaterialConfig(ModelConfig, StoredNaming):
-    """``config.json`` of a model of the task ``material``."""
+    """``config.json`` of a material model."""
 
-    split: str  # in words; of older models a mapping
+    split: str  # description; a mapping in older models
     quantities: Sequence[str]
     sensors: dict[str, StoredLayout]
     classes: list[int]
     absent: NotRequired[list[str]]  # quantities that no sensor has
-    counts: dict[str, dict[str, int]]  # slides by role and sensor
+    counts: dict[str, dict[str, int]]  # role -> sensor -> number of slides
     shapes: NotRequired[dict[str, StoredShape]]  # networks only
     scaling: NotRequired[dict[str, dict[str, list[float]]]]
     joint: NotRequired[bool]
-    held_out: NotRequired[dict[str, list[int]]]  # sensor to classes whose labels it does not learn
-    partners: NotRequired[dict[str, int]]  # class to the one that it is paired with across sensors
+    held_out: NotRequired[dict[str, list[int]]]  # sensor -> classes whose labels it does not learn
+    partners: NotRequired[dict[str, int]]  # class -> its partner across sensors
     validation: NotRequired[BestEpochs]
     spectra: NotRequired[SpectraDescription]
-    known: NotRequired[dict[str, UnknownDescription]]  # by sensor, of calibrated models
+    known: NotRequired[dict[str, UnknownDescription]]  # by sensor, only in calibrated models
 
 
 def aligning_architectures() -> list[str]:

@@ -1,4 +1,4 @@
-"""Fit models that need no epochs: convolutional features or spectra with a readout, and estimators."""
+"""Fit models without epochs: convolutional features, statistics or spectra with a readout, and estimators."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Arrays = dict[str, np.ndarray]
 def rockets(
     params: Minirocket, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
-    """Return the files of a model of patterns and a readout, of each sensor alone."""
+    """Return the files of random convolutions and a readout per sensor."""
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
@@ -61,7 +61,7 @@ def rockets(
 def estimators(
     params: Estimator, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
-    """Return the files of estimators of scikit-learn, of each sensor alone."""
+    """Return the files of one scikit-learn estimator per sensor."""
     fitted: dict[str, FittedEstimator] = {}
     shuffled: dict[str, FittedEstimator] = {}
     levels: Arrays = {}
@@ -81,9 +81,9 @@ def estimators(
 def statistics(
     params: Statistics, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
-    """Return the files of a model of statistics and a readout, of each sensor alone.
+    """Return the files of channel statistics and a readout per sensor.
 
-    Its baselines are those of all models and the same readout of the level alone and of slides without their level.
+    In addition to the common baselines, the same readout is fitted to the level only and to slides without their level.
     """
     tensors: Arrays = {}
     baselines: Arrays = {}
@@ -107,11 +107,11 @@ def spectra(
     validation_slides: BySensor,
     held_out: Mapping[str, Iterable[int]],
 ) -> dict[str, bytes]:
-    """Return the files of a model of spectra over spatial frequency, by which sensors learn materials from one another.
+    """Return the files of spectra over spatial frequency, through which sensors learn materials from each other.
 
-    ``held_out`` are the materials whose labels a sensor does not learn; nothing that is fitted for it sees their slides.
-    Raises `TacpipeError` if a sensor's speed or rate is not known, where sensors share too few materials, and where no
-    sensor learns a material.
+    ``held_out`` contains the materials whose labels a sensor does not learn; their slides are not used to fit it.
+    Raises `TacpipeError` if a sensor's speed or rate is unknown, sensors share too few materials, or a material is
+    learned by no sensor.
     """
     sampled = _samplings(params.speeds, training_slides)
     bands = Bands.common(list(sampled.values()))
@@ -153,9 +153,9 @@ def spectra(
 
 
 def _samplings(speeds: str, training_slides: BySensor) -> dict[str, Sampling]:
-    """Return the sampling of each sensor's slides, at the median of the speeds that are recorded.
+    """Return the sampling of each sensor's slides, at their median recorded speed.
 
-    ``speeds``, like ``biotac=0.025,roboskin=0.05``, is of sensors whose slides have none.
+    ``speeds``, such as ``biotac=0.025,roboskin=0.05``, is used for sensors whose slides have no recorded speed.
     """
     stated_speeds = Assignments(float).items(speeds)
     samplings = {}
@@ -181,7 +181,7 @@ def _labelled(
     validation_slides: Slides | None,
     place: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames and materials to learn from: those of validation too, where params ask for it."""
+    """Return the frames and materials for training, with those of validation if the params request them."""
     frames, materials = training_slides.frames, permuted(params, training_slides.materials, place)
     if params.use_validation and validation_slides is not None and params.labels == "true":
         frames = np.concatenate([frames, validation_slides.frames])
@@ -190,19 +190,19 @@ def _labelled(
 
 
 def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
-    """Return labels permuted among the slides, where params ask for it: then there is nothing to learn."""
+    """Return labels, permuted among the slides if the params request it as a control."""
     if params.labels == "true":
         return materials
     return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
 def stored(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:
-    """Return the tensors of a baseline, under names that no other has."""
+    """Return the tensors of a baseline, under unique names."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 
 
 def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return arrays as a file."""
+    """Return arrays as file content."""
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 

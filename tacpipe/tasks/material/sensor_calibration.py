@@ -1,9 +1,9 @@
-"""Calibrate each sensor of a classifier: its probabilities, and when it answers ``unknown``.
+"""Calibrate the probabilities of each sensor of a classifier, and its threshold for the answer ``unknown``.
 
-The score of a class states how much a slide is like it, independent of the classifier.
-Slides are described by statistics of each channel (`tacpipe.models.readout`) and by how often patterns occur
-in them (`tacpipe.models.minirocket`), standardised and reduced to their principal components. The slides of each class
-spread around its mean with one covariance, shrunk as by Ledoit and Wolf (2004). The score of a class is the logarithm of
+The score of a class measures how similar a slide is to it, independently of the classifier. Slides are described by
+statistics of each channel (`tacpipe.models.readout`) and by the frequencies of patterns (`tacpipe.models.minirocket`),
+standardised and reduced to principal components. All classes share one covariance about their means, shrunk as by
+Ledoit and Wolf (2004). The score of a class is the logarithm of
 
     all * sqrt(plain_all) / (mean * nearest * plain_nearest)
 
@@ -11,12 +11,15 @@ of squared distances of a slide:
 
 - ``mean``: Mahalanobis, to the mean of the class (Lee, Lee, Lee and Shin, A simple unified framework for detecting
   out-of-distribution samples, NeurIPS 2018),
-- ``nearest``: Mahalanobis, to the nearest training slide of the class, because slides of one material form several clusters,
-- ``all``: Mahalanobis, to the mean of all slides, under the covariance of slides of any class. What is unusual for each
-  class alike then does not count (Ren et al., A simple fix to Mahalanobis distance for improving near-OOD detection, 2021).
-  That covariance is the sum of those within and between classes. The empirical one of all slides is smaller than the shrunk
-  one within classes along some components, and slides far from all classes would score highest,
-- ``plain_nearest`` and ``plain_all``: Euclidean, to the nearest training slide of the class and to the mean of all slides.
+- ``nearest``: Mahalanobis, to the nearest training slide of the class, because slides of one material form several
+  clusters,
+- ``all``: Mahalanobis, to the mean of all slides, under the covariance of slides of any class. It cancels deviations
+  that are equally unusual for every class (Ren et al., A simple fix to Mahalanobis distance for improving near-OOD
+  detection, 2021). That covariance is the sum of those within and between classes. The empirical covariance of all
+  slides is smaller than the shrunk covariance within classes along some components, so slides far from all classes
+  would score highest,
+- ``plain_nearest`` and ``plain_all``: Euclidean, to the nearest training slide of the class and to the mean of all
+  slides.
 """
 
 from __future__ import annotations
@@ -37,31 +40,31 @@ from tacpipe.models.minirocket import Rocket, with_profile
 from tacpipe.models.readout import statistics
 from tacpipe.models.tensors import tensors_under
 
-COMPONENTS = 300  # upper limit
-PATTERNS = "patterns."  # begins the names of the tensors of patterns
+COMPONENTS = 300  # maximum number of components
+PATTERNS = "patterns."  # prefix of the tensor names of patterns
 NAMES = ("classes", "centre", "projection", "gain", "overall", "slides", "labels")
-STEADY = 1e-6  # standard deviation below which a feature is constant
-MIN_SQUARED_DISTANCE = 1e-9  # squared distance
+STEADY = 1e-6  # standard deviation below which a feature counts as constant
+MIN_SQUARED_DISTANCE = 1e-9  # lower bound of squared distances
 
 
 @dataclass(frozen=True)
 class ClassDistance:
-    """Training slides as components, and what measures distances between these."""
+    """Distance of slides to classes, from training slides in principal components."""
 
-    classes: Int32s  # (class,), sorted
-    centre: Floats  # (feature,), the mean of all training slides
+    classes: Int32s  # (class,), ascending
+    centre: Floats  # (feature,), mean of all training slides
     projection: Floats  # (feature, component), stored as float32
-    gain: Floats  # (component,), makes the covariance within classes the identity
-    overall: Floats  # (component, component), makes the covariance of slides of any class the identity, after ``gain``
+    gain: Floats  # (component,), whitens the covariance within classes
+    overall: Floats  # (component, component), whitens the covariance of slides of any class, after ``gain``
     slides: Floats  # (slide, component), training slides
     labels: Int32s  # (slide,), indices of ``classes``
     patterns: Rocket
 
     @classmethod
     def fit(cls, frames: Float32s, labels: Ints) -> Self:
-        """Return the distance to classes of slides (slide, time, channel) and their ``labels`` (slide,).
+        """Fit the distance to classes on slides (slide, time, channel) with ``labels`` (slide,).
 
-        Raises `TacpipeError` for what `Rocket.fit` refuses.
+        Raises `TacpipeError` as `Rocket.fit`.
         """
         from sklearn.covariance import ledoit_wolf
 
@@ -92,7 +95,7 @@ class ClassDistance:
         )
 
     def scores(self, frames: Float32s) -> Floats:
-        """Return how much slides (slide, time, channel) are like each class (slide, class), see the module."""
+        """Return the similarity (slide, class) of slides (slide, time, channel) to each class; see the module docstring."""
         plain = (_features(frames, self.patterns) - self.centre) @ self.projection
         scaled, training = plain * self.gain, self.slides * self.gain
         origin = np.zeros((1, plain.shape[1]))
@@ -106,12 +109,12 @@ class ClassDistance:
         return scores
 
     def _nearest(self, distances: Floats) -> Floats:
-        """Return the smallest of the distances to training slides (slide, training slide) by class (slide, class)."""
+        """Return the minimum by class (slide, class) of the distances to training slides (slide, training slide)."""
         by_class = [distances[:, self.labels == label].min(axis=1) for label in range(len(self.classes))]
         return np.stack(by_class, axis=1)
 
     def to_tensors(self) -> dict[str, AnyArray]:
-        """Return all that `from_tensors` needs."""
+        """Return the tensors that `from_tensors` reads."""
         patterns = {f"{PATTERNS}{name}": tensor for name, tensor in self.patterns.to_tensors().items()}
         return {
             **{name: getattr(self, name) for name in NAMES},
@@ -121,7 +124,7 @@ class ClassDistance:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another."""
+        """Return the distance stored by `to_tensors`. Raises `ValueError` for inconsistent shapes."""
         stored = {name: tensors[name] for name in NAMES}
         stored["projection"] = stored["projection"].astype(np.float64)
         distance = cls(**stored, patterns=Rocket.from_tensors(tensors_under(PATTERNS, tensors)))
@@ -145,16 +148,16 @@ def _means(placed: Floats, labels: Ints) -> Floats:
 
 
 def _log_distances(slides: Floats, references: Floats) -> Floats:
-    """Return the logarithm of the squared distance of each slide (slide, component) to each reference (slide, reference)."""
+    """Return the log squared distances (slide, reference) between slides and references, both (…, component)."""
     squared = np.stack([np.square(slide - references).sum(axis=1) for slide in slides])
     distances: Floats = np.log(np.maximum(squared, MIN_SQUARED_DISTANCE))
     return distances
 
 
 def _features(frames: Float32s, patterns: Rocket) -> Floats:
-    """Return the features of slides (slide, time, channel), (slide, feature).
+    """Return the features (slide, feature) of slides (slide, time, channel).
 
-    Patterns need slides of the learned length: a shorter one, as during a live session, is continued with its last row.
+    Patterns require slides of the training length; shorter ones, as in a live session, are padded with their last row.
     """
     missing = max(patterns.frames - frames.shape[1], 0)
     continued = np.pad(frames, [(0, 0), (0, missing), (0, 0)], mode="edge")[:, : patterns.frames]
@@ -165,26 +168,26 @@ def _features(frames: Float32s, patterns: Rocket) -> Floats:
 CALIBRATION_FILE = "known.safetensors"
 Rule = Literal["probability", "distance"]
 RULES: tuple[Rule, ...] = get_args(Rule)
-DISTANCE = "distance."  # begins the names of the tensors of `ClassDistance`
+DISTANCE = "distance."  # prefix of the tensor names of `ClassDistance`
 
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """The temperature of a sensor's scores, and below which score a slide is of no known class."""
+    """Temperature of a sensor's scores, and threshold below which a slide is of no known class."""
 
     temperature: float
-    rule: Rule  # the kind of score
+    rule: Rule  # selected kind of score
     threshold: float
     distance: ClassDistance
 
     def probabilities(self, scores: AnyFloats) -> Float32s:
-        """Return a probability of each class (slide, class) of a classifier's scores."""
+        """Return the calibrated probabilities (slide, class) of a classifier's scores."""
         return calibration.probabilities(scores, self.temperature).astype(np.float32)
 
     def score(self, scores: AnyFloats, frames: Float32s) -> Floats:
-        """Return how known slides look (slide,), by the rule that was chosen; below ``threshold`` they are unknown.
+        """Return the score of known (slide,) by the selected rule; slides below ``threshold`` are unknown.
 
-        ``scores`` (slide, class) are the classifier's, ``frames`` (slide, time, channel) what it read.
+        ``scores`` (slide, class) are the classifier's, and ``frames`` (slide, time, channel) its input.
         """
         return self.scores_by_rule(scores, frames)[self.rule]
 
@@ -200,13 +203,13 @@ class SensorCalibration:
         }
 
     def to_tensors(self) -> dict[str, AnyArray]:
-        """Return all that `from_tensors` needs."""
+        """Return the tensors that `from_tensors` reads."""
         numbers = np.array([self.temperature, self.threshold, RULES.index(self.rule)], np.float64)
         return {"numbers": numbers, **{f"{DISTANCE}{k}": v for k, v in self.distance.to_tensors().items()}}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` if it cannot be."""
+        """Return the calibration stored by `to_tensors`. Raises `ValueError` if it is invalid."""
         temperature, threshold, rule = (float(number) for number in tensors["numbers"])
         if temperature <= 0 or not 0 <= int(rule) < len(RULES):
             raise ValueError(f"the temperature is {temperature} and the rule {rule}")
@@ -216,9 +219,9 @@ class SensorCalibration:
 
 @dataclass(frozen=True)
 class ValidationSlides:
-    """Validation slides of one sensor, with the scores of the classifier."""
+    """Validation slides of one sensor, with the classifier's scores."""
 
-    scores: Float32s  # (slide, class), the classifier's
+    scores: Float32s  # (slide, class), from the classifier
     frames: Float32s  # (slide, time, channel)
     labels: Ints  # (slide,), columns of ``scores``
 
@@ -228,11 +231,11 @@ def fit_calibration(
 ) -> tuple[SensorCalibration, dict[Rule, float]]:
     """Return the calibration of a sensor, and the area under the curve of each rule.
 
-    The distance is fitted on ``training``, frames (slide, time, channel) and classes (slide,) of training slides; all else
-    on ``validation``. The rule is the one that distinguishes validation slides better from themselves with their own class
-    left out of the answers (area under the curve); no slide of an unknown class is needed. The threshold is that of split
-    conformal prediction: a new slide of a known class falls below it with a probability of at most ``false_unknown``.
-    Raises `TacpipeError` with too few slides for that.
+    The distance is fitted on ``training``, with frames (slide, time, channel) and classes (slide,); everything else on
+    ``validation``. Of both rules, the one is selected that better separates validation slides from the same slides with
+    their own class removed from the answers (area under the curve); slides of unknown classes are not needed. The
+    threshold is that of split conformal prediction: a new slide of a known class is below it with a probability of at
+    most ``false_unknown``. Raises `TacpipeError` if there are too few slides for that.
     """
     count = len(validation.labels)
     if calibration.most_promised(count) < 1 - false_unknown:
@@ -258,7 +261,7 @@ def fit_calibration(
 
 
 def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
-    """Return calibrations by sensor as a file."""
+    """Return the file content of calibrations by sensor."""
     tensors = {
         f"{name}.{key}": value
         for name, sensor_calibration in calibrations.items()
@@ -268,13 +271,13 @@ def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
 
 
 def unpack_calibrations(content: bytes, sensors: Iterable[str]) -> dict[str, SensorCalibration]:
-    """Return the calibrations that `pack_calibrations` wrote. Raises `TacpipeError` for another file."""
+    """Return the calibrations stored by `pack_calibrations`. Raises `TacpipeError` for another file."""
     tensors = model_files.arrays(content, CALIBRATION_FILE)
     return {name: SensorCalibration.from_tensors(tensors_under(f"{name}.", tensors)) for name in sensors}
 
 
 def _log_odds(scores: AnyFloats) -> Floats:
-    """Return the logarithm of p / (1 - p) of the largest probability p of each slide (slide,)."""
+    """Return log(p / (1 - p)) of the largest probability p of each slide (slide,)."""
     wide = scores.astype(np.float64)
     best = wide.argmax(axis=1)[:, None]
     other_scores = wide.copy()

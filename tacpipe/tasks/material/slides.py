@@ -1,4 +1,4 @@
-"""Slides of a dataset as arrays, one bundle per sensor, and the materials whose labels a sensor does not learn."""
+"""Load the slides of a dataset as arrays by sensor, and parse the materials held out of a sensor's labels."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 
 STREAM = "slide"
 TACTILE = "tactile"
-NEAR = 0.02  # largest difference between the rates of a sensor's slides, as a fraction of the rate
+NEAR = 0.02  # maximum relative difference between the rates of a sensor's slides
 
 
 @dataclass(frozen=True)
 class SlideLayout:
-    """The layout of a sensor's slides: their channels, frames, frames per second and arrangement."""
+    """Layout of a sensor's slides: channels, number of frames, frames per second and order."""
 
     sensor: str
     channels: tuple[str, ...]
     frames: int
     rate_hz: float
-    layout: str = "time"  # frames in the order of time; authors: as published, in another one
+    layout: str = "time"  # time: frames in time order; authors: in the published order
 
     def alike(self, other: SlideLayout) -> bool:
-        """Return whether slides of both can be read as one: the rate may differ a little, as stamps do, or be unknown."""
+        """Return whether both layouts are compatible: rates may differ slightly, as timestamps do, or be unknown."""
         difference_hz = abs(self.rate_hz - other.rate_hz)
         near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= NEAR * max(self.rate_hz, other.rate_hz)
         return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
     def to_json(self) -> StoredLayout:
-        """Return what `from_json` reads."""
+        """Return the layout for `from_json`."""
         return {
             "channels": list(self.channels),
             "frames": self.frames,
@@ -54,7 +54,7 @@ class SlideLayout:
 
     @classmethod
     def from_json(cls, sensor: str, stored: StoredLayout) -> SlideLayout:
-        """Return the layout that `to_json` wrote."""
+        """Return the layout stored by `to_json`."""
         return cls(sensor, tuple(stored["channels"]), int(stored["frames"]), float(stored["rate_hz"]), stored["layout"])
 
 
@@ -65,16 +65,16 @@ class Slides:
     layout: SlideLayout
     names: tuple[str, ...]
     frames: Float32s  # (slide, time, channel), device counts
-    materials: Int64s  # (slide,), numbers of classes; UNKNOWN where none is labelled
+    materials: Int64s  # (slide,), class numbers; UNKNOWN if unlabelled
     digests: tuple[str, ...]
-    speeds_m_s: Floats  # (slide,), or NaN if none is recorded
+    speeds_m_s: Floats  # (slide,), NaN if not recorded
 
     def __len__(self) -> int:
-        """Return how many slides there are."""
+        """Return the number of slides."""
         return len(self.names)
 
     def select(self, chosen: Bools) -> Slides:
-        """Return the slides that a mask (slide,) chooses."""
+        """Return the slides selected by a mask (slide,)."""
         at = np.flatnonzero(chosen)
         return Slides(
             self.layout,
@@ -98,18 +98,17 @@ def read(
     labelled: bool = False,
     advance: Callable[..., None] | None = None,
 ) -> dict[str, Slides]:
-    """Return the slides of each sensor, by name; ``only`` names the sensors to read, none being all.
+    """Return the slides by sensor; ``only`` contains the sensors to read, or is empty for all.
 
-    ``naming`` gives the number of each label.
+    ``naming`` maps labels to numbers. Columns of the ``quantities`` are read if a sensor has them. With ``labelled``, a
+    slide without material raises an error. ``advance`` is called after each recording.
 
-    Columns of the ``quantities`` are read, as far as a sensor has them. ``labelled`` refuses slides without a material;
-    ``advance`` is called after each recording.
-    Raises `TacpipeError` if a recording names no sensor, holds no channel or a value that is not finite, and where
-    slides of one sensor differ in channels, frames or rate.
+    Raises `TacpipeError` if a recording has no sensor or channel, or a value is not finite, and if slides of one sensor
+    differ in channels, frames or rate.
     """
     by_sensor: dict[str, list[tuple[Recording, SlideLayout, Float32s]]] = {}
     present_sensors: set[str] = set()
-    for shard in recordings.recordings.values() if labelled else ():  # labels are checked before any frame is read
+    for shard in recordings.recordings.values() if labelled else ():  # check labels before reading any frame
         if not only or shard.attributes.get("sensor") in only:
             _require_label(shard, naming.key)
     for name, shard in sorted(recordings.recordings.items()):
@@ -132,7 +131,7 @@ def read(
 
 
 def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[str]:
-    """Return those of the quantities that no sensor has, by the first recording of each."""
+    """Return the quantities that no sensor has, checked on each sensor's first recording."""
     first = {shard.attributes.get("sensor"): shard for _, shard in sorted(recordings.recordings.items(), reverse=True)}
     present_quantities: set[str] = set()
     for shard in first.values():
@@ -142,7 +141,7 @@ def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[st
 
 
 def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[SlideLayout, Float32s]:
-    """Return the layout of a slide and its frames (time, channel), device counts; raises as `read`."""
+    """Return the layout of a slide and its frames (time, channel) in device counts; raises as `read`."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has the streams {', '.join(shard.streams)} and none is a slide. "
@@ -167,7 +166,7 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Sl
 
 
 def _nominal_hz(table: pa.Table) -> float:
-    """Return the rate of the rows by their median step; 0 without stamps."""
+    """Return the rate of the rows from their median step; 0 without timestamps."""
     if "t_ns" not in table.column_names or table.num_rows < 2:
         return 0.0
     step_ns = float(np.median(np.diff(table.column("t_ns").to_numpy())))
@@ -182,7 +181,7 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
 
 
 def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool) -> Slides:
-    """Return the slides of one sensor, alike in layout."""
+    """Return the slides of one sensor, after a check that their layouts are compatible."""
     first, layout, _ = sensor_slides[0]
     for shard, compared, _ in sensor_slides:
         if not layout.alike(compared):
@@ -201,7 +200,7 @@ def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], na
 
 
 def difference(expected: SlideLayout, layout: SlideLayout) -> str:
-    """Return in words how one layout differs from another.
+    """Return a description of the difference between two layouts.
 
     >>> difference(SlideLayout("a", ("x",), 400, 100.0), SlideLayout("a", ("x",), 75, 100.0))
     'has 75 frames, not 400'
@@ -218,7 +217,7 @@ def difference(expected: SlideLayout, layout: SlideLayout) -> str:
 
 
 def _require_label(shard: Recording, key: str) -> None:
-    """Raise `TacpipeError` for a slide without the label that names its class."""
+    """Raise `TacpipeError` if a slide has no label of its class."""
     if shard.attributes.get(key) is None:
         raise TacpipeError(
             f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no label {key} to learn from; set "
@@ -228,7 +227,7 @@ def _require_label(shard: Recording, key: str) -> None:
 
 
 def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
-    """Return the number of a slide's class; `UNKNOWN` without a label, and where none is needed also for another one."""
+    """Return the class number of a slide; `UNKNOWN` without a label or, unless ``labelled``, for an unlisted label."""
     label = shard.attributes.get(naming.key)
     try:
         return naming.number(label)
@@ -241,7 +240,7 @@ def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
 
 
 def quantities(text: str) -> tuple[str, ...]:
-    """Return the quantities that ``text`` names, with commas between.
+    """Return the quantities in a comma-separated list.
 
     >>> quantities("tactile, vibration")
     ('tactile', 'vibration')
@@ -252,7 +251,7 @@ def quantities(text: str) -> tuple[str, ...]:
 def held_out_materials(
     assignments: str, classes: Sequence[int], sensors: Iterable[str], naming: Naming = NUMBERS
 ) -> dict[str, set[int]]:
-    """Return the materials whose labels each sensor does not learn; ``assignments`` is like ``roboskin=17,18,19,20``.
+    """Return the held-out materials of each sensor, from ``assignments`` like ``roboskin=17,18,19,20``.
 
     >>> held_out_materials("b=3,4", [1, 2, 3, 4], ["a", "b"])
     {'a': set(), 'b': {3, 4}}

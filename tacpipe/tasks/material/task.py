@@ -1,4 +1,4 @@
-"""The task ``material``: which material is under the finger."""
+"""Define the task ``material``: classify the material under the finger."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.recordings import OpenedChain
 
-MATERIALS, SLIDES = 6, 240  # slides of each sensor on each material
+MATERIALS, SLIDES = 6, 240  # number of materials; slides per sensor and material
 
 
 def demo(output: Path) -> Demo:
-    """Return the commands from the simulation to the results, which write below ``output``."""
+    """Return the commands of the demo, from simulation to results, which write below ``output``."""
     names = ("touched", "slides", "slides-split", "materials", "materials-results", "joint", "joint-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["slides-split"]]
     simulation = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
-    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # the paper has 2,000 epochs
+    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # the paper uses 2,000 epochs
     commands = [
         ["simulate", "material", *simulation, "-o", place["touched"]],
         ["segment", "slides", place["touched"], "-o", place["slides"]],
@@ -82,7 +82,7 @@ REQUIREMENTS = Requirements(
 
 
 class MaterialTask(Task):
-    """Recognition of materials."""
+    """Classify materials."""
 
     name = "material"
 
@@ -104,19 +104,19 @@ class MaterialTask(Task):
         return Result(files=network_training.train(params, train, val, workspace, init.files if init else None))
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
-        """Return how often materials are named right; raises as `tacpipe.tasks.material.evaluation`."""
+        """Return the accuracy of the predicted materials; raises as `tacpipe.tasks.material.evaluation`."""
         from tacpipe.tasks.material import evaluation
 
         return evaluation.evaluate(model.files, recordings)
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return one table of named materials; raises as `tacpipe.tasks.material.model`."""
+        """Return one table of predicted materials; raises as `tacpipe.tasks.material.model`."""
         from tacpipe.tasks.material.model import predict
 
         return predict(model.files, recordings, probabilities=request.probabilities)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> MaterialModel:
-        """Return the model among ``files``, trained behind the stages of ``chain``."""
+        """Return the model in ``files``, trained behind the stages of ``chain``."""
         from tacpipe.tasks.material.model import MaterialModel
 
         return MaterialModel.load(files, chain)
@@ -130,18 +130,18 @@ class MaterialTask(Task):
 
     @property
     def live(self) -> LiveTask:
-        """The material of a slide while it lasts."""
+        """Prediction of the material during a slide."""
         from tacpipe.tasks.material.live.task import MaterialLive
 
         return MaterialLive()
 
     @property
     def report(self) -> TaskReport:
-        """Accuracy by sensor and material."""
+        """Report of accuracy by sensor and material."""
         from tacpipe.tasks.material.report import MaterialReport
 
         return MaterialReport(self.name)
 
     def demo(self, output: Path) -> Demo:
-        """Return the chain on simulated slides."""
+        """Return the demo on simulated slides."""
         return demo(output)

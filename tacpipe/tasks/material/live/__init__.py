@@ -1,1 +1,1 @@
-"""Name the material of a slide while it lasts."""
+"""Predict the material of a slide during the slide."""

@@ -1,8 +1,8 @@
-"""Turn the blocks of a live session into answers of a model of materials.
+"""Convert the blocks of a live session to predictions of a material model.
 
-A recording holds one slide, as `tacpipe segment slides` has it, or with a pause several, one after another
-(`parts`). Several times a second the slide so far is read, from all samples up to a moment; the last
-answer of a slide, from all that belongs to it, is its final one.
+A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones (`parts`).
+Several times a second the current slide is classified from all samples up to that time. The last prediction of a slide,
+from all of its samples, is final.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from tacpipe.tasks.material.live.slide import Answer, Parting, SlideSoFar, after
 if TYPE_CHECKING:
     import pyarrow as pa
 
-GAP_NS = 50_000_000  # age of the newest sample of the finger, from which on its stream is silent
-MAX_DURATION_NS = 120_000_000_000  # longest recording: its rows are kept until it ends
+GAP_NS = 50_000_000  # age of the finger's newest sample above which its stream counts as silent
+MAX_DURATION_NS = 120_000_000_000  # maximum duration of a recording, whose rows are kept until it ends
 IDLE_NS = 20_000_000
 RESTARTED = "the model's process was started anew, and lacks what came before"
 THROWN = "blocks were thrown away under overload"
@@ -35,15 +35,15 @@ THROWN = "blocks were thrown away under overload"
 
 @dataclass(frozen=True)
 class Begun:
-    """States that a recording runs, for a process that replaces another one and lacks the samples so far."""
+    """Indicates a running recording to a process that replaces another one and lacks the earlier samples."""
 
     def to_json(self) -> Json:
-        """Return nothing: there is no more to know."""
+        """Return an empty object, because there is nothing else to store."""
         return {}
 
 
 class MaterialEngine(Engine):
-    """One live session of a model of materials."""
+    """A live session with a material model."""
 
     def __init__(
         self,
@@ -56,41 +56,41 @@ class MaterialEngine(Engine):
         settle_ns: int = SETTLE_NS,
         pause_ns: int = 0,
     ) -> None:
-        """Take what is read. A pause of 0: a recording is one slide."""
+        """Store the sensors and settings. If ``pause_ns`` is 0, a recording is one slide."""
         super().__init__(sensors, settle_ns)
         self._parting = Parting(slide, finger, pause_ns) if pause_ns else None
-        self._number = 1  # number of the slide in its recording
+        self._number = 1  # index of the slide in its recording
         self.every_ns = every_ns
         self._late = 0
         self._finger, self._slide, self._description = finger, slide, description
-        self._lacks = ""  # why this recording gives no answer any more
+        self._lacks = ""  # reason why this recording gets no more predictions
         self._continues = False
         self._decoders: dict[str, Decoder] = {}
         self._tables: dict[str, pa.Table] = {}
-        self._over: set[str] = set()  # streams of which nothing more is of the recording
+        self._over: set[str] = set()  # streams without further data for the recording
         self._due_ns: int | None = None
-        self._read_ns = 0  # up to which samples were read
+        self._read_ns = 0  # end of the samples that were read
 
     @property
     def late(self) -> int:
-        """Samples so far that came after the answer that they belong to."""
+        """Number of samples so far that arrived after the prediction for their time."""
         return self._late
 
     @property
     def beginning(self) -> Begun | None:
-        """States that a recording runs."""
+        """Marker of a running recording."""
         return Begun() if self.running else None
 
     def describe(self, model: str) -> MaterialDescription:
-        """Return what its messages are."""
+        """Return the description of the session's messages."""
         return self._description
 
     def continue_recording(self, beginning: str) -> None:
-        """Take note that the next recording lacks its first samples."""
+        """Mark the next recording as lacking its first samples."""
         self._continues = True
 
     def begin_recording(self, offset_ns: int) -> None:
-        """Begin a recording."""
+        """Start a recording."""
         self._lacks, self._continues = RESTARTED if self._continues else "", False
         self._due_ns, self._read_ns = None, 0
         self._decoders, self._tables, self._over = {}, {}, set()
@@ -99,29 +99,29 @@ class MaterialEngine(Engine):
             self._parting.begin()
 
     def end_recording(self) -> None:
-        """Wait for the ends of its streams: a recording is over with the last of them."""
+        """Wait for the ends of its streams; a recording ends with the last of them."""
 
     def overflow(self) -> None:
-        """Give no further answer in this recording, which lacks blocks."""
+        """Stop predictions for this recording, because blocks are missing."""
         super().overflow()
         self._lacks = THROWN
 
     def begin_stream(self, stream: str) -> None:
-        """Decode a stream from the start of the recording on."""
+        """Decode a stream from the start of the recording."""
         self._decoders[stream] = Decoder(self.sensors[stream])
 
     def end_stream(self, stream: str) -> None:
-        """Take note that nothing more of a stream belongs to the recording."""
+        """Mark a stream as ended for the recording."""
         self._over.add(stream)
 
     def take_note(self, stream: str, note: StreamNote) -> None:
-        """Take a note on a stream; bytes that were lost go to its decoder."""
+        """Process a note on a stream; lost bytes are reported to its decoder."""
         super().take_note(stream, note)
         if note.what not in (BEGAN, OVER):
             self._keep(stream, note)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Keep bytes of a stream that is not over."""
+        """Store bytes of a stream that has not ended."""
         self._keep(stream, chunks)
 
     def _keep(self, stream: str, block: Chunks | StreamNote) -> None:
@@ -129,11 +129,11 @@ class MaterialEngine(Engine):
             self._decoders[stream].take(block)
 
     def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock."""
+        """Return the monotonic time of the next call of `step`."""
         return now_ns + IDLE_NS if self._due_ns is None or self._over else max(self._due_ns, now_ns + IDLE_NS // 20)
 
     def step(self, now_ns: int) -> list[MaterialMessage]:
-        """Return the answer that is due, behind the final ones of slides that are over."""
+        """Return the final messages of ended slides, followed by the message that is due."""
         if self._offset_ns is None:
             return []
         if self._over:
@@ -146,7 +146,7 @@ class MaterialEngine(Engine):
         return self._answered(now_ns + self._offset_ns - self.settle_ns, final=False)
 
     def finish(self) -> list[MaterialMessage]:
-        """Return the final answers that are left of the recording, which is over."""
+        """Return the remaining final messages of the ended recording."""
         if self._offset_ns is None:
             return []
         messages = self._answered(0, final=True)
@@ -154,25 +154,25 @@ class MaterialEngine(Engine):
         return messages
 
     def published(self, message: Message, now_ns: int) -> None:
-        """Write the latency into a message that is about to be published, also into one without an answer."""
+        """Write the latency into a message before publication, also if it has no prediction."""
         if self._offset_ns is not None and message.made_from_t_ns:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
     def _answered(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
-        """Return the answers from all samples up to a moment; the final one of a recording is from all there are."""
+        """Return the messages for all samples up to a time; a recording's final message uses all samples."""
         began_s = time.perf_counter()
         self._fetch(final=final)
         if final:
             last = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
             until_ns = int(max(last, default=self._read_ns))
         messages = self._final_ones(until_ns)
-        if not messages or self._finger in self._tables:  # else nothing has come of the next slide
+        if not messages or self._finger in self._tables:  # otherwise the next slide has no samples yet
             messages.append(self._message(until_ns, final=final))
         messages[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
         return messages
 
     def _final_ones(self, until_ns: int) -> list[MaterialMessage]:
-        """Return the final answers of the slides that are over by a moment, and forget what belongs to them."""
+        """Return the final messages of slides that ended by ``until_ns``, and discard their samples."""
         messages: list[MaterialMessage] = []
         while self._parting is not None and not self._lacks:
             end_ns = self._parting.end_ns(self._tables, until_ns)
@@ -185,7 +185,7 @@ class MaterialEngine(Engine):
         return messages
 
     def _message(self, until_ns: int, *, final: bool) -> MaterialMessage:
-        """Return the answer of the slide from its samples up to a moment."""
+        """Return the message for the slide's samples up to a time."""
         streams = up_to(self._tables, until_ns)
         newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
         answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
@@ -221,7 +221,7 @@ class MaterialEngine(Engine):
         return self._slide.answer(streams)
 
     def _fetch(self, *, final: bool) -> None:
-        """Put what came behind what is kept, unless nothing can be answered from it."""
+        """Append new samples to the stored tables, unless no prediction is possible."""
         import pyarrow as pa
 
         assert self._offset_ns is not None
@@ -236,7 +236,7 @@ class MaterialEngine(Engine):
 
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:
-    """Return the stream with tactile channels. Raises `TacpipeError` if there is none, or more than one."""
+    """Return the stream with tactile channels. Raises `TacpipeError` if there is not exactly one."""
     from tacpipe.channels.streams import finger
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}

@@ -1,4 +1,4 @@
-"""Declare the messages of a session with a model of materials: the material of a slide while it lasts."""
+"""Define the messages of a session with a material model: the material of a slide during the slide."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from tacpipe.live.messages import VERSION, Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 WAITING, SLIDING, ENDED, FINAL = "waiting", "sliding", "ended", "final"  # states of a slide
-MATERIAL = "material"  # the recorded stream
+MATERIAL = "material"  # name of the recorded stream
 RECORDED = (MATERIAL, LSL)
-MIN_SEEN = 0.25  # default of the fraction of a slide before which its material is unknown
+MIN_SEEN = 0.25  # default for the minimum fraction of a slide before its material is predicted
 
 
 def _probability_columns(sizes: MessageSizes) -> list[LiveColumn]:
@@ -68,63 +68,63 @@ DECLARATION = Declaration(
 
 @dataclass
 class MaterialMessage(messages.Message):
-    """The material of a slide so far, or why none is named."""
+    """The material of the slide so far, or the reason why it is unknown."""
 
     seq: int
-    t_ns: int  # time up to which samples were read, UTC as the recording has it
-    names: tuple[str, ...]  # names of the classes
-    probabilities: Float32s | None  # (class,); None: no material is named
-    state: str = WAITING  # state of the slide; final: nothing more comes, and `tacpipe predict` gives the same
-    rows: int = 0  # rows of the slide so far
-    seen: float = 0.0  # fraction of the rows that the model reads
-    cause: str = ""  # why no material is named
+    t_ns: int  # time up to which samples were read, UTC time of the recording
+    names: tuple[str, ...]  # class names
+    probabilities: Float32s | None  # (class,); None if no material is predicted
+    state: str = WAITING  # state of the slide; final if it equals the result of `tacpipe predict`
+    rows: int = 0  # number of rows of the slide so far
+    seen: float = 0.0  # fraction of the model's input rows
+    cause: str = ""  # reason why no material is predicted
     made_from_t_ns: int = 0  # arrival of the newest sample that was read
     latency_ms: float = math.nan
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
-    slide: int = 1  # number of the slide in its recording
+    slide: int = 1  # index of the slide in its recording
     declaration: ClassVar[Declaration] = DECLARATION
 
     @property
     def class_number(self) -> int:
-        """The number of the material among the model's classes, -1 for none."""
+        """Class number of the material, or -1 if unknown."""
         return -1 if self.probabilities is None else int(self.probabilities.argmax())
 
     @property
     def material(self) -> str:
-        """The name of the material, or unknown."""
+        """Name of the material, or unknown."""
         return "unknown" if self.probabilities is None else self.names[self.class_number]
 
     @property
     def probability(self) -> float | None:
-        """The probability of the material."""
+        """Probability of the material."""
         return None if self.probabilities is None else self.probabilities.tolist()[self.class_number]
 
     @property
     def probabilities_by_name(self) -> dict[str, float] | None:
-        """The probability of each material."""
+        """Probability of each material."""
         return None if self.probabilities is None else dict(zip(self.names, self.probabilities.tolist(), strict=True))
 
     @property
     def probability_columns(self) -> Float32s:
-        """The probability of each material (class,), or NaN if none is named."""
+        """Probability of each material (class,), or NaN if there is no prediction."""
         unknown = np.full(len(self.names), np.nan, np.float32)
         return unknown if self.probabilities is None else self.probabilities.astype(np.float32)
 
     @property
     def ended(self) -> bool:
-        """True if the slide is over."""
+        """Whether the slide has ended."""
         return self.state in (ENDED, FINAL)
 
     @property
     def answers(self) -> bool:
-        """True if a material is named."""
+        """Whether a material is predicted."""
         return self.probabilities is not None
 
     @property
     def states(self) -> Mapping[str, str]:
-        """The material with its probability."""
+        """The material and its probability, for display."""
         if self.probabilities is None:
             return {"material": "unknown"}
         return {"material": f"{self.material} ({self.probability:.2f})"}
@@ -132,25 +132,25 @@ class MaterialMessage(messages.Message):
 
 @dataclass(frozen=True)
 class MaterialDescription(messages.Description):
-    """Describes the messages of a session with a model of materials."""
+    """Description of the messages of a session with a material model."""
 
     channels: tuple[str, ...]  # names of the materials
     sensor: str
-    frames: int  # rows of a slide that the model reads
-    any_length: bool  # True: it reads fewer, too
-    confidence: str  # probability: what the model was trained to state; order: scores of no scale, which only order
-    rate_hz: float  # messages a second
+    frames: int  # number of rows that the model reads of a slide
+    any_length: bool  # whether the model accepts fewer rows
+    confidence: str  # probability: as the model was trained; order: scores without a scale, which only rank classes
+    rate_hz: float  # messages per second
     model: str
     declaration: ClassVar[Declaration] = DECLARATION
     answers: ClassVar[str] = "materials named"
 
     @property
     def sizes(self) -> Sizes:
-        """The names of the materials."""
+        """Names of the materials."""
         return Sizes(self.channels)
 
     def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+        """Return the description as a dict for JSON and msgpack."""
         return {
             "version": VERSION,
             "kind": "description",

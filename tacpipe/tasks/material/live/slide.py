@@ -1,8 +1,8 @@
-"""The material of a slide while it lasts: `tacpipe segment slides` and the model, applied to what has come so far.
+"""Predict the material during a slide: apply `tacpipe segment slides` and the model to the samples so far.
 
-Whatever is asked at a moment is what a recording that ends there would give, so nothing looks ahead, and at the end of the
-recording the answer is that of `tacpipe predict`. Only a slide that is still shorter than those of training has a rule of
-its own: models that read slides of any length read what there is of it, once there is enough.
+The prediction at any time equals that for a recording that ends there, so it uses no future samples, and at the end of
+the recording it equals that of `tacpipe predict`. Only slides that are still shorter than those of training are treated
+differently: models that accept slides of any length read the available rows, once there are enough.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 SLIDES = "segment.slides"
-ENDED_NS = 200_000_000  # time without a row of the slide after which it is over
+ENDED_NS = 200_000_000  # time without a row of the slide after which it has ended
 UNLIKE = "the slide is like none of the materials that the model knows"
 
 
 def slide_params(steps: Sequence[Step]) -> Any:
-    """Return the params of `segment slides` that a model of materials was trained behind.
+    """Return the params of the stage `segment slides` that a material model was trained behind.
 
-    Raises `UsageError` if that stage has another version now, `TacpipeError` if the model was trained behind others.
+    Raises `UsageError` if that stage now has another version, `TacpipeError` if the model was trained behind other
+    stages.
     """
     names = [step["stage"] for step in steps]
     if names != [SLIDES]:
@@ -66,7 +67,7 @@ def slide_params(steps: Sequence[Step]) -> Any:
 
 @dataclass(frozen=True)
 class Held:
-    """The streams of a recording so far, as a stage reads a recording."""
+    """Streams of a recording so far, with the interface that stages read."""
 
     tables: Mapping[str, pa.Table]
     attributes: Mapping[str, Attribute]
@@ -78,32 +79,32 @@ class Held:
         return tuple(self.tables)
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        """Return a stream."""
+        """Return a stream, or some of its columns."""
         return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a model for a slide so far."""
+    """A model's prediction for a slide so far."""
 
-    scores: Float32s | None  # (class,); None: no material is named, for a cause
-    rows: int = 0  # rows of the slide so far
-    fraction: float = 0.0  # rows so far, as a fraction of those that the model reads
-    is_over: bool = False  # nothing came of the slide for `ENDED_NS`
+    scores: Float32s | None  # (class,); None if no material is predicted, with the reason in ``cause``
+    rows: int = 0  # number of rows of the slide so far
+    fraction: float = 0.0  # fraction of the rows that the model reads
+    is_over: bool = False  # whether the slide had no new row for `ENDED_NS`
     cause: str = ""
     probabilities: Float32s | None = field(default=None)  # (class,)
 
 
 class SlideSoFar:
-    """Names the material of the slide in what has come of a recording."""
+    """Predicts the material of the slide in the samples so far."""
 
     def __init__(
         self, classifier: Classifier, params: Any, sensor: str, least_fraction: float, rate_hz: float | None = None
     ) -> None:
-        """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor.
+        """Store the params of `segment slides` and the minimum fraction of a slide. Raises an error for an unknown sensor.
 
-        ``rate_hz`` is the rig's, as the label of a recording; None: that of the stamps, which are arrivals, and so come in
-        bursts where the computer is busy.
+        ``rate_hz`` is the rig's nominal rate. If None, the rate is that of the arrival times, which come in bursts on a
+        busy computer.
         """
         self._classifier, self._params, self._sensor = classifier, params, sensor
         self._attributes = {"sensor": sensor} | ({"rate_hz": rate_hz} if rate_hz else {})
@@ -113,16 +114,16 @@ class SlideSoFar:
 
     @property
     def frames(self) -> int:
-        """Rows of a slide that the model reads."""
+        """Number of rows that the model reads of a slide."""
         return self._layout.frames
 
     @property
     def any_length(self) -> bool:
-        """True for a model that reads fewer rows, too."""
+        """Whether the model accepts fewer rows."""
         return self._reader.any_length
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
-        """Return what a recording of these streams would give if it ended now."""
+        """Return the prediction for a recording of these streams that ends now."""
         recording = Held(streams, self._attributes)
         try:
             segmented = self._stage(replace(self._params, crop="none"), recording)
@@ -153,10 +154,10 @@ class SlideSoFar:
         )
 
     def is_over(self, streams: Mapping[str, pa.Table], finger_stream: str, pause_ns: int) -> bool:
-        """Return whether the slide in these streams ended, and nothing of it came for a pause.
+        """Return whether the slide in these streams has ended and been followed by a pause.
 
-        With the trigger ``load`` that is where the finger touches nothing, whatever the arm does: what comes then begins
-        free, as a recording does. With ``pressure`` it is where the arm has stopped.
+        With the trigger ``load``, a pause is a time without contact, whatever the arm does; the samples after it start
+        without contact, as in a recording. With ``pressure``, it is a time in which the arm has stopped.
         """
         free = self._params.trigger == "load"
         tables = {name: table for name, table in streams.items() if not free or name == finger_stream}
@@ -164,18 +165,18 @@ class SlideSoFar:
             return False
         try:
             slide = self._stage(replace(self._params, crop="none"), Held(tables, self._attributes)).streams[STREAM]
-        except TacpipeError:  # no slide has begun
+        except TacpipeError:  # no slide has started
             return False
         newest_ns, last_ns = (table.column("t_ns")[-1].as_py() for table in (tables[finger_stream], slide))
         return bool(newest_ns - last_ns >= pause_ns)
 
     @property
     def ends_by_arm(self) -> bool:
-        """True if a slide ends only when the arm stops."""
+        """Whether a slide ends only when the arm stops."""
         return bool(self._params.trigger != "load")
 
     def _cut(self, recording: Held, table: pa.Table) -> tuple[Any, bool]:
-        """Return the rows of the slide that count, as the stage cuts them out or as far as they have come, and which."""
+        """Return the rows of the slide, as the stage selects them or as far as available, and whether it did."""
         params = self._params
         first = params.offset_frames if params.crop == "offset" else 0
         if params.crop == "none" or table.num_rows - first >= params.frames:
@@ -185,25 +186,25 @@ class SlideSoFar:
         return Held({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
 
 
-MOMENT_NS = 100_000_000  # time between two moments of a part, from its finger's first sample on
+MOMENT_NS = 100_000_000  # interval between checks of a part, starting at the finger's first sample
 
 
 class Parting:
-    """Finds the ends of slides in what has come of a part of a recording."""
+    """Detects the ends of slides in the samples of a part of a recording."""
 
     def __init__(self, slide: SlideSoFar, finger: str, pause_ns: int) -> None:
-        """Take what a slide is, the stream of the finger, and how long a pause is."""
+        """Store the slide definition, the finger's stream and the pause duration."""
         self._slide, self._finger, self._pause_ns = slide, finger, pause_ns
-        self._moments = 0  # number of moments of this part so far
+        self._moments = 0  # number of checks of this part
 
     def begin(self) -> None:
-        """Begin another part."""
+        """Start the next part."""
         self._moments = 0
 
     def end_ns(self, tables: Tables, until_ns: int) -> int | None:
-        """Return the moment at which the slide of this part is over, or None if it is not by ``until_ns``.
+        """Return the time at which the slide of this part ended, or None if it has not ended by ``until_ns``.
 
-        ``tables`` are the streams of this part, of which all samples up to ``until_ns`` have come.
+        ``tables`` contains the streams of this part, complete up to ``until_ns``.
         """
         if self._finger not in tables:
             return None
@@ -216,25 +217,25 @@ class Parting:
 
 
 def up_to(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
-    """Return the rows of each stream up to a time; streams without any are left out."""
+    """Return the rows of each stream up to a time; empty streams are omitted."""
     return {name: tables[name].slice(0, count) for name, count in _counts(tables, t_ns).items() if count}
 
 
 def after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
-    """Return the rows of each stream behind a time; streams without any are left out."""
+    """Return the rows of each stream after a time; empty streams are omitted."""
     counts = _counts(tables, t_ns)
     return {name: tables[name].slice(count) for name, count in counts.items() if count < tables[name].num_rows}
 
 
 def _counts(tables: Tables, t_ns: int) -> dict[str, int]:
-    """Return how many rows each stream has up to a time."""
+    """Return the number of rows of each stream up to a time."""
     return {
         name: int(np.searchsorted(table.column("t_ns").to_numpy(), t_ns, "right")) for name, table in tables.items()
     }
 
 
 def parts(slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables) -> Iterator[tuple[int, dict[str, pa.Table]]]:
-    """Yield the end and the streams of each part of a whole recording; all of it is one where a pause is 0."""
+    """Yield the end and the streams of each part of a recording; if ``pause_ns`` is 0, there is one part."""
     remaining = {name: table for name, table in tables.items() if table.num_rows}
     last_ns = max((int(table.column("t_ns")[-1].as_py()) for table in remaining.values()), default=0)
     parting = Parting(slide, finger, pause_ns)
@@ -247,17 +248,16 @@ def parts(slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables) -> Iter
         yield last_ns, remaining
 
 
-PAUSE, LEAST = "live_pause_s", "live_least"  # attributes of a session's recording: what it was asked for
-UNREAD = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that no session reads
-Row = tuple[str, int, int, Answer]  # recording, number of the slide, up to when it was read, answer
+PAUSE, LEAST = "live_pause_s", "live_least"  # attributes with the settings of a session's recording
+UNREAD = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that sessions do not read
+Row = tuple[str, int, int, Answer]  # recording, index of the slide, end of the samples that were read, prediction
 
 
 def predict(model: Model, recordings: Dataset) -> Result:
-    """Return one table, ``predictions``: a row a slide, with number, end, rows, material, cause and probabilities.
+    """Return one table, ``predictions``, with one row per slide: index, end, rows, material, cause and probabilities.
 
-    Recordings are given as they were recorded. A recording is one slide, and where its session was asked for a pause (its
-    attribute ``live_pause_s``) one after another. Raises `TacpipeError`, naming the recording, where one is not what the
-    model reads.
+    ``recordings`` are raw. A recording is one slide or, if its session had a pause (attribute ``live_pause_s``),
+    several successive ones. Raises `TacpipeError` with the name of a recording that does not fit the model.
     """
     classifier = Classifier.load(model.files)
     params = slide_params(model.source.chain)

@@ -1,4 +1,4 @@
-"""Run models of material live: their settings, the plan of a session, and its engine."""
+"""Run material models live: settings, session plan and engine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaterialSettings(TaskSettings):
-    """Settings of a session with a model of materials."""
+    """Settings of a session with a material model."""
 
     sensor: str = ""  # Sensor of the rig, of those that the model knows; by default its only one
     every_ms: Annotated[float, Range(10, 10_000)] = 100.0  # Time between two answers, ms [100]
@@ -36,7 +36,7 @@ class MaterialSettings(TaskSettings):
 
 
 class MaterialLive(LiveTask):
-    """The material of a slide while it lasts."""
+    """Prediction of the material during a slide."""
 
     settings: ClassVar[type[TaskSettings]] = MaterialSettings
     declaration: ClassVar[Declaration] = DECLARATION
@@ -57,8 +57,8 @@ class MaterialLive(LiveTask):
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> MaterialEngine:
         """Return the engine of a session.
 
-        Raises `UsageError` if it is not stated which of the model's sensors the rig has, `TacpipeError` if the rig
-        has not the channels that the model reads, or the model was trained behind a stage that has no causal rule.
+        Raises `UsageError` if the rig's sensor is ambiguous. Raises `TacpipeError` if the rig lacks channels of the
+        model, or the model was trained behind a stage without a causal version.
         """
         from tacpipe.tasks.material.classifier import Classifier
         from tacpipe.tasks.material.live.engine import MaterialEngine, find_finger
@@ -103,7 +103,7 @@ class MaterialLive(LiveTask):
         )
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return the final answer of each slide."""
+        """Return the final prediction for each slide."""
         from tacpipe.tasks.material.live.slide import predict
 
         return predict(model, recordings)
@@ -115,7 +115,7 @@ def _material_settings(settings: Settings) -> MaterialSettings:
 
 
 def _check_channels(classifier: Classifier, sensor: str, stream: str, finger: Sensor) -> None:
-    """Raise `TacpipeError` if the stream of the finger has other channels than the slides of training."""
+    """Raise `TacpipeError` if the finger's stream and the training slides differ in channels."""
     layout = classifier.layout(sensor)
     quantities = {quantity.encode() for quantity in classifier.quantities}
     channels = tuple(field.name for field in finger.fields() if (field.metadata or {}).get(b"quantity") in quantities)

@@ -1,4 +1,4 @@
-"""Report results on materials."""
+"""Report material results."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class MaterialReport(TaskReport):
     predictor_names = methods.PREDICTOR_NAMES
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
-        """Return the runs of results that hold predictions of slides which the model has not seen."""
+        """Return the runs of results that contain predictions for unseen slides."""
         return methods.read_runs(results)
 
     def kind(self, predictor: str) -> Kind:
-        """Return what a predictor is."""
+        """Return the kind of a predictor: model, baseline or control."""
         return methods.KINDS.get(predictor, "variant")
 
     def uses(self, dataset: Dataset) -> bool:
-        """Return whether a dataset holds slides, which are drawn."""
+        """Return whether a dataset contains slides, which the report draws."""
         return figures.holds_slides(dataset)
 
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return counts, the last epoch, the skill over the mean level and the numbers of the paper."""
+        """Return counts, last epoch, skill over the mean level, and the numbers of the paper."""
         runs = [run for run in context.runs if comparison.question in run.questions]
         sensors = (
             sensor for run in runs for sensor in run.details.sensors if question_on(run, sensor) == comparison.question
@@ -52,7 +52,7 @@ class MaterialReport(TaskReport):
             return row.method.of(comparison.question)
 
         def named_right(row: ComparisonRow) -> Cell:
-            counted = row.predictor != headline.CHANCE  # chance names no material
+            counted = row.predictor != headline.CHANCE  # chance predicts no material
             return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
 
         def last(row: ComparisonRow) -> Cell:
@@ -75,7 +75,7 @@ class MaterialReport(TaskReport):
         return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
 
     def folds(self, context: Context) -> list[Fold]:
-        """Return what materials have of their own."""
+        """Return the sections that are specific to materials."""
         methods = context.methods
         return [
             *blocks.fold(
@@ -96,12 +96,12 @@ class MaterialReport(TaskReport):
         ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about these numbers."""
+        """Return the caveats of these numbers."""
         methods = context.methods
         return [_basis(methods), _pooled(methods), scores.caution(methods), _not_run(methods)] if methods else []
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return more columns of the table of runs."""
+        """Return additional columns of the table of runs."""
         return joint.run_columns(run)
 
 
@@ -113,7 +113,7 @@ PAIRED = (
 
 
 def _pooled(methods: Sequence[Method]) -> str:
-    """Return what the table of accuracies of these methods holds."""
+    """Return a description of the table of accuracies of these methods."""
     runs = [run for method in methods for run in method.details]
     published = all(method.published for method in methods)
     predicted = {name for run in runs for name in run.predictions.predicted}
@@ -138,7 +138,7 @@ def _pooled(methods: Sequence[Method]) -> str:
 
 
 def _basis(methods: Sequence[Method]) -> str:
-    """Return what all rests on: slides, training slides, and settings."""
+    """Return a description of the data of all methods: slides, training slides, and settings."""
     described = []
     for sensor in sensors_of(methods):
         slides = [run.details.predictions.of(sensor) for method in methods for run in runs_on(method, sensor)]
@@ -156,7 +156,7 @@ def _basis(methods: Sequence[Method]) -> str:
 
 
 def _not_run(methods: Sequence[Method]) -> str:
-    """Return what the paper printed of methods that were not run, where the slides are the paper's."""
+    """Return the published numbers of methods that were not run, if the slides are those of the paper."""
     if not all(method.published for method in methods):
         return ""
     missing = [name for name in joint.ACCURACIES if all(method.family != name for method in methods)]

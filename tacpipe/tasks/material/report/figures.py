@@ -1,4 +1,4 @@
-"""Draw confusions, training, latents and typical slides."""
+"""Draw confusions, training curves, latents and typical slides."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
 
 
-MAX_PAIRS = 3  # pairs of materials in words
+MAX_PAIRS = 3  # maximum number of pairs of materials in a sentence
 CONFUSION_NOTE = (
     "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
 )
 
 
 def confusion_folds(context: Context) -> list[Fold]:
-    """Return the confusions of the best method and of the joint one, a chart a sensor."""
+    """Return the confusions of the best and of the joint method, one chart per sensor."""
     drawn = []
     joint = scores.main_method(context.methods)
     for sensor in sensors_of([method for method in context.methods if has_usual_settings(method.settings)]):
@@ -53,7 +53,7 @@ def confusion_folds(context: Context) -> list[Fold]:
 
 
 def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
-    """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
+    """Return the confusion counts (material, predicted), pooled over runs, and the materials."""
     import pandas as pd
 
     tables = []
@@ -71,7 +71,7 @@ def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | lis
 
 
 def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
-    """Return the materials most often taken for another, in words."""
+    """Return a sentence on the materials that are most often confused with another."""
     wrong = counts - np.diag(np.diag(counts))
     order = np.argsort(-wrong, axis=None, kind="stable")[:MAX_PAIRS]
     described = []
@@ -94,7 +94,7 @@ def _confusion_chart(method: Method, sensor: str) -> Chart:
     return Chart(f"{sensor_title(sensor)}: {method.name}", spec, caption)
 
 
-Points = dict[int, tuple[float, float, float]]  # accuracy and its bounds, by number of training slides
+Points = dict[int, tuple[float, float, float]]  # number of training slides -> accuracy and its bounds
 
 
 def training_folds(methods: Sequence[Method]) -> list[Fold]:
@@ -104,7 +104,10 @@ def training_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def validation_charts(methods: Sequence[Method]) -> list[Chart]:
-    """Return validation accuracy by epoch, Figure 9 of the paper, one chart a sensor; none without epochs."""
+    """Return validation accuracy by epoch, as in Figure 9 of the paper, one chart per sensor.
+
+    Empty if there are no epochs.
+    """
     networks = [method for method in methods if has_usual_settings(method.settings)]
     chosen = [method for family in ("RAEC joint", "RAEC independent") for method in networks if method.family == family]
     order = [method.name for method in chosen]
@@ -121,7 +124,7 @@ def validation_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
-    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart, or None if none is given."""
+    """Return Figure 10 of the paper: the distance between paired latents of the sensors; empty if it was not logged."""
     chosen = [
         method
         for method in methods
@@ -139,12 +142,12 @@ def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
 
 
 def alignment_by_epoch(run: MaterialResult) -> list[float]:
-    """Return the mean squared latent difference of training pairs by epoch, or NaN if an epoch does not state it."""
+    """Return the mean squared latent difference of training pairs by epoch; NaN for epochs without it."""
     return without_gaps([epoch.get("alignment") for epoch in run.history])
 
 
 def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return accuracy over the number of training slides, a chart a sensor, or None if all have as many."""
+    """Return accuracy by number of training slides, one chart per sensor; empty if all methods have the same number."""
     chosen = [candidate for candidate in methods if has_usual_settings(candidate.settings, "few", "subsample_sensor")]
     drawn = []
     for sensor in sensors_of(chosen):
@@ -153,7 +156,7 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
             fewer = {method.settings["subsample_sensor"], method.settings["few_of"]} - {""}
             if fewer <= {sensor}:
                 _add_points(points, method_title(method), method, sensor)
-            if fewer == {sensor}:  # such a line ends where all sensors have all slides
+            if fewer == {sensor}:  # this line ends at the full number of slides of all sensors
                 loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
                 for candidate in chosen:
                     if has_usual_settings(candidate.settings) and candidate.key_without(*loose) == method.key_without(
@@ -182,7 +185,7 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def _add_points(points: dict[str, Points], name: str, method: Method, sensor: str) -> None:
-    """Add what a method states to a line."""
+    """Add the accuracy of a method to a line."""
     counted = accuracy(runs_on(method, sensor), sensor)
     if counted is None:
         return
@@ -192,7 +195,7 @@ def _add_points(points: dict[str, Points], name: str, method: Method, sensor: st
 
 
 def _validation_by_epoch(run: MaterialResult, sensor: str) -> list[float]:
-    """Return the validation accuracy on a sensor's slides by epoch, in percent, or empty if none is given."""
+    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty if it was not logged."""
     accuracies = [epoch.get("val", {}).get(sensor, {}).get("accuracy") for epoch in run.history]
     return [100 * value for value in without_gaps(accuracies)]
 
@@ -206,7 +209,7 @@ LATENT_NOTE = (
 
 
 def latent_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return a chart each of a joint run, of the control and of two independent ones; nothing without joint latents."""
+    """Return charts of a joint run, its control and two independent runs; empty without joint latents."""
     main = scores.main_method(methods)
     if main is None:
         return []
@@ -216,9 +219,9 @@ def latent_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
-    """Return points of several sets, each (slide, latent), on the first two principal components of all, (slide, 2).
+    """Project sets of points (slide, latent) on the first two principal components of all, each (slide, 2).
 
-    Of the two directions of a component the one is taken in which its largest weight is positive.
+    The sign of each component makes its largest weight positive.
     """
     stacked = np.vstack(parts)
     centre = stacked.mean(axis=0)
@@ -230,16 +233,16 @@ def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
 def count_nearest_partners(
     first: SlidePredictions, second: SlidePredictions, partners: Mapping[int, int]
 ) -> tuple[int, int]:
-    """Return of how many materials the nearest mean among the other's is that of its partner, and of how many.
+    """Return how many materials are nearest to their partner by class means, and how many there are.
 
-    All latents count. ``partners`` has the other sensor's material of each; one that is not in it is its own.
+    All latents are used. ``partners`` maps materials to those of the other sensor; missing materials map to themselves.
     """
     first_materials, second_materials = np.unique(first.materials), np.unique(second.materials)
     means = [
         np.array([_latents_of(part)[part.materials == name].mean(axis=0) for name in names])
         for part, names in ((first, first_materials), (second, second_materials))
     ]
-    distances = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other)
+    distances = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other sensor)
     partner_names = [partners.get(int(name), int(name)) for name in first_materials]
     is_nearest = [
         near == name
@@ -250,7 +253,7 @@ def count_nearest_partners(
 
 
 def _latent_chart(method: Method) -> Chart | None:
-    """Return the latents of one run of a method, or of one a sensor where each has its own model."""
+    """Return the latents of one run of a method, or of one run per sensor if each has its own model."""
     rows = _paired_predictions(method.details)
     if rows is None:
         return None
@@ -281,7 +284,7 @@ def _latent_chart(method: Method) -> Chart | None:
 def _latent_rows(
     points: Sequence[AnyFloats], parts: Sequence[SlidePredictions], partners: Mapping[int, int]
 ) -> list[tuple[str, AnyFloats, AnyFloats]]:
-    """Return the name of each material, the mean of the first sensor's slides and of its partner's by the other."""
+    """Return each material's name, the mean of the first sensor's slides, and that of the partner's by the other sensor."""
     means = [
         {int(material): at[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
         for at, part in zip(points, parts, strict=True)
@@ -295,7 +298,7 @@ def _latent_rows(
 
 
 def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str], list[SlidePredictions]] | None:
-    """Return two sensors and the rows of each, of the first run that holds both, or else of the first of each."""
+    """Return two sensors and the rows of each, from the first run that contains both or else from the first run of each."""
     with_latents = [run for run in runs if run.predictions.latents is not None]
     sensors = ordered_sensors([sensor for run in with_latents for sensor in run.sensors])[:2]
     if len(sensors) < 2:
@@ -317,12 +320,12 @@ SLIDE, PROFILE = "slide", "profile"
 
 
 def holds_slides(dataset: Dataset) -> bool:
-    """Return whether a dataset holds slides."""
+    """Return whether a dataset contains slides."""
     return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.recordings.values())
 
 
 def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
-    """Return what slides were like; nothing without any."""
+    """Return charts of typical slides; empty if there are none."""
     shards = [shard for dataset in datasets for shard in dataset.recordings.values() if holds_slides(dataset)]
     if not shards:
         return []
@@ -343,7 +346,7 @@ def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
 
 
 def typical_slide(shards: Sequence[Recording]) -> Recording:
-    """Return the slide of median force among those that kept to the protocol, or among all where none did."""
+    """Return the slide with the median force among those that followed the protocol, or among all if none did."""
     inside_protocol = [shard for shard in shards if not shard.attributes.get("outside_protocol")] or list(shards)
 
     def force(shard: Recording) -> tuple[float, str]:
@@ -353,7 +356,7 @@ def typical_slide(shards: Sequence[Recording]) -> Recording:
 
 
 def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:
-    """Return how many slides there are of a sensor, and how many kept to the protocol."""
+    """Return the number of a sensor's slides, and of those that followed the protocol, in words."""
     outside = [shard for shard in shards if shard.attributes.get("outside_protocol")]
     slides_text = counted(len(shards), "slides")
     if not any("outside_protocol" in shard.attributes for shard in shards):
@@ -365,7 +368,7 @@ def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:
 
 
 def _profile_charts(shard: Recording, sensor: str, published: bool) -> list[Chart]:
-    """Return force and speed of one slide."""
+    """Return charts of the force and speed of one slide."""
     table = shard.table(PROFILE)
     time_ns = table["t_ns"].to_numpy()
     time_s = (time_ns - time_ns[0]) / 1e9

@@ -1,4 +1,4 @@
-"""Report what learning sensors jointly changes, in the tables of the paper with its printed numbers."""
+"""Report the effect of joint learning, in tables of the paper's form with its published numbers."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ PRINTED_BASIS = (
 )
 
 
-ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
-APART = 0.2  # loss of accuracy by exchanged classifiers, from which on there is no alignment to explain
-LOSS = 0.05  # accuracy that exchanged classifiers may lose beyond those of real pairs
+ALIKE = 2.0  # latents of permuted pairs count as equally close as those of real pairs up to this factor
+APART = 0.2  # loss of accuracy with exchanged classifiers above which sensors are not aligned
+LOSS = 0.05  # additional loss of accuracy with exchanged classifiers compared with real pairs
 NO_CONTROL = (
     "No run with permuted materials is among the results, so whether labels alone drive the alignment was not tested."
 )
 
 
 def joint_effects(methods: Sequence[Method]) -> list[str]:
-    """Return what joint learning does, and what controls state of it."""
+    """Return sentences on the effect of joint learning and the result of its control."""
     main = scores.main_method(methods)
     return (
         [
@@ -79,7 +79,7 @@ def joint_effects(methods: Sequence[Method]) -> list[str]:
 
 
 def describe_control(joint: Method, permuted: Method | None) -> str:
-    """Return what training on pairs of permuted materials states of the alignment of real ones, as far as there is one."""
+    """Return what training on permuted pairs implies for the alignment of real pairs, if there is any."""
     if permuted is None:
         return NO_CONTROL
     alignments = [_last_alignment(item) for item in (joint, permuted)]
@@ -120,7 +120,7 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
 
 
 def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
-    """Return what learning jointly changes, a sentence a sensor."""
+    """Return the gain of joint learning, one sentence per sensor."""
     if independent is None:
         return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
     described = []
@@ -149,7 +149,7 @@ def _describe_difference(difference: MethodDifference) -> str:
 
 
 def _last_alignment(method: Method) -> float:
-    """Return the latent difference after the last epoch, the mean over runs."""
+    """Return the latent difference after the last epoch, averaged over runs."""
     last = [curve[-1] for result in method.details if (curve := figures.alignment_by_epoch(result))]
     return float(np.mean(last)) if last else float("nan")
 
@@ -160,7 +160,7 @@ def _swapped_accuracy(method: Method) -> dict[str, Accuracy]:
 
 
 def swap_table(methods: Sequence[Method]) -> Table | None:
-    """Return Table II: accuracy before and after classifiers are exchanged, or None if none were."""
+    """Return Table II, the accuracy before and after exchanging classifiers; None if they were not exchanged."""
     candidates = [item for item in methods if has_usual_settings(item.settings) or scores.is_control(item)]
     candidates = [
         item for item in candidates if any(SWAPPED in result.predictions.predicted for result in item.details)
@@ -197,7 +197,7 @@ def swap_table(methods: Sequence[Method]) -> Table | None:
 
 
 def difference_table(methods: Sequence[Method]) -> Table | None:
-    """Return which method is ahead on the same slides, and how sure that is, or None if none can be paired."""
+    """Return a table of paired differences between methods on the slides they share; None if no methods can be paired."""
     rows: list[list[str | Cell]] = []
     for pair in scores.method_pairs(methods):
         for sensor in sensors_of([pair.first, pair.second]):
@@ -219,13 +219,13 @@ def difference_table(methods: Sequence[Method]) -> Table | None:
 
 
 def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
-    """Return more columns of the table of runs: slides learned from, epochs and seconds."""
+    """Return additional columns of the table of runs: training slides, epochs and seconds."""
     result = run.details
     learned = " + ".join(f"{count}" for _, count in sorted(result.learned.items()))
     best_epochs = result.config.get("validation", {}).get("epoch", {}) if result.history else {}
     described = dict.fromkeys(
         best_epochs[sensor] for sensor in ordered_sensors(best_epochs)
-    )  # one where sensors were learned jointly
+    )  # a single value if sensors were learned jointly
     seconds = f"{float(result.config['seconds']):,.0f}" if "seconds" in result.config else NONE
     return {
         "slides learned from": learned or NONE,
@@ -236,16 +236,16 @@ def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
 
 
 TABLE_NUMBERS = {"biotac": "III", "roboskin": "IV"}
-SAME_COUNT = 0.92  # numbers of slides in this ratio are as many
-BATCH = 32  # slides, of the paper's batches
+SAME_COUNT = 0.92  # numbers of slides count as equal above this ratio
+BATCH = 32  # batch size of the paper
 JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 
 
 def reduction_tables(methods: Sequence[Method]) -> list[Table]:
-    """Return a table a reduced sensor, in the paper's form, or None if no sensor was reduced or other data are shown.
+    """Return one table per reduced sensor in the form of the paper; empty if no sensor was reduced or the data differ.
 
-    A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
-    slides than the other. Where both were run, the paper's way counts.
+    A sensor is reduced if it learns from a fraction of the batches, as in the paper, or if its split has fewer slides
+    than the other's. If both were run, the paper's method is used.
     """
     chosen = [method for method in methods if has_usual_settings(method.settings, "subsample_sensor", "few")]
     if not all(method.published for method in chosen):
@@ -295,13 +295,13 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
 
 
 def _reduction_cell(methods: Sequence[Method], sensor: str) -> str | Cell:
-    """Return the accuracy of that of some methods that has most runs."""
+    """Return the accuracy of the method with the most runs."""
     chosen = max(methods, key=lambda method: len(runs_on(method, sensor)), default=None)
     return scores.accuracy_cell(accuracy(runs_on(chosen, sensor), sensor)) if chosen else NONE
 
 
 def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
-    """Return whether a method learned from about so many slides of a sensor."""
+    """Return whether a method learned from approximately this number of a sensor's slides."""
     described = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
     return bool(described) and SAME_COUNT < max(described) / slides < 1 / SAME_COUNT
 
@@ -316,18 +316,18 @@ ZERO_SHOT_NOTE = (
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Runs that differ in seed, fold, and in which materials they held out of a sensor's labels."""
+    """Runs that differ only in seed, fold, and in the materials held out of a sensor's labels."""
 
     name: str
     kind: str
-    main: bool  # True: nothing else sets them apart
+    main: bool  # True if nothing else distinguishes them
     sensor: str
-    results: tuple[ZeroShotAccuracy, ...]  # accuracy on the held-out materials, one per run
-    materials: int  # number of materials that any run held out
+    results: tuple[ZeroShotAccuracy, ...]  # accuracy on the held-out materials of each run
+    materials: int  # number of materials held out in any run
 
 
 def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return how often held-out materials are named right across sensors, or nothing if none were held out."""
+    """Return sections on the classification of held-out materials across sensors; empty if none were held out."""
     rows: list[list[str | Cell]] = []
     for scored in held_out_methods(methods):
         rows.append(
@@ -354,7 +354,7 @@ def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
-    """Return whether one sensor's classifier names what the other never learned, a sentence a method and sensor."""
+    """Return whether one sensor's classifier recognises materials that the other did not learn; by method and sensor."""
     described = []
     for scored in held_out_methods(methods):
         correct, evaluated, low, high = _zero_shot_counts(scored.results, scored.sensor, scored.materials)
@@ -373,7 +373,7 @@ def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
 
 
 def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
-    """Return the runs that held materials out, those together that differ in which, by sensor."""
+    """Return the runs with held-out materials, grouped if they differ only in these materials, by sensor."""
     alike: dict[str, list[Method]] = {}
     for method in methods:
         if any("zero_shot" in result.metrics for result in method.details):
@@ -398,10 +398,10 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
 
 
 def _zero_shot_counts(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> tuple[int, int, float, float]:
-    """Return how many slides were named right, of how many, and the interval of that share.
+    """Return the correct and total number of slides, and the interval of the accuracy.
 
-    Slides of one material are right or wrong together, also by chance and in several runs. So there are as many trials as
-    held-out ``materials``.
+    Slides of one material are not independent, even by chance and over several runs. So the number of trials is the
+    number of held-out ``materials``.
     """
     correct = sum(result["correct"].get(sensor, 0) for result in results)
     evaluated = sum(result["n"].get(sensor, 0) for result in results)
@@ -411,14 +411,14 @@ def _zero_shot_counts(results: Sequence[HeldOutAccuracy], sensor: str, materials
 
 
 def _count_held_out(sets: Collection[str], sensor: str) -> int:
-    """Return how many materials any of the settings held out of a sensor's labels, each like ``roboskin=17,18``."""
+    """Return the number of materials held out of a sensor's labels by any of the settings, each like ``roboskin=17,18``."""
     parts = (part.strip().partition("=") for setting in sets for part in setting.split(";"))
     held_out = {material.strip() for name, _, described in parts if name == sensor for material in described.split(",")}
     return max(len(held_out - {""}), 1)
 
 
 def _zero_shot_cells(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> list[str | Cell]:
-    """Return what runs state of the held-out materials of one sensor."""
+    """Return the cells for the held-out materials of one sensor."""
     correct, evaluated, low, high = _zero_shot_counts(results, sensor, materials)
     if not evaluated:
         return [NONE, NONE, str(len(results))]

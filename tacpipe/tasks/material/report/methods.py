@@ -1,4 +1,4 @@
-"""Read results on materials as runs of methods: a question is the slides of a sensor."""
+"""Read material results as runs of methods; each sensor's slides are a question."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
-USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that need no mark
+USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that names do not mark
 _PLAIN = {
     "pairing": ("random", "fixed"),
     "labels": ("true",),
@@ -43,42 +43,42 @@ _PLAIN = {
     "few": ("",),
     "elsewhere": (False,),
 }
-# In these, runs of one method may differ; run_label and quantities are shown as split and vibration.
+# Runs of one method may differ in these; run_label and quantities are shown as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
-_PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without effect where sensors learn alone
-_SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
+_PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without effect if sensors are trained separately
+_SAME = 0.75  # ratio above which numbers of training slides count as equal: folds differ, and some use validation slides too
 
 
 class MaterialResult(context.ReportResult[MaterialConfig]):
-    """One result on materials."""
+    """A material result."""
 
     STAGE = "train.material"
     SETS = ("biotac-slide", "roboskin")
 
     @cached_property
     def metrics(self) -> MaterialMetrics:
-        """The parts of the metrics that are reported as they are."""
+        """Metrics that are reported without further computation."""
         metrics: MaterialMetrics = context.read_json(self.dataset, "metrics.json")
         return metrics
 
     @cached_property
     def predictions(self) -> SlidePredictions:
-        """The predictions for each slide that the model has not seen."""
+        """Predictions for each unseen slide."""
         return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:
-        """The sensors whose slides the model was evaluated on."""
+        """Sensors whose slides the model was evaluated on."""
         return ordered_sensors(self.predictions.sensors.tolist())
 
     @property
     def trained(self) -> Mapping[str, int]:
-        """The number of slides with the role train, by sensor."""
+        """Number of slides with the role train, by sensor."""
         return self.config.get("counts", {}).get("train", {})
 
     @property
     def learned(self) -> Mapping[str, int]:
-        """The number of slides that the model learned from, by sensor: a readout also learns from those of validation."""
+        """Number of training slides by sensor; readouts may also learn from validation slides."""
         params = self.params
         is_readout = getattr(architectures.find(MaterialModelParams, self.architecture), "IS_READOUT", False)
         if is_readout and params.get("use_validation") and params.get("labels") != "permuted":
@@ -92,12 +92,12 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
 
     @property
     def architecture(self) -> str:
-        """The kind of model."""
+        """Architecture of the model."""
         return str(self.config.get("architecture", self.params.get("architecture", "")))
 
     @property
     def place(self) -> tuple[str, str]:
-        """The split and the layout of its slides: what is given together of results is of one of each."""
+        """Split and layout of its slides; results are only pooled if both are equal."""
         split = self.config.get("split", "")
         layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
         described = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
@@ -105,14 +105,14 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
 
 
 def settings(results: Sequence[MaterialResult]) -> list[Settings]:
-    """Return all that makes a method of each result.
+    """Return the settings that define the method of each result.
 
-    That is architecture, joint or not, number of training slides, layout and split of the slides, and all params but the
-    seed; what is of no effect is left out.
+    These are architecture, joint or not, number of training slides, layout and split of the slides, and all params
+    except the seed. Params without effect are removed.
     """
     places = [result.place for result in results]
     main = max(dict.fromkeys(places), key=places.count, default=("", "time"))
-    all_slides: dict[tuple[str, str], dict[str, int]] = {}  # the largest number of training slides, by place and sensor
+    all_slides: dict[tuple[str, str], dict[str, int]] = {}  # split and layout -> sensor -> maximum
     for result, place in zip(results, places, strict=True):
         for sensor, count in result.trained.items():
             most_slides = all_slides.setdefault(place, {})
@@ -125,15 +125,15 @@ def settings(results: Sequence[MaterialResult]) -> list[Settings]:
 
 
 def has_usual_settings(settings: Settings, *but: str) -> bool:
-    """Return whether a method of these settings was trained on all materials and slides, with true labels and pairs.
+    """Return whether a method was trained on all materials and slides, with true labels and pairs, as tables require.
 
-    This is what tables compare; the settings in ``but`` may be others.
+    The settings in ``but`` may differ.
     """
     return all(name in but or settings[name] in usual for name, usual in _PLAIN.items())
 
 
 def method_title(method: Method) -> str:
-    """Return a method's name but for the number of slides: what a curve over that is called."""
+    """Return a method's name without the number of slides, for a curve over that number."""
     settings = method.settings
     parts = [base_name({**settings, "few": "", "subsample_sensor": ""})]
     parts += [mark for mark in marks(method.differing) if not mark.endswith("shuffle")]
@@ -145,7 +145,7 @@ def method_title(method: Method) -> str:
 
 
 def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
-    """Return the sensors that any of some methods was evaluated on."""
+    """Return the sensors that any of the methods was evaluated on."""
     return ordered_sensors([sensor for method in methods for result in method.details for sensor in result.sensors])
 
 
@@ -155,7 +155,7 @@ def runs_on(method: Method, sensor: str) -> list[ComparedRun]:
 
 
 def ordered_sensors(sensors: Collection[str]) -> tuple[str, ...]:
-    """Return sensors, each once, in the order of tables: those of the paper first."""
+    """Return the unique sensors in table order: those of the paper first."""
     named_sensors = list(SENSORS)
     return tuple(
         sorted(
@@ -166,7 +166,7 @@ def ordered_sensors(sensors: Collection[str]) -> tuple[str, ...]:
 
 
 def sensor_title(sensor: str) -> str:
-    """Return a sensor's name as texts have it.
+    """Return the display name of a sensor.
 
     >>> sensor_title("biotac"), sensor_title("xela1")
     ('BioTac', 'xela1')
@@ -175,9 +175,9 @@ def sensor_title(sensor: str) -> str:
 
 
 def slides_kept(slides: int, batch: int, ratio: int) -> int:
-    """Return how many slides a sensor learns from that keeps ``ratio`` % of the full batches.
+    """Return the number of training slides of a sensor that keeps ``ratio`` % of the full batches.
 
-    90 % leaves out each tenth batch, the others keep each second, fourth, sixth and ninth.
+    90 % skips each tenth batch; the others keep each second, fourth, sixth and ninth.
 
     >>> [slides_kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
     [600, 512, 288, 160, 96, 64]
@@ -190,7 +190,7 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
 
 
 def base_name(settings: Settings, variants: bool = True) -> str:
-    """Return the name that a method has before it is derived from others like it."""
+    """Return the base name of a method, without suffixes that distinguish it from similar ones."""
     architecture = str(settings["architecture"])
     name = architectures.title(MaterialModelParams, architecture)
     if settings["frozen_sensor"]:
@@ -217,7 +217,7 @@ def base_name(settings: Settings, variants: bool = True) -> str:
 
 
 def _settings(run: MaterialResult) -> Settings:
-    """Return all that makes a method but the number of its slides; what is of no effect is left out."""
+    """Return the settings that define a method without the number of slides; params without effect are removed."""
     config, params, architecture = run.config, run.params, run.architecture
     frozen = str(params.get("frozen_sensor", ""))
     joint = bool(config.get("joint", params.get("joint", False)))
@@ -229,7 +229,7 @@ def _settings(run: MaterialResult) -> Settings:
         **{name: value for name, value in params.items() if name not in idle},
         "architecture": architecture,
         "joint": joint,
-        "frozen_sensor": bool(frozen),  # each run reports on the sensor that was mapped, so both are one method
+        "frozen_sensor": bool(frozen),  # each run reports on the mapped sensor, so both directions are one method
         "pairing": str(params.get("pairing", "random")) if joint or frozen else "random",
         "labels": str(params.get("labels", "true")),
         "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",
@@ -245,10 +245,10 @@ def _settings(run: MaterialResult) -> Settings:
 
 
 def _few(run: MaterialResult, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
-    """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
+    """Return the number of training slides of a run if reduced, and the reduced sensors if not all are.
 
-    Numbers are rounded to those of other runs that have about as many; ``described`` has the fractions of before. A
-    sensor that learns from some batches alone has all slides: that is a setting.
+    Numbers are rounded to those of earlier runs with about as many slides; their fractions are stored in ``described``.
+    A sensor that learns from some batches only has all slides, because that is a separate setting.
     """
     fewer = {}
     for sensor in ordered_sensors(run.trained):
@@ -284,19 +284,19 @@ KINDS: dict[str, Kind] = {
 
 
 def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
-    """Return the runs of results that hold predictions of slides which the model has not seen."""
+    """Return the runs of results that contain predictions for unseen slides."""
     all_results = [MaterialResult(result) for result in drop_duplicates(results) if "predictions" in result.recordings]
     with_sensors = [result for result in all_results if result.sensors]
     return [_run(*pair) for pair in zip(with_sensors, settings(with_sensors), strict=True)]
 
 
 def question_on(run: ComparedRun, sensor: str) -> Question | None:
-    """Return the question that a run answers on slides of a sensor."""
+    """Return the question that a run answers for slides of a sensor."""
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 
 def named_right(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
-    """Return whether each slide of a sensor was named right, 1 or 0, and 1, by recording."""
+    """Return (correct, 1) for each slide of a sensor by recording, where correct is 1 or 0."""
     rows = result.predictions.of(sensor)
     triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
     return {str(name): np.array([answer == truth, 1.0]) for name, answer, truth in triples if answer != NOTHING}

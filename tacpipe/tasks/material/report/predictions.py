@@ -1,4 +1,4 @@
-"""The predictions of a result's model and baselines for each slide that the model has not seen."""
+"""Read the predictions of a model and its baselines for each unseen slide."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
 LEVEL_ONLY, LEVEL_REMOVED = "level_only", "level_removed"  # baselines of the architecture statistics
 PREDICTORS = (MODEL, LEVEL, LEVEL_ONLY, LEVEL_REMOVED, SHUFFLED, SWAPPED, LAST)
-NOTHING = -1  # stands where a predictor stated nothing of a slide
+NOTHING = -1  # number of a missing prediction
 
 
 @dataclass(frozen=True)
 class SlidePredictions:
-    """One row a slide, those of training left out."""
+    """Predictions with one row per slide; training slides are excluded."""
 
     recordings: NDArray[np.str_]  # (slide,)
     sensors: NDArray[np.str_]  # (slide,)
-    materials: Int64s  # (slide,), the truth
+    materials: Int64s  # (slide,), true material
     predicted: Mapping[str, Int64s]  # predictor -> (slide,)
-    latents: AnyFloats | None  # (slide, latent), or None if the model has none
+    latents: AnyFloats | None  # (slide, latent); None if the model has no latents
     naming: Naming = NUMBERS  # names of the materials
-    sessions: NDArray[np.str_] | None = None  # (slide,), or empty if none is named; None in results that report on none
+    sessions: NDArray[np.str_] | None = None  # (slide,), empty string if unnamed; None in results without sessions
 
     def of(self, sensor: str) -> SlidePredictions:
         """Return the rows of one sensor."""
@@ -50,15 +50,12 @@ class SlidePredictions:
         )
 
     def named(self, materials: Int64s) -> NDArray[Any]:
-        """Return the names of materials (slide,): text, or the numbers where these are the names."""
+        """Return the names of materials (slide,): text, or numbers if the materials have no names."""
         return self.naming.names_for(materials)
 
     @property
     def one_session_each(self) -> bool:
-        """True if all slides of a material that a sensor measured are of one session.
-
-        The material and the session cannot be distinguished then.
-        """
+        """Whether all slides of each material are of one session per sensor, so that the two effects cannot be separated."""
         if self.sessions is None or not len(self.sessions) or (self.sessions == "").any():
             return False
         sessions: dict[tuple[str, int], set[str]] = {}
@@ -68,10 +65,11 @@ class SlidePredictions:
 
 
 def read_predictions(table: pa.Table, config: MaterialConfig) -> SlidePredictions:
-    """Return what the table ``predictions`` of a result states of slides that its model has not seen.
+    """Return the predictions for unseen slides in the table ``predictions`` of a result.
 
-    As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
-    of the last batch where the model's ``config`` leaves it out, nor those of a sensor whose network was only taken over.
+    As in the result's own metrics, three kinds of slides are excluded: those of materials held out of a sensor's
+    labels, those of an incomplete last batch if ``config`` omits it, and those of a sensor whose network was only
+    copied.
     """
     naming = Naming.from_json(config)
     table = table.filter(_counted_slides(table, config, naming))
@@ -91,7 +89,7 @@ def read_predictions(table: pa.Table, config: MaterialConfig) -> SlidePrediction
 
 
 def _numbers(table: pa.Table, name: str, naming: Naming) -> Int64s:
-    """Return a column of materials as numbers (slide,), `NOTHING` where it is empty."""
+    """Return a column of materials as numbers (slide,), with `NOTHING` for null."""
     if not naming.names:
         return table[name].fill_null(NOTHING).to_numpy().astype(np.int64)  # type: ignore[no-any-return]
     numbers = {material: number for number, material in enumerate(naming.names)}
@@ -99,7 +97,7 @@ def _numbers(table: pa.Table, name: str, naming: Naming) -> Int64s:
 
 
 def _counted_slides(table: pa.Table, config: MaterialConfig, naming: Naming) -> Bools:
-    """Return which rows count (slide,)."""
+    """Return a mask (slide,) of the rows to evaluate."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)
     settings = params_of.counting(registry.load("train.material"), config.get("params", {}))

@@ -1,4 +1,4 @@
-"""The section on calibrated classifiers: whether probabilities are frequencies, and the answer ``unknown``."""
+"""Report calibrated classifiers: reliability of their probabilities, and the answer ``unknown``."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ANSWERS = "answers.csv"
-UNKNOWN = "unknown"  # the answer for a slide like no material
-MIN_BIN_COUNT = 20  # answers of a bin of stated probabilities
-RATES = np.linspace(0, 1, 101)  # rates of known slides answered unknown, at which curves are averaged over runs
+UNKNOWN = "unknown"  # answer for a slide that resembles no learned material
+MIN_BIN_COUNT = 20  # minimum number of answers per bin of predicted probability
+RATES = np.linspace(0, 1, 101)  # false-unknown rates at which curves are averaged over runs
 RELIABLE = (
     "Right against stated, in bins of as many slides each: on the thin line probabilities are frequencies. As trained: in "
     "bins of the same width. Shaded: 95 % (Wilson) over slides, each counted once."
@@ -42,7 +42,7 @@ REFUSED = (
 
 
 class Rate(NamedTuple):
-    """A fraction of slides, each counted once however many runs answered it, with its 95 % interval (Wilson)."""
+    """Fraction of slides with its 95 % Wilson interval; a slide counts once, however many runs classified it."""
 
     fraction: float
     low: float
@@ -51,7 +51,7 @@ class Rate(NamedTuple):
 
 
 def probability_folds(methods: Sequence[Method]) -> list[Fold]:
-    """Return reliability and curves of unknown, of calibrated models; nothing without any."""
+    """Return reliability charts and curves of unknown for calibrated models; empty if there are none."""
     reliable, refused, rows = [], [], []
     for sensor in sensors_of(methods):
         calibrated = [(method, read) for method in methods if (read := read_answers(method, sensor)) is not None]
@@ -80,10 +80,10 @@ def probability_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
-    """Return what calibrated runs of a method answered of a sensor's slides: a row a slide that was not seen and a run.
+    """Return the answers of calibrated runs for a sensor's slides, one row per unseen slide and run.
 
-    Columns: ``run``, ``recording``, ``known`` (whether its material was learned), ``right``, ``probability``, ``score`` and
-    ``refused`` (answered unknown). None if no run is of a calibrated model.
+    Columns: ``run``, ``recording``, ``known`` (whether its material was learned), ``right``, ``probability``, ``score``
+    and ``refused`` (answered unknown). None if no run has a calibrated model.
     """
     import pandas as pd
 
@@ -97,14 +97,14 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
         read = read[(read.sensor == sensor) & ~read.seen]
         rows = run.details.predictions.of(sensor)
         truth = dict(zip(rows.recordings.tolist(), map(str, rows.named(rows.materials).tolist()), strict=True))
-        counted = read.recording.isin(truth) | ~read.known  # slides of known materials count as elsewhere on the page
+        counted = read.recording.isin(truth) | ~read.known  # known materials: slides as elsewhere on the page
         read = read[counted].assign(run=number_of, refused=read.answer == UNKNOWN)
         parts.append(read.assign(right=read.named == read.recording.map(truth)))
     return pd.concat(parts) if parts else None
 
 
 def rate_of(rows: pd.DataFrame, column: str) -> Rate:
-    """Return in which fraction of slides a column is true, with Wilson's interval; NaN without slides."""
+    """Return the fraction of slides for which a column is true, with Wilson's interval; NaN if there are none."""
     if not len(rows):
         return Rate(float("nan"), float("nan"), float("nan"), 0)
     slides = rows.recording.nunique()
@@ -113,9 +113,9 @@ def rate_of(rows: pd.DataFrame, column: str) -> Rate:
 
 
 def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
-    """Return in which fraction of slides of unknown materials a column is true, with its interval over materials.
+    """Return the fraction of slides of unknown materials for which a column is true, with its interval over materials.
 
-    Ends are NaN with fewer than `headline.MIN_CLUSTERS` materials, and in results that do not name them.
+    The bounds are NaN for fewer than `headline.MIN_CLUSTERS` materials, and in results without their names.
     """
     if "label" not in rows or rows.label.nunique() < headline.MIN_CLUSTERS:
         return rate_of(rows, column)._replace(low=float("nan"), high=float("nan"))
@@ -124,9 +124,10 @@ def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
 
 
 def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
-    """Return which fraction of unknown slides scores below the threshold below which `RATES` of known ones do (rate,).
+    """Return the fraction of unknown slides below the thresholds at which the fractions `RATES` of known ones are (rate,).
 
-    ``known`` and ``unknown`` (slide,) are scores. Between thresholds it is linear, as the area under it is.
+    ``known_scores`` and ``unknown`` are scores (slide,). The curve is linear between thresholds, as for the area under
+    it.
     """
     ends = np.r_[-np.inf, np.unique(np.concatenate([known_scores, unknown])), np.inf]
     refused_known, refused_unknown = (
@@ -137,7 +138,7 @@ def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
 
 
 def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFrame) -> Chart:
-    """Return accuracy by stated probability, before and after the temperature."""
+    """Return a chart of accuracy by predicted probability, before and after the temperature."""
     known_rows = read[read.known].sort_values("probability", kind="stable")
     bins = np.array_split(
         np.arange(len(known_rows)), int(np.clip(len(known_rows) // MIN_BIN_COUNT, 1, calibration.BINS))
@@ -156,7 +157,7 @@ def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFra
 
 
 def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float]]:
-    """Return mean confidence and accuracy of each bin of what the runs stated before calibration."""
+    """Return mean confidence and accuracy of each bin of the uncalibrated probabilities."""
     sums: dict[int, list[float]] = {}
     for run in runs_on(method, sensor):
         tree = run.details.metrics.get("calibration", {}).get(sensor, {}).get("before", {})
@@ -169,7 +170,7 @@ def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float
 
 
 def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]]) -> Chart:
-    """Return how many slides of unknown materials are found against known ones that are lost, and where thresholds lie."""
+    """Return a chart of true-unknown against false-unknown rates, with the thresholds."""
     drawn, points = [], []
     for name, read in chart_lines:
         loss_curves = []

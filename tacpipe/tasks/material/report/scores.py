@@ -1,4 +1,4 @@
-"""Compute accuracies over slides, and what one method gains over another."""
+"""Compute accuracies over slides, and differences between methods."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """The fraction of slides named right, pooled over runs."""
+    """Fraction of correctly classified slides, pooled over runs."""
 
-    correct: int  # verdicts of all runs added
+    correct: int  # sum over all runs
     evaluated: int
-    slides: int  # each counted once
-    low: float  # 95 % interval over slides (Wilson)
+    slides: int  # number of distinct slides
+    low: float  # 95 % Wilson interval over slides
     high: float
-    sd: float  # over runs, NaN for a single one
+    sd: float  # over runs; NaN for a single run
     runs: int
 
     @property
     def fraction(self) -> float:
-        """The fraction of slides named right."""
+        """Fraction of correctly classified slides."""
         return self.correct / self.evaluated
 
 
 def accuracy(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> Accuracy | None:
-    """Return how many slides of a sensor a predictor of these runs names right, or None if none states anything."""
+    """Return the accuracy of a predictor on a sensor's slides; None if there are no predictions."""
     named_right = slides_named_right(runs, sensor, predictor)
     if not len(named_right):
         return None
@@ -52,9 +52,9 @@ def accuracy(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -
 
 
 def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> float:
-    """Return 1 - errors / errors of the mean level, of runs that hold both, or NaN if the mean level never errs.
+    """Return 1 - errors / errors of the mean level over runs with both; NaN if the mean level has no errors.
 
-    1 is perfect, 0 no better than what the time-averaged channels state.
+    1 is perfect, 0 is no better than the time-averaged channels.
     """
     comparable = [run for run in runs if {LEVEL, predictor} <= set(run.details.predictions.predicted)]
     counted, level = (accuracy(comparable, sensor, name) for name in (predictor, LEVEL))
@@ -64,7 +64,7 @@ def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL
 
 
 def slides_named_right(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> pd.Series:
-    """Return whether slides were named right, 1 or 0, by run and recording."""
+    """Return 1 for each correctly classified slide and 0 for others, by run and recording."""
     import pandas as pd
 
     questions = {question: None for run in runs if (question := methods.question_on(run, sensor))}
@@ -75,13 +75,13 @@ def slides_named_right(runs: Sequence[ComparedRun], sensor: str, predictor: str 
 
 @dataclass(frozen=True)
 class MethodDifference:
-    """The difference of two methods on the slides that both were evaluated on."""
+    """Difference of two methods on the slides that both were evaluated on."""
 
     slides: int
-    gain: Gain  # percentage points
-    first_only: int  # slides that the first alone names right
+    gain: Gain  # in percentage points
+    first_only: int  # slides that only the first classifies correctly
     second_only: int
-    mcnemar: float  # p
+    mcnemar: float  # p-value
     runs: PairedRuns
 
     @property
@@ -102,9 +102,9 @@ class MethodPair:
 def compare_runs(
     first: Method, second: Method, sensor: str, predictors: tuple[str, str] = (MODEL, MODEL)
 ) -> MethodDifference | None:
-    """Return what ``first`` has over ``second`` on slides of a sensor, or None if they share none.
+    """Return the difference of ``first`` and ``second`` on slides of a sensor; None if they share none.
 
-    McNemar's test takes a slide for right where at least half of a method's runs name it right.
+    For McNemar's test a slide is correct if at least half of a method's runs classify it correctly.
     """
     runs_by_method = [runs_on(first_right, sensor) for first_right in (first, second)]
     if not all(runs_by_method) or (question := question_on(runs_by_method[0][0], sensor)) is None:
@@ -125,7 +125,7 @@ def compare_runs(
 
 
 def method_pairs(methods: Sequence[Method]) -> list[MethodPair]:
-    """Return which methods a table compares: what is asked to help, against the same without it."""
+    """Return the pairs of methods that a table compares: a technique and the same method without it."""
     candidates = [candidate for candidate in methods if has_usual_settings(candidate.settings)]
     all_pairs = []
     for joint in (candidate for candidate in candidates if candidate.family == "RAEC joint"):
@@ -142,7 +142,7 @@ def method_pairs(methods: Sequence[Method]) -> list[MethodPair]:
 
 
 def is_control(method: Method) -> bool:
-    """Return whether a method is the negative control: trained jointly like others, its pairs of permuted materials."""
+    """Return whether a method is the negative control: joint training on pairs of permuted materials."""
     settings = method.settings
     return (
         method.family == "RAEC joint" and settings["pairing"] == "permuted" and has_usual_settings(settings, "pairing")
@@ -150,7 +150,7 @@ def is_control(method: Method) -> bool:
 
 
 def main_method(methods: Sequence[Method], family: str = "RAEC joint") -> Method | None:
-    """Return the plain method of a family that represents it where one is given: that with most runs."""
+    """Return the method that represents a family: the unmodified one with the most runs; None if there is none."""
     candidates = [
         candidate for candidate in methods if has_usual_settings(candidate.settings) and candidate.family == family
     ]
@@ -158,7 +158,7 @@ def main_method(methods: Sequence[Method], family: str = "RAEC joint") -> Method
 
 
 def independent_method(methods: Sequence[Method], joint: Method) -> Method | None:
-    """Return the network most like a joint one that learned from one sensor alone."""
+    """Return the network that was trained on one sensor only and is most similar to a joint one."""
     return nearest_method(
         joint,
         [method for method in methods if has_usual_settings(method.settings) and method.family == "RAEC independent"],
@@ -166,12 +166,12 @@ def independent_method(methods: Sequence[Method], joint: Method) -> Method | Non
 
 
 def permuted_method(methods: Sequence[Method], joint: Method) -> Method | None:
-    """Return the control that is most like a joint method."""
+    """Return the control that is most similar to a joint method."""
     return nearest_method(joint, [method for method in methods if is_control(method)])
 
 
 def nearest_method(method: Method, candidates: Sequence[Method]) -> Method | None:
-    """Return that of ``others`` that shares most settings with a method; of several the one with most runs."""
+    """Return the candidate that shares the most settings with a method; ties are resolved by number of runs."""
 
     def shared(candidate: Method) -> int:
         return sum(candidate.settings.get(name) == value for name, value in method.settings.items())
@@ -186,7 +186,7 @@ SESSIONS = (
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these slides cannot show, next to every table of accuracies, or empty if nothing is known against them."""
+    """Return a warning on what these slides cannot show, for every table of accuracies; empty if there is none."""
     if any(rows.simulated for rows in methods):
         return context.SIMULATED
     predictions = [result.predictions for rows in methods for result in rows.details]
@@ -194,7 +194,7 @@ def caution(methods: Sequence[Method]) -> str:
 
 
 def format_percent(fraction: float) -> str:
-    """Return a share in percent.
+    """Format a fraction in percent.
 
     >>> format_percent(0.995), format_percent(float("nan"))
     ('99.5', '–')
@@ -203,14 +203,14 @@ def format_percent(fraction: float) -> str:
 
 
 def accuracy_cell(counted: Accuracy | None) -> Cell:
-    """Return an accuracy and its standard deviation over runs, above what it rests on and its interval."""
+    """Return a cell with an accuracy and its standard deviation over runs, above its counts and interval."""
     return (
         count_cell(counted.correct, counted.evaluated, counted.low, counted.high, counted.sd) if counted else Cell(NONE)
     )
 
 
 def count_cell(correct: int, evaluated: int, low: float, high: float, sd: float) -> Cell:
-    """Return a share in percent, with its standard deviation where there is one, above what it rests on.
+    """Return a cell with a fraction in percent and its standard deviation, if any, above its counts and interval.
 
     >>> count_cell(190, 200, 0.91, 0.97, float("nan"))
     Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95, copy='')
