@@ -1,4 +1,4 @@
-"""Compare forecasters with their baselines in a headline, in the unit of the tactile channels."""
+"""Summarize how forecasters compare with their baselines, in the unit of the tactile channels."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from tacpipe.tasks.forward.situations import SituationMeasures
     from tacpipe.tasks.forward.slips import LeadSums, SlipScore
 
-COUNT, COUNTS = "count", "counts"  # the unit in columns and in texts
-MIXED = "own units"  # unit of channels, or of models, that differ
+COUNT, COUNTS = "count", "counts"  # unit in column names and in text
+MIXED = "own units"  # unit if channels or models differ
 
 
 def unit_of_channels(schema: pa.Schema, channels: Sequence[str]) -> str:
-    """Return the unit of tactile columns, `MIXED` where they have several."""
+    """Return the unit of tactile columns, or `MIXED` if they have several units."""
     units = {(schema.field(name).metadata or {}).get(b"unit", b"").decode() or COUNT for name in channels}
     return units.pop() if len(units) == 1 else MIXED
 
 
 def unit_of_model(config: ForwardConfig) -> str:
-    """Return the unit in a model's configuration, as texts have it; one without is in counts.
+    """Return the unit in a model's configuration, in the form used in text; counts if the configuration has no unit.
 
     >>> unit_of_model({"inputs": {}}), unit_of_model({"inputs": {"unit": "kPa"}})
     ('counts', 'kPa')
@@ -42,21 +42,21 @@ def unit_of_model(config: ForwardConfig) -> str:
 
 
 def common_unit(configs: Iterable[ForwardConfig]) -> str:
-    """Return the unit that models have in common, `MIXED` where they differ."""
+    """Return the common unit of the models, or `MIXED` if their units differ."""
     units = {unit_of_model(config) for config in configs} or {COUNTS}
     return units.pop() if len(units) == 1 else MIXED
 
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
-STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
-Errors = tuple[AnyFloats, AnyFloats]  # sums of squared and of absolute errors of a recording, each (step,)
-GEOMETRIC = "mae_counts_geometric"  # the skill of ``metrics.json`` that is not pooled
-RECORDINGS, OBJECTS = "recordings", "objects"  # units of the interval
+STEPS = (1, 3, 5, 10)  # displayed steps, if the model predicts them
+Errors = tuple[AnyFloats, AnyFloats]  # sums of a recording's squared and absolute errors, each (step,)
+GEOMETRIC = "mae_counts_geometric"  # skill in ``metrics.json`` that is not pooled over recordings
+RECORDINGS, OBJECTS = "recordings", "objects"  # resampling units of the confidence interval
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
 
 
 def legitimate(predictor: str) -> bool:
-    """Return whether a predictor is a baseline: neither the model's own, nor one that goes through its codec.
+    """Return whether a predictor is a baseline, i.e. neither a variant of the model nor a predictor that uses its codec.
 
     >>> [legitimate(name) for name in ("ridge", "persistence", "model_anchored", "codec", "codec_persistence")]
     [True, True, False, False, False]
@@ -65,7 +65,7 @@ def legitimate(predictor: str) -> bool:
 
 
 def shown(steps: Sequence[int]) -> tuple[int, ...]:
-    """Return those of a model's steps that a headline is about.
+    """Return the steps of a model that a headline includes.
 
     >>> shown(range(1, 11)), shown((1, 2, 3)), shown((2, 4))
     ((1, 3, 5, 10), (1, 3), (4,))
@@ -74,7 +74,7 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
 
 
 def look_ahead_notes(config: ForwardConfig) -> list[str]:
-    """Return how far the rows that a model was trained on look ahead, or nothing if they do not."""
+    """Return notes on how far the model's training rows look ahead; an empty list if they do not."""
     ahead = config.get("look_ahead")
     if not ahead or not ahead["max_ms"]:
         return []
@@ -85,31 +85,31 @@ def look_ahead_notes(config: ForwardConfig) -> list[str]:
     ]
 
 
-IntervalsByStep = dict[str, dict[str, float]]  # mean, low and high of a value by step
+IntervalsByStep = dict[str, dict[str, float]]  # mean, lower and upper bound of a value by step
 QuantileMeasures = dict[str, dict[str, float]]  # by measure and step
 
 
 class WindowCounts(TypedDict):
-    """Windows and recordings that errors are about."""
+    """Numbers of evaluated windows and recordings."""
 
     windows: int
     recordings: int
     recordings_without_window: int
-    effective_windows: int  # number that fits without overlap of their horizons
+    effective_windows: int  # number of windows with non-overlapping horizons
 
 
 class PredictorScores(TypedDict):
-    """Mean errors of a predictor by step, ``t1`` …, and over all steps, ``mean``."""
+    """Mean errors of a predictor by step (``t1``, ``t2``, …) and over all steps (``mean``)."""
 
-    mse_counts: dict[str, dict[str, float]]  # by group of channels
+    mse_counts: dict[str, dict[str, float]]  # by channel group
     mae_counts: dict[str, dict[str, float]]
-    mse_standard: dict[str, float]  # in units of each channel's spread in training
+    mse_standard: dict[str, float]  # in units of each channel's standard deviation in training
     mse_latent: NotRequired[dict[str, float]]
-    mse_feature: NotRequired[dict[str, float]]  # latents scaled to ±1
+    mse_feature: NotRequired[dict[str, float]]  # of latents scaled to ±1
 
 
 class LiveRows(TypedDict):
-    """Published forecasts of live sessions next to those that ``predict --causal`` gives."""
+    """Comparison of forecasts published in live sessions with the output of ``predict --causal``."""
 
     published: int
     recomputed: int
@@ -128,45 +128,45 @@ class LiveMeasures(TypedDict):
     rows: LiveRows
     mae: dict[str, dict[str, float]]  # by predictor and step
     latency: dict[str, float]
-    alarms: dict[str, dict[str, LeadSums]]  # by alarm and event, and predictor
+    alarms: dict[str, dict[str, LeadSums]]  # by alarm and event, then by predictor
 
 
 class LiveMetrics(LiveMeasures):
-    """Measures of all recorded live sessions and of each."""
+    """Measures of all recorded live sessions together and of each session."""
 
     recordings: dict[str, LiveMeasures]
 
 
 @dataclass(frozen=True)
 class ForwardScores:
-    """Errors and skill on some recordings."""
+    """Errors and skill on a set of recordings."""
 
     counts: WindowCounts
     predictors: dict[str, PredictorScores]  # empty if no recording has a window
-    skill: dict[str, IntervalsByStep]  # of the model over persistence, by measure
+    skill: dict[str, IntervalsByStep]  # of the model relative to persistence, by measure
 
     @classmethod
     def from_json(cls, stored: Json) -> Self:
-        """Return the scores in ``metrics.json`` or in one of its parts."""
+        """Create the scores from ``metrics.json`` or one of its parts."""
         scored = {name: value for name, value in stored.items() if name != "skill" and "mse_counts" in value}
         return cls(stored["counts"], scored, stored.get("skill", {}))
 
     def to_json(self) -> Json:
-        """Return what `from_json` reads."""
+        """Return the scores in the form that `from_json` reads."""
         return {"counts": self.counts, **self.predictors, **({"skill": self.skill} if self.skill else {})}
 
 
 @dataclass(frozen=True)
 class QuantileMetrics:
-    """Measures of a calibrated model's quantiles."""
+    """Metrics of a calibrated model's quantiles."""
 
     description: QuantileDescription
-    fresh: dict[str, QuantileMeasures]  # of recordings that the model has not seen, by predictor
+    fresh: dict[str, QuantileMeasures]  # on recordings that the model has not seen, by predictor
     parts: dict[str, dict[str, QuantileMeasures]]
 
     @classmethod
     def from_json(cls, stored: Json) -> Self:
-        """Return what `to_json` wrote."""
+        """Create the metrics from the output of `to_json`."""
         parts = {name: stored[name] for name in METRIC_PARTS if name in stored}
         described = ("levels", "method", "recordings", "most_promised")
         fresh = {name: value for name, value in stored.items() if name not in (*parts, *described)}
@@ -179,19 +179,20 @@ class QuantileMetrics:
         return cls(description, fresh, parts)
 
     def to_json(self) -> Json:
-        """Return the part ``quantiles`` of ``metrics.json``."""
+        """Return the ``quantiles`` part of ``metrics.json``."""
         return {**self.description, **self.fresh, **self.parts}
 
 
-METRIC_PARTS = ("known", "unseen", "seen")  # of known and of unseen objects, and recordings that the model has seen
+# recordings of known objects, of unseen objects, and recordings that the model has seen
+METRIC_PARTS = ("known", "unseen", "seen")
 
 
 @dataclass(frozen=True)
 class ForwardMetrics:
-    """``metrics.json`` of a result on forecasts."""
+    """Content of ``metrics.json`` in a forecast evaluation."""
 
-    fresh: ForwardScores  # of recordings that the model has not seen
-    parts: dict[str, ForwardScores]  # those of `METRIC_PARTS` that hold recordings
+    fresh: ForwardScores  # on recordings that the model has not seen
+    parts: dict[str, ForwardScores]  # by each of `METRIC_PARTS` that contains recordings
     anticipation: dict[str, AlarmScore] = field(default_factory=dict)  # by predictor
     slips: dict[str, SlipScore] = field(default_factory=dict)  # by predictor
     situations: dict[str, SituationMeasures] = field(default_factory=dict)
@@ -200,7 +201,7 @@ class ForwardMetrics:
 
     @classmethod
     def from_json(cls, stored: Json) -> Self:
-        """Return the metrics that `to_json` wrote."""
+        """Create the metrics from the output of `to_json`."""
         return cls(
             ForwardScores.from_json(stored),
             {name: ForwardScores.from_json(stored[name]) for name in METRIC_PARTS if name in stored},
@@ -212,7 +213,7 @@ class ForwardMetrics:
         )
 
     def to_json(self) -> Json:
-        """Return the content of ``metrics.json``; what was not measured is left out."""
+        """Return the content of ``metrics.json`` without metrics that were not computed."""
         optional = {
             "anticipation": self.anticipation,
             "slips": self.slips,
@@ -226,36 +227,36 @@ class ForwardMetrics:
 
 @dataclass(frozen=True)
 class Parts:
-    """The sums over recordings, each (..., step), and the number of values."""
+    """Sums over recordings, each (..., step), and the number of values."""
 
     squared: AnyFloats
-    still_squared: AnyFloats  # errors of persistence
+    still_squared: AnyFloats  # squared errors of persistence
     absolute: AnyFloats
-    logs: AnyFloats  # logarithms of the ratio to persistence's absolute error, summed over recordings
-    counted: AnyFloats  # recordings on which persistence errs
-    values: AnyFloats  # (...): windows times channels
+    logs: AnyFloats  # log ratio of the model's to persistence's absolute error, summed over recordings
+    counted: AnyFloats  # number of recordings in which persistence has an error
+    values: AnyFloats  # (...), number of windows times number of channels
 
     @classmethod
     def of_sums(cls, sums: AnyFloats) -> Parts:
-        """Return the parts of `sums` (..., part)."""
+        """Create the parts from the output of `sums` (..., part)."""
         steps = (sums.shape[-1] - 1) // 5
         squared, persistence, absolute, logs, counted = (sums[..., at * steps : (at + 1) * steps] for at in range(5))
         return cls(squared, persistence, absolute, logs, counted, sums[..., -1])
 
     @property
     def skill(self) -> AnyFloats:
-        """1 - the geometric mean over recordings of the ratio to persistence's absolute error, (..., step)."""
+        """1 minus the geometric mean over recordings of the absolute error relative to persistence's (..., step)."""
         return np.where(self.counted > 0, -np.expm1(self.logs / np.maximum(self.counted, 1)) + 0.0, np.nan)
 
     @property
     def mean_skill(self) -> AnyFloats:
-        """`skill` with the geometric mean over steps too, (...)."""
+        """`skill` with the geometric mean over both recordings and steps (...)."""
         counted = self.counted.sum(axis=-1)
         return np.where(counted > 0, -np.expm1(self.logs.sum(axis=-1) / np.maximum(counted, 1)) + 0.0, np.nan)
 
     @property
     def squared_skill(self) -> AnyFloats:
-        """1 - squared error / squared error of persistence, both pooled over recordings, mean over steps, (...)."""
+        """Mean over steps (...) of 1 minus the ratio of squared errors, both pooled over recordings, to persistence."""
         ratio = intervals.skill(self.squared, self.still_squared)
         errs = ~np.isnan(ratio)
         mean = np.where(errs, ratio, 0).sum(axis=-1) / np.maximum(errs.sum(axis=-1), 1)
@@ -263,9 +264,9 @@ class Parts:
 
 
 def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
-    """Return what adds up over recordings (`Parts`), from the errors of a recording at the shown steps.
+    """Return the additive parts (`Parts`) of one recording's errors at the displayed steps.
 
-    ``values`` is how many values each was summed over: windows times channels.
+    ``values`` is the number of summed values, i.e. windows times channels.
     """
     (squared, absolute), (still_squared, still_absolute) = errors, persistence
     logs, counted = intervals.log_ratios(absolute, still_absolute)
@@ -282,9 +283,10 @@ def headline(
     unit: str = COUNTS,
     objects: Mapping[str, str] | None = None,
 ) -> Headline | None:
-    """Return how a method compares with its baselines on known objects, unseen ones or all; `sums` by seed and recording.
+    """Compare a method with its baselines on known objects, unseen objects, or all.
 
-    ``unit`` is that of the mean absolute errors. The interval is over ``objects``, by recording, where these are given.
+    ``model`` and ``baselines`` contain the `sums` by seed and recording, and ``unit`` is the unit of the mean absolute
+    errors. If ``objects`` (object by recording) is passed, the interval is over objects.
     """
     compared = {name: sums_of_baseline for name, sums_of_baseline in baselines.items() if legitimate(name)}
     cluster = OBJECTS if objects else RECORDINGS
@@ -294,7 +296,7 @@ def headline(
 
 
 def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS) -> Measure:
-    """Return how `sums` at some steps become errors; ``unit`` is that of the mean absolute ones."""
+    """Return the measure that turns `sums` at some steps into errors; ``unit`` is the unit of the mean absolute errors."""
     ahead = [f"t+{step}" for step in steps]
 
     def error(sums: AnyFloats) -> AnyFloats:
@@ -305,7 +307,7 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         mae = parts.absolute / parts.values if parts.values else np.full(len(steps), np.nan)
         return (*map(float, mae), float(parts.squared_skill), float(parts.mean_skill))
 
-    # a column of its own for what ranks: errors by step alone do not rank predictors
+    # The ranking score has its own column, because errors by step do not rank predictors.
     over = " and ".join(filter(None, (", ".join(ahead[:-1]), ahead[-1])))
     return Measure(
         (*(f"MAE {step}" for step in ahead), "squared vs persistence", "vs persistence"),

@@ -1,4 +1,4 @@
-"""The errors of several predictors of the same windows, as metrics and tables."""
+"""Metrics and tables of several predictors' errors on the same windows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tacpipe.tasks.forward.headline import (
 )
 from tacpipe.tasks.forward.predictors import Prediction
 
-Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
+Masks = Mapping[str, Bools]  # mask (channel,) by name of the channel group
 
 _COLUMNS = pa.schema(
     {
@@ -51,7 +51,7 @@ _COLUMNS = pa.schema(
 
 @dataclass
 class ForecastErrorSums:
-    """Sums of one predictor's errors over the windows of a recording, each (step, feature) or (step, channel)."""
+    """Sums of one predictor's errors over a recording's windows, each (step, feature) or (step, channel)."""
 
     latent_squared: AnyFloats | None
     feature_squared: AnyFloats | None
@@ -60,7 +60,7 @@ class ForecastErrorSums:
 
     @classmethod
     def from_predictions(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> ForecastErrorSums:
-        """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
+        """Compute the errors of ``predicted``; ``feature_half`` (feature,) is the divisor in the paper's scaling."""
         latent = feature = None
         if predicted.latent is not None and truth.latent is not None:
             latent = regression.squared_error_sums(predicted.latent, truth.latent)
@@ -73,7 +73,7 @@ class ForecastErrorSums:
         )
 
     def __add__(self, further: ForecastErrorSums) -> ForecastErrorSums:
-        """Return the errors over the windows of both."""
+        """Return the summed errors over the windows of both."""
 
         def summed(name: str) -> Any:
             first, second = getattr(self, name), getattr(further, name)
@@ -84,29 +84,29 @@ class ForecastErrorSums:
 
 @dataclass
 class Trial:
-    """The errors on one recording by predictor, or empty if it holds no window."""
+    """Errors on one recording by predictor; empty if the recording contains no window."""
 
     name: str
-    seen: bool  # True if the model was trained or validated on the recording
+    seen: bool  # whether the model was trained or validated on the recording
     object: str | None = None
-    known: bool = True  # True if the model was trained on the same object, or no label names the object
+    known: bool = True  # whether the model was trained on the same object; also True if the object is not labelled
     windows: int = 0
     errors: dict[str, ForecastErrorSums] = field(default_factory=dict)
 
     def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: AnyFloats) -> None:
-        """Count some more windows of the recording."""
+        """Add the errors of all predictors on some windows of the recording."""
         self.windows += len(truth.count)
         for name, predicted in predictions.items():
             self.add_errors(name, predicted, truth, feature_half)
 
     def add_errors(self, name: str, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> None:
-        """Add the errors of one predictor on some windows, which are counted apart."""
+        """Add one predictor's errors on some windows. Does not change the number of windows."""
         errors = ForecastErrorSums.from_predictions(predicted, truth, feature_half)
         self.errors[name] = self.errors[name] + errors if name in self.errors else errors
 
 
 def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
-    """Return masks (channel,) for both sensors together, each sensor (``sensor1``… in order of columns) and each axis."""
+    """Return masks (channel,) of all channels, each sensor (``sensor1``, ``sensor2``, … in column order) and each axis."""
     groups = {"both": np.ones(len(layout), dtype=bool)}
     streams = list(dict.fromkeys(channel["stream"] for channel in layout if "stream" in channel))
     for number, stream in enumerate(streams, 1):
@@ -117,10 +117,11 @@ def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
 
 
 def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardMetrics:
-    """Return the errors of all predictors; ``channel_scale`` (channel,) is each channel's spread in training.
+    """Return the metrics of all predictors.
 
-    Recordings that the model has not seen are ``fresh``, and under ``known`` and ``unseen`` once more those of objects
-    that it was trained on and of others, where there are both; those that it has seen are under ``seen``.
+    ``channel_scale`` (channel,) is each channel's standard deviation in training. Recordings that the model has not
+    seen are in ``fresh``, and those that it has seen in ``seen``. If there are recordings of both known and new
+    objects, ``known`` and ``unseen`` contain the two subsets of ``fresh``.
     """
     fresh = [trial for trial in trials if not trial.seen]
     parts = {
@@ -137,9 +138,9 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
 
 
 def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
-    """Return how the model compares with its baselines on recordings that it has not seen, of known objects and unseen ones.
+    """Compare the model with its baselines on recordings it has not seen, separately for known and unseen objects.
 
-    Where nobody named an object, all are taken together.
+    Recordings without labelled objects are evaluated together.
     """
     fresh = [trial for trial in trials if not trial.seen and trial.windows]
     steps = headlines.shown(range(1, horizon + 1))
@@ -169,7 +170,7 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
 
 
 def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: float) -> bytes:
-    """Return the errors by predictor and step."""
+    """Return a CSV file of errors by predictor and step."""
     rows = [
         (
             name,
@@ -186,11 +187,12 @@ def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: fl
 
 
 def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFloats) -> bytes:
-    """Return the sums behind all errors as a Parquet table, so that results can be pooled by recording.
+    """Return the error sums as a Parquet table, so that results can be pooled by recording.
 
-    A row a recording, predictor, group and step: ``windows`` and ``channels`` that ``squared`` and ``absolute`` errors
-    were summed over. Groups are those of channels in counts; ``standard``, all channels in units of their spread in
-    training; ``feature`` and ``latent``, the representation's own, scaled as the paper does and not.
+    Each row is a recording, predictor, channel group and step, with the ``squared`` and ``absolute`` error sums and the
+    numbers of ``windows`` and ``channels`` that they were summed over. Channel groups are in counts. ``standard`` is
+    all channels in units of their standard deviation in training. ``feature`` and ``latent`` are the features of the
+    representation with and without the paper's scaling.
     """
     columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS.names}
     for trial in trials:
@@ -209,7 +211,7 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFlo
 
 
 def _pooled(errors: ForecastErrorSums, groups: Masks, channel_scale: AnyFloats) -> Iterator[tuple[str, Any, Any, int]]:
-    """Yield each group's name, its sums of squared and absolute errors (step,) and its number of channels."""
+    """Yield each group's name, sums of squared and absolute errors (step,) and number of channels."""
     for group, mask in groups.items():
         yield (
             group,
@@ -225,7 +227,7 @@ def _pooled(errors: ForecastErrorSums, groups: Masks, channel_scale: AnyFloats) 
 
 
 def trials_csv(trials: Sequence[Trial]) -> bytes:
-    """Return one line a recording: windows, mean absolute error of model and persistence in counts, and skill."""
+    """Return a CSV file with a line per recording: windows, mean absolute errors in counts, and skill."""
     rows = []
     for trial in trials:
         errors: list[float | str] = ["", "", ""]
@@ -249,7 +251,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
 
 
 def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardScores:
-    """Return errors of each predictor, skill and counts over the recordings that hold windows."""
+    """Return each predictor's errors, skill and counts over the recordings that contain windows."""
     evaluated = [item for item in trials if item.windows]
     windows = np.array([item.windows for item in evaluated], dtype=np.int64)
     counts: WindowCounts = {
@@ -295,29 +297,32 @@ def _steps(sums: AnyFloats, windows: Int64s) -> dict[str, float]:
 
 
 def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> dict[str, dict[str, float]]:
-    """Return the mean error by group of channels and step."""
+    """Return the mean error by channel group and step."""
     return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
 
 
 def _by_step(trials: Sequence[Trial], predictor: str, attribute: str) -> AnyFloats:
-    """Return one kind of a predictor's error sums over all channels, shape (recording, step)."""
+    """Return the error sums in an attribute of a predictor's errors over all channels, shape (recording, step)."""
     return np.stack([getattr(trial.errors[predictor], attribute).sum(axis=1) for trial in trials])
 
 
 def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
-    """Return skill with its interval over clusters by step and over all, from sums (recording, step); undefined left out."""
+    """Return skill with intervals over clusters by step and over all steps, from sums (recording, step).
+
+    Undefined values are omitted.
+    """
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
     return _intervals_by_step(intervals.skill_interval(wide[0], wide[1], clusters))
 
 
 def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
-    """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_intervals_by_step` does."""
+    """Return skill from the geometric mean of absolute error ratios (recording, step), as `_intervals_by_step` does."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
     return _intervals_by_step(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
 
 
 def _intervals_by_step(interval: Interval) -> IntervalsByStep:
-    """Return values with their intervals by step and over all; what is not defined is left out."""
+    """Return values with their intervals by step and over all steps, without undefined ones."""
     names = [f"t{step}" for step in range(1, len(interval.mean))] + ["mean"]
     tree: IntervalsByStep = {}
     for index, name in enumerate(names):
@@ -327,12 +332,12 @@ def _intervals_by_step(interval: Interval) -> IntervalsByStep:
 
 
 def _rounded(value: float) -> float:
-    """Return ``value`` to 9 digits: more would differ between machines."""
+    """Round ``value`` to 9 digits, because further digits differ between machines."""
     return float(f"{value:.9g}")
 
 
 def _csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
-    """Return a CSV file with ``header``."""
+    """Return the content of a CSV file with ``header``."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -1,4 +1,4 @@
-"""Build the network of a forecaster, pick its windows from the rows of recordings, and check and record the network."""
+"""Build a forecaster's network, index windows in the rows of recordings, and validate and trace the network."""
 
 from __future__ import annotations
 
@@ -33,29 +33,26 @@ ACTIONS = ("planned", "none", "shuffled")
 
 @dataclass(frozen=True)
 class Rows:
-    """Touch and arm of all rows, and where windows begin."""
+    """Touch and arm in all rows, and the first rows of windows."""
 
     touch: Tensor  # (time, feature)
     arm: Tensor  # (time, 13)
     finger: Tensor  # (time,)
-    tracks: Sequence[Track]  # the tracks that the rows come from
+    tracks: Sequence[Track]  # source of the rows
     starts: Tensor  # (window,)
     context: int
     horizon: int
     actions: str = "planned"
-    mapped: MappedArrays | None = None  # files that hold the rows; None: memory
-    plan_velocity: Tensor | None = None  # (time, 6), velocities of planned rows; None: those of ``arm``
+    mapped: MappedArrays | None = None  # files that contain the rows; None: rows are in memory
+    plan_velocity: Tensor | None = None  # (time, 6), velocities of planned rows; None: the velocities in ``arm``
 
     @property
     def part(self) -> loop.WindowSet:
-        """The windows and the loss for the training loop."""
+        """Windows and loss for the training loop."""
         return loop.WindowSet(len(self.starts), self.loss)
 
     def pick(self, starts: Tensor) -> tuple[ForecastWindows, Tensor]:
-        """Return the windows that begin at ``starts`` (window,), and their future.
-
-        The future is that of the tactile signals (horizon, window, feature).
-        """
+        """Return the windows that start at ``starts`` (window,), and their future touch (horizon, window, feature)."""
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
         touch, arm = (values.index_select(0, rows.flatten()).view(*rows.shape, -1) for values in (self.touch, self.arm))
@@ -72,12 +69,12 @@ class Rows:
         return lost
 
     def recording_of(self, starts: Tensor) -> Tensor:
-        """Return the number of the recording (window,) of the windows that begin at ``starts`` (window,)."""
+        """Return the recording number (window,) of each window that starts at ``starts`` (window,)."""
         ends = torch.from_numpy(np.cumsum([len(track.t_ns) for track in self.tracks]))
         return torch.searchsorted(ends, starts.cpu().contiguous(), right=True)
 
     def tactile(self, rows: Int64s) -> AnyFloats:
-        """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""
+        """Return counts above rest (window, row, channel) at ``rows`` (window, row); each window is in one track."""
         ends = np.cumsum([len(track.t_ns) for track in self.tracks])
         track_numbers = np.searchsorted(ends, rows[:, 0], side="right")  # (window,)
         levels = np.empty((*rows.shape, self.tracks[0].tactile.shape[1] if self.tracks else 0))
@@ -89,7 +86,7 @@ class Rows:
         return levels
 
     def evenly_spread(self, limit: int) -> Tensor:
-        """Return at most ``limit`` starts, evenly spread."""
+        """Return at most ``limit`` evenly spaced starts."""
         return self.starts[:: max(1, -(-len(self.starts) // limit))]
 
 
@@ -103,9 +100,9 @@ def rows_of_tracks(
     device: str = "cpu",
     mapped: MappedArrays | None = None,
 ) -> Rows:
-    """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
+    """Return the concatenated rows of all tracks, and the windows at ``starts``, which are row numbers within each track.
 
-    The rows lie in files of ``mapped``; None: in memory. Raises `StorageError` if its disk is full.
+    The rows are stored in files of ``mapped``, or in memory if it is None. Raises `StorageError` if the disk is full.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
@@ -141,9 +138,9 @@ def rows_of_tracks(
 
 
 def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
-    """Return the windows with the plan that a model trained on ``actions`` reads.
+    """Return the windows with the plan that a model trained with ``actions`` reads.
 
-    ``shuffled`` permutes the plans among the windows by torch's generator: the negative control.
+    With ``shuffled``, a negative control, torch's generator permutes the plans among the windows.
     """
     if actions == "none":
         return windows_of.without_plan(windows)
@@ -153,28 +150,28 @@ def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
     return windows
 
 
-METHODS = ("calibrate", "loss")  # methods of a network that scales itself
-TRIED = 2  # windows
+METHODS = ("calibrate", "loss")  # methods of a network that fits its own scales
+TRIED = 2  # number of windows for the check
 
 
 def shape(params: ForwardModelParams, codec: codecs.Codec) -> ForecastShape:
-    """Return what a network for the codec's features reads and predicts."""
+    """Return the input and output sizes of a network for the codec's features."""
     places = codec.layout if codec.kind == "raw" else ()
     changes = codec.representation == INCREMENTS
     return ForecastShape(len(codec.latents), params.context, params.horizon, tuple(places), changes)
 
 
 def build(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
-    """Return the network that ``params`` build, of random weights, for the codec's features; several as an `Ensemble`.
+    """Return the network that ``params`` build for the codec's features, with random weights; several as an `Ensemble`.
 
-    Raises `TacpipeError` if they build something else.
+    Raises `TacpipeError` if ``params`` build anything but a network.
     """
     members = [_member(params, codec) for _ in range(params.members)]
     return members[0] if len(members) == 1 else Ensemble(members)
 
 
 def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
-    """Return one network that scales itself; a plain one is put between scales."""
+    """Return one network that fits its own scales; wraps a plain network in scales."""
     sizes = shape(params, codec)
     network = params.build(sizes)
     if not isinstance(network, nn.Module):
@@ -196,7 +193,7 @@ def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
 
 @torch.no_grad()
 def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindows, features: int) -> None:
-    """Raise `TacpipeError` if a network returns something else than features to come for a few ``windows``."""
+    """Raise `TacpipeError` if a network does not return future features for a few ``windows``."""
     sample = ForecastWindows(*(part[:, :TRIED] for part in windows))
     training = network.training
     features_ahead = network.eval()(sample)
@@ -212,31 +209,36 @@ def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindo
         )
 
 
-TRACED = 12  # windows that both must agree on; the first calls of a recording profile and optimize it
-WALK, STEP = 20.0, 0.002  # random steps between rows of tried windows: hundredths of a feature's training range, m
+TRACED = (
+    12  # number of windows on which network and trace must agree; the first calls of a trace profile and optimize it
+)
+WALK, STEP = (
+    20.0,
+    0.002,
+)  # random steps between rows of test windows: in hundredths of a feature's training range, and in m
 
 
 class Network:
-    """The network of a forecaster, for one window at a time.
+    """Network of a forecaster, for one window at a time.
 
-    One window is little work: of a forecast's time in the network, more than half goes into calling some hundred
-    operations from Python. `torch.jit.trace` and `freeze` record them once. A network that cannot be recorded, or whose
-    recording gives other numbers for any tried window, runs as it is.
+    One window is little work: more than half of a forecast's network time is spent on calling some hundred operations
+    from Python. `torch.jit.trace` and `freeze` record these calls once. A network that cannot be traced, or whose trace
+    returns different values for any test window, is called directly.
     """
 
     def __init__(self, forecaster: Forecaster) -> None:
-        """Record it; where that gives other numbers, keep it as it is."""
+        """Trace the network, or keep the original if the trace returns different values."""
         self._forecaster = forecaster
         self._recorded = None if forecaster.actions == "shuffled" else _recorded(forecaster)
 
     @property
     def is_recorded(self) -> bool:
-        """True if the traced network is used."""
+        """Whether the traced network is used."""
         return self._recorded is not None
 
     @torch.no_grad()
     def features(self, windows: ForecastWindows) -> AnyFloats:
-        """Return the features to come (window, horizon, feature), as `Forecaster.features`; ``windows`` holds one."""
+        """Return the future features (window, horizon, feature), as `Forecaster.features` does, for a single window."""
         if self._recorded is None:
             return self._forecaster.features(windows)
         predicted: Tensor = self._recorded(*windows)
@@ -245,7 +247,7 @@ class Network:
 
 
 class _Parts(nn.Module):
-    """A network that is given the parts of windows."""
+    """Adapter that calls a network with the parts of windows as separate arguments."""
 
     def __init__(self, forecaster: Forecaster) -> None:
         super().__init__()
@@ -258,30 +260,30 @@ class _Parts(nn.Module):
 
 @torch.no_grad()
 def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
-    """Return the recording, or None if there is none that gives the same bits."""
+    """Return the traced network, or None if tracing fails or the trace does not return identical bits."""
     parts = _Parts(forecaster).eval()
     examples = _tried(forecaster)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warns of shapes that become constants, as they are here
+            warnings.simplefilter("ignore")  # torch warns of shapes that become constants, which is intended here
             traced = torch.jit.trace(parts, tuple(examples[0]), check_trace=False)  # type: ignore[no-untyped-call]
             frozen: torch.jit.ScriptModule = torch.jit.freeze(traced)
-            for _ in range(2):  # once while it is optimized, and as it stays
+            for _ in range(2):  # during and after optimization of the trace
                 if not all(torch.equal(frozen(*windows), parts(*windows)) for windows in examples):
                     return None
-    except Exception:  # an architecture of another package may raise anything
+    except Exception:  # an architecture from another package may raise any error
         return None
     return frozen
 
 
 def _tried(forecaster: Forecaster) -> list[ForecastWindows]:
-    """Return windows (one each) that walk, rest, jump and hold still."""
+    """Return test windows, one per item, with random walks, rest, jumps and constant values."""
     rng = np.random.default_rng(0)
     context, rows = forecaster.context, forecaster.context + forecaster.horizon
     examples = []
     for number in range(TRACED):
         size = 0.0 if number == 0 else float(rng.lognormal(0, 1))
-        moved = rng.random((context, 1, 1)) < rng.random()  # other rows repeat the one before
+        moved = rng.random((context, 1, 1)) < rng.random()  # the other rows repeat the previous row
         walk = WALK * rng.normal(0, size, (context, 1, len(forecaster.codec.latents))) * moved
         touch = walk.cumsum(axis=0) * forecaster.feature_half / 100
         arm = rng.normal(0, STEP * size, (rows, 1, ARM)).cumsum(axis=0)

@@ -1,6 +1,6 @@
-"""How a model of the task ``forward`` is built and trained: the params of `tacpipe train forward`, one class a family.
+"""Params of `tacpipe train forward`: how a model is built and trained, with one class per model family.
 
-Classes of other packages extend `ForwardModelParams`, whose `build` states what a network reads and returns.
+Other packages subclass `ForwardModelParams`, whose `build` documents the inputs and outputs of a network.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ForwardModelParams(ABC):
-    """Size of a model of the task ``forward`` and of its windows, and how it is trained.
+    """Size of a model of the task ``forward``, its windows, and its training.
 
-    Each architecture extends it, adds params of its own, and builds its network.
+    Each architecture subclasses it, adds its own params, and builds its network.
     """
 
-    ARCHITECTURES: ClassVar[str] = "forward"  # the task, as entry points name it
+    ARCHITECTURES: ClassVar[str] = "forward"  # name of the task in entry points
     architecture: str = "auto"
     # part of the planned motion that the model reads: planned, none, or shuffled (another window's, a negative control)
     actions: Literal["planned", "none", "shuffled"] = "planned"
     hidden: PositiveInt = 128  # units per layer
     epochs: PositiveInt = 16  # maximum number of passes over the training windows
     batch: PositiveInt = 128  # windows per step of the optimiser
-    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam; the peak if it goes through a cycle
+    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam, or its peak if cycle is set
     cycle: bool = True  # raise and lower the learning rate once over all epochs
-    patience: PositiveInt = 16  # epochs without a lower validation error after which training ends
-    gradient_clip: PositiveFloat = 1.0  # largest norm of the gradient
+    patience: PositiveInt = 16  # epochs without a lower validation error before training stops
+    gradient_clip: PositiveFloat = 1.0  # maximum norm of the gradient
     windows: Literal["all", "contact"] = "all"  # training windows: all, or those within one contact
     stride: PositiveInt = 1  # rows from one training window to the next
     seed: Seed = 0  # random seed of initial weights and of the order of windows
     context: PositiveInt = 10  # past rows that the model reads
     horizon: PositiveInt = 10  # future rows that it predicts
-    baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
+    baselines: bool = True  # also fit the linear baselines, for comparison by evaluate
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
     # networks with different random weights whose forecasts are averaged
     members: PositiveInt = added(1)
-    arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
+    arm: str = added("")  # stream whose position and orientation are the motion; empty: the only stream with a position
     PANELS: ClassVar[Panels] = {
         "Model": ("architecture", "members", "actions", "hidden", "dropout", "context", "horizon"),
         "Training": (
@@ -65,47 +65,57 @@ class ForwardModelParams(ABC):
     def resolved(
         self, layout: Sequence[Mapping[str, str]], start: ForwardModelParams | None, *, changes: bool
     ) -> ForwardModelParams:
-        """Return these params with the meaning of ``auto`` for channels that lie like ``layout``; latents have none.
+        """Return these params with values of ``auto`` replaced according to the channel ``layout``.
 
-        ``start`` are the params of the model to begin with, ``changes`` states that features are increments.
+        Latents have no layout.
+
+        ``start`` are the params of the initial model, and ``changes`` is True if features are increments.
         """
         return self
 
     @abstractmethod
     def build(self, shape: ForecastShape) -> nn.Module:
-        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.ForecastShape`).
+        """Return the network, with random weights, for the sizes in ``shape`` (`tacpipe.models.windows.ForecastShape`).
 
         **A plain network** is called as ``network(past, plan)`` and returns (horizon, window, feature), float32.
 
-        - ``past`` (context, window, ``shape.past``) describes each row that was measured, the last one now: of each feature
-          the difference from now (in units of the usual change, compressed by asinh) and the level (mean 0, deviation 1,
-          within 8 deviations); whether the row repeats the one before; the width of the gripper against now; motion.
-        - ``plan`` (horizon, window, ``shape.plan``) is the motion to come: position, rotation, velocity, angular velocity
-          and acceleration of the hand as it sees them now, scaled, and the direction up. Without an arm it is constant.
-        - It returns the change from now, in units of the usual change, or, where the network has ``change_only = False``,
-          levels as ``past`` has them. Zeros are persistence, so a last layer of zeros begins there.
+        - ``past`` (context, window, ``shape.past``) describes each measured row, of which the last is the current one.
+          It contains each feature's difference from the current row (in units of the RMS change, compressed by
+          asinh) and its level (mean 0, standard deviation 1, clipped to 8 standard deviations), whether the row repeats
+          the previous one, the gripper's width relative to the current width, and motion.
+        - ``plan`` (horizon, window, ``shape.plan``) is the future motion: position, rotation, velocity, angular
+          velocity and acceleration in the current frame of the hand, scaled, and the vertical direction. Without an arm
+          it is constant.
+        - The output is the change from the current row, in units of the RMS change; if the network has ``change_only
+          = False``, it is levels in the scale of ``past``. Zeros are persistence, so initialize the last layer with
+          zeros.
 
-        **A network that scales itself** has the methods ``calibrate(windows, ahead)``, which fits its scales on training
-        windows, and ``loss(windows, ahead)``, which returns a scalar, and the attribute ``change_only``. It is called as
-        ``network(windows)`` with `tacpipe.models.windows.ForecastWindows` in the units of the recordings, and returns the
-        features to come in theirs. `tacpipe.models.change.ChangeForecast` has all but ``forward``.
+        **A network that scales itself** has the methods ``calibrate(windows, ahead)``, which fits its scales on
+        training windows, and ``loss(windows, ahead)``, which returns a scalar, and the attribute ``change_only``. It is
+        called as ``network(windows)`` with `tacpipe.models.windows.ForecastWindows` in the units of the recordings, and
+        returns the future features in the same units. `tacpipe.models.change.ChangeForecast` implements all but
+        ``forward``.
 
-        Of either kind, a prediction depends on its own window alone (so no normalisation over the batch), and each step on
-        the plan up to it, or evaluation of shuffled and missing plans means nothing.
+        For both kinds, a prediction must depend only on its own window (so no batch normalisation), and each step only
+        on the plan up to that step; otherwise the evaluation of shuffled and missing plans is meaningless.
 
-        The task makes the windows, fits scales on training recordings, trains (Adam, early stopping, checkpoints that
-        resume, bfloat16), stores weights as safetensors, fits the baselines, and evaluates. A plain
-        network learns the absolute error, of latents of increments Huber's. Raise `TacpipeError` for what cannot be read.
+        The task creates the windows, fits scales on training recordings, trains (Adam, early stopping, resumable
+        checkpoints, bfloat16), stores weights as safetensors, fits the baselines, and evaluates. A plain network
+        minimises the absolute error, or Huber's for latents of increments. Raise `TacpipeError` for inputs that cannot
+        be read.
         """
 
 
 @dataclass(frozen=True)
 class Change(ForwardModelParams):
-    """A model that predicts the change since the last row; auto is taxelwise on raw channels and gru on latents."""
+    """Params of a model that predicts the change since the last row.
 
-    # network; auto: taxelwise for raw channels, gru for latents and for channels that do not lie taxel by taxel
+    ``auto`` is taxelwise on raw channels and gru on latents.
+    """
+
+    # network; auto: taxelwise for raw channels, gru for latents and for channels that are not grouped by taxel
     architecture: Literal["auto", "taxelwise", "gru", "lstm", "tcn"] = "auto"
-    dropout: Dropout = 0.2  # fraction of units left out of each training step
+    dropout: Dropout = 0.2  # fraction of units dropped in each training step
     # error that training minimises; auto: absolute, and huber for latents of increments, whose median is often 0
     loss: Literal["auto", "absolute", "huber", "squared"] = "auto"
     PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3}}
@@ -113,7 +123,7 @@ class Change(ForwardModelParams):
     def resolved(
         self, layout: Sequence[Mapping[str, str]], start: ForwardModelParams | None, *, changes: bool
     ) -> ForwardModelParams:
-        """Return these params with the meaning of ``auto``: the architecture of ``start`` if that one predicts change."""
+        """Return these params with values of ``auto`` replaced; uses the architecture of ``start`` if it predicts change."""
         from tacpipe.models import forecasts
 
         choice = self.architecture
@@ -125,7 +135,7 @@ class Change(ForwardModelParams):
         )
 
     def build(self, shape: ForecastShape) -> nn.Module:
-        """Return the network; ``auto`` and the loss are resolved before."""
+        """Return the network. ``auto`` in architecture and loss must be resolved before."""
         from tacpipe.models import forecasts
 
         return forecasts.build(
@@ -143,9 +153,9 @@ class Change(ForwardModelParams):
 
 @dataclass(frozen=True)
 class Recurrent(ForwardModelParams):
-    """The paper's model, which predicts levels; it has no dropout and minimises the squared error."""
+    """Params of the paper's model, which predicts levels, has no dropout and minimises the squared error."""
 
-    # network: recurrent is the paper's
+    # network; recurrent is the paper's architecture
     architecture: Literal["recurrent"] = "recurrent"
     PRESETS: ClassVar[Presets] = {
         "paper": {
@@ -162,67 +172,67 @@ class Recurrent(ForwardModelParams):
     }
 
     def build(self, shape: ForecastShape) -> nn.Module:
-        """Return the paper's network between its scalings."""
+        """Return the paper's network with scaling of its inputs and outputs."""
         from tacpipe.models.forecasts import RecurrentForecast
 
         return RecurrentForecast(shape.features, self.hidden)
 
 
 Params = ForwardModelParams  # params of any architecture
-PAPER = Recurrent.architecture  # the architecture of the paper
+PAPER = Recurrent.architecture  # architecture of the paper
 
 
 class CodecDescription(TypedDict):
-    """The representation that a model reads, in its configuration."""
+    """Representation that a model reads, in its configuration."""
 
-    kind: str  # as `tacpipe compress` names it; raw: no codec
+    kind: str  # name in `tacpipe compress`; raw: no codec
     of: str  # levels or increments
     frames: int
     latents: int
-    name: str  # in reports
+    name: str  # name in reports
 
 
 class ArmColumns(TypedDict):
-    """The columns of the arm that a model reads, in its configuration."""
+    """Columns of the arm that a model reads, in its configuration."""
 
     position: Sequence[str]
     orientation: Sequence[str]
 
 
 class ModelInputs(TypedDict):
-    """The columns that a model reads, in its configuration."""
+    """Columns that a model reads, in its configuration."""
 
     tactile: list[str]
     layout: list[dict[str, str]]  # stream, taxel and axis of each channel
-    orientation_reference: list[float]  # (4,): quaternions have the sign that is nearest to this one
-    plan_velocity: NotRequired[str]  # source of a plan's velocities; absent: as those of the past
-    unit: NotRequired[str]  # of the channels; absent: counts
-    pose: NotRequired[ArmColumns]  # absent: the columns of a Panda
+    orientation_reference: list[float]  # (4,), quaternions have the sign that is nearest to this one
+    plan_velocity: NotRequired[str]  # source of a plan's velocities; absent: same source as past velocities
+    unit: NotRequired[str]  # unit of the channels; absent: counts
+    pose: NotRequired[ArmColumns]  # absent: columns of a Panda
 
 
 class ForwardScaling(TypedDict):
-    """Spreads over usable training rows, in a model's configuration."""
+    """Ranges and standard deviations over usable training rows, in a model's configuration."""
 
     feature_half: list[float]  # half the range of each feature
-    channel_count: list[float]  # the standard deviation of each channel in counts
+    channel_count: list[float]  # standard deviation of each channel in counts
 
 
 class LookAhead(TypedDict):
-    """The time by which rows of the training recordings look ahead, in a model's configuration."""
+    """How far rows of the training recordings look ahead in time, in a model's configuration."""
 
     mean_ms: float
     max_ms: float
 
 
 class AlarmLevels(TypedDict, total=False):
-    """The levels of alarms that validation recordings set, in a model's configuration; empty without recordings."""
+    """Alarm levels set on validation recordings, in a model's configuration; empty without such recordings."""
 
-    sd: list[float]  # usual change of each load
-    theta: dict[str, list[float | None]]  # level of each load by predictor; None: never
+    sd: list[float]  # standard deviation of each load's change
+    theta: dict[str, list[float | None]]  # level of each load by predictor; None: no alarms
 
 
 class QuantileDescription(TypedDict):
-    """The calibration of a model's quantiles, in its configuration."""
+    """Calibration of a model's quantiles, in its configuration."""
 
     levels: list[int]  # percent
     method: str
@@ -231,14 +241,14 @@ class QuantileDescription(TypedDict):
 
 
 class ForwardConfig(ModelConfig):
-    """``config.json`` of a model of the task ``forward``."""
+    """Content of ``config.json`` in a model of the task ``forward``."""
 
     codec: CodecDescription
     context: int
     horizon: int
     inputs: ModelInputs
     rate_hz: float
-    gap_ms: dict[str, float]  # longest time without a gap by stream
+    gap_ms: dict[str, float]  # maximum time between samples without a gap, by stream
     look_ahead: NotRequired[LookAhead]
     timeline: str
     scaling: ForwardScaling

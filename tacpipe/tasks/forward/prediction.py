@@ -1,4 +1,4 @@
-"""Predict with a forecaster: tables for recordings, arrays for controllers."""
+"""Predict with a forecaster: tables from recordings, and arrays for controllers."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 def predict(
     model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
 ) -> Result:
-    """Return a table a recording: when each prediction was known, and each channel's counts above rest ``steps`` later.
+    """Return one table per recording with each prediction's time and each channel's counts above rest ``steps`` later.
 
-    Columns are named like ``xela1_taxel01_z_t5``, and with ``quantiles`` (percent) like ``xela1_taxel01_z_t5_q90`` too.
-    Raises `TacpipeError` for a step that the model does not reach, for quantiles that it does not have, and where the
-    recordings are not what it reads.
+    Columns are named like ``xela1_taxel01_z_t5``, and those of ``quantiles`` (percent) like ``xela1_taxel01_z_t5_q90``.
+    Raises `TacpipeError` for a step beyond the model's horizon, for quantiles that the model does not have, and for
+    recordings that the model cannot read.
     """
     tables = _gathered(Forecaster.load(model), recordings, steps, quantiles)
     return Result({name: RecordingOutput(gathered.rows()) for name, gathered in tables.items()})
@@ -44,7 +44,7 @@ def predict(
 def tables(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
 ) -> dict[str, pa.Table]:
-    """Return the table of each recording's predictions; steps and errors are those of `predict`."""
+    """Return each recording's table of predictions; steps and errors are those of `predict`."""
     rows = {name: table.rows() for name, table in _gathered(forecaster, recordings, steps, quantiles).items()}
     return {name: table if isinstance(table, pa.Table) else table.read_all() for name, table in rows.items()}
 
@@ -52,7 +52,7 @@ def tables(
 def _gathered(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
 ) -> dict[str, Gathered]:
-    """Return the predictions of each recording, put aside some windows at a time."""
+    """Return each recording's predictions, collected in batches of windows."""
     check_steps(steps, forecaster.horizon)
     levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
@@ -85,14 +85,14 @@ def _gathered(
 
 
 def check_steps(steps: Sequence[int], horizon: int) -> None:
-    """Raise `TacpipeError` for a step ahead that a model does not reach."""
+    """Raise `TacpipeError` for a step beyond a model's horizon."""
     for step in steps:
         if not 1 <= step <= horizon:
             raise TacpipeError(f"The model predicts 1 to {horizon} steps ahead, not {step}. Give --steps of these.")
 
 
 def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
-    """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
+    """Return the windows of a dataset's only recording as `Forecaster.predict` reads them."""
     check_codec(forecaster.codec_files, recordings.files)
     (shard,) = recordings.recordings.values()
     track = forecaster.track(shard)
@@ -114,9 +114,9 @@ def prediction_table(
     steps: Sequence[int],
     bands: Mapping[int, Float32s] | None = None,
 ) -> pa.Table:
-    """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy.
+    """Return the table of predicted ``counts`` (step, channel, window), which become columns without a copy.
 
-    ``bands`` holds quantiles of the same shape by their level in percent, in columns behind each one's prediction.
+    ``bands`` contains quantiles of the same shape by level in percent; their columns follow the prediction's.
     """
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]
@@ -133,11 +133,11 @@ def prediction_table(
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))
 
 
-STEPS = (1, 3, 5, 10)  # ahead, that are predicted unless others are asked for, as by `tacpipe predict`
+STEPS = (1, 3, 5, 10)  # default steps ahead, as in `tacpipe predict`
 
 
 class ForwardModel(Forecaster):
-    """Predicts future tactile signals of recordings, or of arrays."""
+    """Model that predicts future tactile signals from recordings or arrays."""
 
     @overload
     def predict(
@@ -156,27 +156,29 @@ class ForwardModel(Forecaster):
         steps: Sequence[int] = STEPS,
         quantiles: Sequence[int] = (),
     ) -> pa.Table | AnyFloats:
-        """Return predicted tactile signals: of a dataset or one of its recordings as a table, of arrays as an array.
+        """Return predicted tactile signals: a table for a dataset or one of its recordings, an array for arrays.
 
-        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes
-        and ``tacpipe.open(OUTPUT).table()`` reads: ``recording``, ``t_ns`` (when it was known) and for each channel and each
-        of ``steps`` the counts above rest that many rows later, as ``xela1_taxel01_z_t5``, float32; a row a window.
-        ``.to_pandas()`` makes a frame of it. ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as
-        ``xela1_taxel01_z_t5_q90``. Raises `UsageError` if the recordings did not go through the stages that
-        the model was trained behind, `TacpipeError` for a step beyond the horizon.
+        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict`
+        writes and ``tacpipe.open(OUTPUT).table()`` reads, with one row per window: ``recording``, ``t_ns`` (the time of
+        the prediction) and for each channel and each of ``steps`` the counts above rest that many rows later, such as
+        ``xela1_taxel01_z_t5``, float32. ``.to_pandas()`` converts it to a data frame. ``quantiles`` (percent, from
+        those of `tacpipe calibrate`) adds columns such as ``xela1_taxel01_z_t5_q90``. Raises `UsageError` if the
+        recordings were not processed by the stages that preceded the model's training, and `TacpipeError` for a step
+        beyond the horizon.
 
-        **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last, has
-        `window_columns` or these, `derived_columns` and the width of the gripper; ``plan`` (horizon, column) or (window,
-        horizon, column), the rows to come, has `plan_columns`, or these and `derived_columns`. `windows` makes both of a
-        recording. Velocities that are left out are differences of the poses. Returns counts above rest, float64 (horizon,
-        channel) or (window, horizon, channel); with ``quantiles`` these instead, float32 (…, channel, quantile).
+        **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last,
+        contains `window_columns`, or these and `derived_columns` and the width of the gripper; ``plan`` (horizon,
+        column) or (window, horizon, column), the future rows, contains `plan_columns`, or these and `derived_columns`.
+        `windows` creates both from a recording. Missing velocities are computed as differences of the poses. Returns
+        counts above rest, float64 (horizon, channel) or (window, horizon, channel); with ``quantiles`` the quantiles
+        instead, float32 (…, channel, quantile).
 
-        Raises `TacpipeError` for other shapes, for values that are not finite, and for raw counts instead of counts above
-        rest: where the median of a window's counts, by absolute value over rows and channels, is more than twice
-        `largest_level`, half of all channels are further from rest than in training hardly any channel ever was. Offsets
-        of a XELA uSkin are at least four times `largest_level` on 52 published trials; true windows reach 0.9 of it if
-        the model was trained on the weakest of these trials alone, and 0.1 if on all. An offset below twice
-        `largest_level` goes unnoticed.
+        Raises `TacpipeError` for other shapes, for values that are not finite, and for raw counts instead of counts
+        above rest. Counts are considered raw if the median absolute count of a window, over rows and channels, is more
+        than twice `largest_level`: half of all channels are then further from rest than almost any channel was in
+        training. Offsets of a XELA uSkin are at least four times `largest_level` on 52 published trials; true windows
+        reach 0.9 of it if the model was trained only on the weakest of these trials, and 0.1 if on all. An offset below
+        twice `largest_level` is not detected.
         """
         if plan is not None:
             window = cast("AnyFloats", data)
@@ -185,8 +187,8 @@ class ForwardModel(Forecaster):
         return one_after_another(tables(self, recordings, sorted(set(steps)), sorted(set(quantiles))))
 
     def windows(self, recording: Recording) -> WindowArrays:
-        """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.
+        """Return a recording's windows as `predict` reads them: ``window``, ``plan`` and ``t_ns``, the prediction times.
 
-        Rows in gaps are in none of them. The recorded motion serves as the plan. Raises as `predict`.
+        Excludes windows with rows in gaps. The recorded motion serves as the plan. Raises the same errors as `predict`.
         """
         return inputs(self, open_for_model(recording.alone, self.chain))

@@ -1,4 +1,4 @@
-"""All predictors of future tactile signals: the model, its baselines, and the bound that its codec sets."""
+"""Predict future tactile signals with the model, its baselines, and its codec, which limits the model's accuracy."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.networks import rows_of_tracks
 from tacpipe.tasks.forward.tracks import Track
 
-CHUNK = 2048  # windows predicted at once
+CHUNK = 2048  # windows per batch
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """The predictions of one predictor for some windows: features (window, step, feature), counts (window, step, channel).
+    """Predictions of one predictor for some windows: features (window, step, feature), counts (window, step, channel).
 
-    Features are those of the model's codec; None for a predictor that has none.
+    Features are those of the model's codec, or None if the predictor has none.
     """
 
     latent: AnyFloats | None
@@ -34,53 +34,53 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Predicted:
-    """Some windows of a recording: the measured signals, and the predictions of each predictor."""
+    """Some windows of a recording with the measured signals and each predictor's predictions."""
 
-    now: Int64s  # (window,), the last row that is read
-    features: AnyFloats  # (window, step, feature) of the model
+    now: Int64s  # (window,), last input row
+    features: AnyFloats  # (window, step, feature), as the model represents them
     truth: Prediction
-    predictions: Mapping[str, Prediction]  # `items` makes one after another, so that not all are in memory at once
+    predictions: Mapping[str, Prediction]  # `items` computes them one by one, so that not all are in memory at once
 
 
 @dataclass(frozen=True)
 class WindowForecast:
-    """Some windows of a recording, and the predictions of the model alone."""
+    """Some windows of a recording with only the model's predictions."""
 
     windows: ForecastWindows
-    past: Int64s  # (window, context), rows that are read
-    future: Int64s  # (window, step), rows that are predicted
+    past: Int64s  # (window, context), input rows
+    future: Int64s  # (window, step), predicted rows
     features: AnyFloats  # (window, step, feature)
     count: AnyFloats  # (window, step, channel)
 
     @property
     def now(self) -> Int64s:
-        """The last row that is read (window,)."""
+        """Last input row (window,)."""
         return self.past[:, -1]
 
 
 def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[WindowForecast]:
-    """Yield the model's predictions for the windows of ``track`` that begin at ``starts``, some windows at a time."""
+    """Yield the model's predictions for the windows of ``track`` that start at ``starts``, in batches."""
     track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
     for first in range(0, len(starts), CHUNK):
         yield _forecast(forecaster, track, starts[first : first + CHUNK])
 
 
 def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowForecast:
-    """Return the model's predictions for some windows, those that begin at ``starts``, in order."""
+    """Return the model's predictions for the windows that start at ``starts``, in order."""
     context, horizon = forecaster.context, forecaster.horizon
     past, future = (starts[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
     block = track.between(int(starts[0]), int(starts[-1]) + context + horizon)
     block_rows = rows_of_tracks([block], [starts - starts[0]], context, horizon)
     windows = block_rows.pick(block_rows.starts)[0]
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
+        torch.manual_seed(0)  # evaluate a control with the same shuffled plans each time
         features = forecaster.features(windows)
     count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
     return WindowForecast(windows, past, future, features, count)
 
 
 def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
-    """Yield what all predictors predict for the windows of ``track`` that begin at ``starts``, some windows at a time."""
+    """Yield all predictors' predictions for the windows of ``track`` that start at ``starts``, in batches."""
     for forecast in forecasts(forecaster, track, starts):
         truth = Prediction(track.latent[forecast.future], track.tactile[forecast.future])
         yield Predicted(forecast.now, forecast.features, truth, _Predictions(forecaster, track, forecast))
@@ -88,13 +88,13 @@ def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
 
 
 class _Predictions(Mapping[str, Prediction]):
-    """The predictions of each predictor for some windows, computed at each access."""
+    """Each predictor's predictions for some windows, computed at each access."""
 
     def __init__(self, forecaster: Forecaster, track: Track, forecast: WindowForecast) -> None:
         self._forecaster, self._track, self._forecast = forecaster, track, forecast
 
     def items(self) -> ItemsView[str, Prediction]:
-        """Return names and predictions, each computed as the iteration reaches it."""
+        """Return pairs of names and predictions, computed during iteration."""
         return _Items(self)
 
     def __getitem__(self, name: str) -> Prediction:
@@ -110,7 +110,7 @@ class _Predictions(Mapping[str, Prediction]):
         return sum(1 for _ in self)
 
     def each_prediction(self) -> Iterator[tuple[str, Prediction]]:
-        """Yield what each predictor predicts."""
+        """Yield each predictor's name and prediction."""
         forecaster, track, forecast = self._forecaster, self._track, self._forecast
         yield from _of_model(forecaster, track, forecast)
         yield from _of_codec(forecaster, track, forecast)
@@ -124,7 +124,7 @@ class _Predictions(Mapping[str, Prediction]):
 
 
 class _Items(ItemsView[str, Prediction]):
-    """Names and predictions of `_Predictions`, without finding each by its name."""
+    """Names and predictions of `_Predictions`, without a lookup of each name."""
 
     def __init__(self, predictions: _Predictions) -> None:
         super().__init__(predictions)
@@ -135,7 +135,7 @@ class _Items(ItemsView[str, Prediction]):
 
 
 def _of_model(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
-    """Yield the model's prediction, and persistence."""
+    """Yield the predictions of the model and of persistence."""
     codec, horizon = forecaster.codec, forecaster.horizon
     last, last_feature = track.tactile[forecast.now], track.latent[forecast.now]
     unchanged = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
@@ -146,7 +146,7 @@ def _of_model(forecaster: Forecaster, track: Track, forecast: WindowForecast) ->
 
 
 def _of_codec(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
-    """Yield what the codec alone loses of the true features to come."""
+    """Yield the codec's reconstruction of the true future features, whose error is that of the codec."""
     codec = forecaster.codec
     if codec.kind == "raw":
         return
@@ -159,5 +159,5 @@ def _of_codec(forecaster: Forecaster, track: Track, forecast: WindowForecast) ->
 
 
 def _repeat_over_steps(values: AnyFloats, horizon: int) -> AnyFloats:
-    """Return ``values`` (window, channel) at every step, (window, step, channel)."""
+    """Return ``values`` (window, channel) repeated for each step, (window, step, channel)."""
     return np.repeat(values[:, None], horizon, axis=1)

@@ -1,8 +1,8 @@
-"""Learn the quantiles of a forecast's error from what the forecast and its inputs show, for any architecture.
+"""Fit quantiles of a forecast's error from the forecast and its inputs, for any architecture.
 
-A small network, the same for all channels, reads features of a channel at a moment and gives, for each step ahead, where
-the median of the error lies and how far each further quantile lies beyond the one before, so that quantiles never cross.
-It works in units of each channel's and step's mean absolute error in fitting, and minimises the pinball loss (Koenker and
+A small network, shared by all channels, reads features of a channel at a time and returns, for each step ahead, the
+median of the error and the distance of each further quantile from the previous one, so that quantiles never cross. It
+works in units of each channel's and step's mean absolute error in fitting, and minimises the pinball loss (Koenker and
 Bassett, Regression quantiles, 1978), as quantile regression networks do (Taylor, 2000).
 """
 
@@ -28,19 +28,19 @@ from tacpipe.tasks import task
 
 HIDDEN = 32
 PASSES = 1200  # steps of the optimiser
-BATCH = 1024  # values of each, a value being a channel of a window
+BATCH = 1024  # values per step; a value is a channel of a window
 LEARNING_RATE = 3e-3
-MIN_VALUES = 100  # values to fit on
-MIN_UNIT_FRACTION = 1e-3  # unit of a channel that never errs, as a fraction of the mean unit
-FARTHEST = 8.0  # deviations at which a feature is cut
+MIN_VALUES = 100  # values needed for fitting
+MIN_UNIT_FRACTION = 1e-3  # unit of a channel without errors, as a fraction of the mean unit
+FARTHEST = 8.0  # standard deviations to which features are clipped
 
 
 @dataclass(frozen=True)
 class ResidualQuantiles:
-    """Hold the weights of the network, scales of its features, and units of errors."""
+    """Network that predicts quantiles of errors: its weights, feature scales and error units."""
 
     levels: AnyFloats  # (level,), fractions in ascending order, symmetric about 0.5
-    unit: AnyFloats  # (channel, step), mean absolute error
+    unit: AnyFloats  # (channel, step), mean absolute errors
     centre: AnyFloats  # (feature,)
     spread: AnyFloats  # (feature,)
     weights: tuple[AnyFloats, ...]  # three layers, (in, out)
@@ -50,11 +50,11 @@ class ResidualQuantiles:
     def fit(
         cls, features: Float32s, errors: Float32s, levels: AnyFloats, *, seed: int = 0, passes: int = PASSES
     ) -> Self:
-        """Fit quantiles to errors, and return them.
+        """Fit the quantiles of errors.
 
-        ``errors`` are true less predicted values (window, channel, step), ``features`` those of each channel (window,
-        channel, feature). ``passes`` are steps of the optimiser. The same seed gives the same weights. Raises
-        `TacpipeError` for fewer than 100 values, and where one is not finite.
+        ``errors`` are true minus predicted values (window, channel, step), and ``features`` each channel's features
+        (window, channel, feature). ``passes`` are steps of the optimiser. The same seed gives the same weights. Raises
+        `TacpipeError` for fewer than 100 values, and for values that are not finite.
         """
         if errors.shape[0] * errors.shape[1] < MIN_VALUES:
             raise TacpipeError(
@@ -77,7 +77,7 @@ class ResidualQuantiles:
         return cls(np.asarray(levels, np.float64), unit, centre, spread, weights, biases)
 
     def predict(self, features: Float32s) -> Float32s:
-        """Return quantiles of the error (window, channel, step, level), in ascending order.
+        """Return the quantiles of the error (window, channel, step, level) in ascending order.
 
         ``features`` are (window, channel, feature).
         """
@@ -90,7 +90,7 @@ class ResidualQuantiles:
         return (ordered * self.unit[None, :, :, None]).astype(np.float32, copy=False)
 
     def to_tensors(self) -> dict[str, AnyArray]:
-        """Return all that `from_tensors` needs."""
+        """Return the tensors that `from_tensors` reads."""
         layers = zip(self.weights, self.biases, strict=True)
         return {
             **{name: getattr(self, name) for name in ("levels", "unit", "centre", "spread")},
@@ -99,7 +99,7 @@ class ResidualQuantiles:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
-        """Return what `to_tensors` described. Raises `ValueError` if shapes do not fit one another."""
+        """Create the quantiles from the tensors of `to_tensors`. Raises `ValueError` if shapes are inconsistent."""
         quantiles = cls(
             tensors["levels"],
             tensors["unit"],
@@ -120,7 +120,7 @@ class ResidualQuantiles:
 
 
 def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, passes: int) -> nn.Sequential:
-    """Return the network of the least pinball loss on ``errors`` (value, step), in units of the channel."""
+    """Return the network trained to minimise the pinball loss on ``errors`` (value, step), in units of the channel."""
     steps, middle = errors.shape[1], len(levels) // 2
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -144,7 +144,7 @@ def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, pas
 
 
 def _ordered_tensor(raw: torch.Tensor, middle: int) -> torch.Tensor:
-    """Return quantiles in ascending order: the median as it is, each further one beyond by a softplus."""
+    """Return ascending quantiles: the raw median, and outwards from it cumulative sums of softplus values."""
     median = raw[..., middle : middle + 1]
     up = median + functional.softplus(raw[..., middle + 1 :]).cumsum(-1)
     down = median - functional.softplus(raw[..., :middle].flip(-1)).cumsum(-1).flip(-1)
@@ -152,7 +152,7 @@ def _ordered_tensor(raw: torch.Tensor, middle: int) -> torch.Tensor:
 
 
 def _ordered(raw: AnyFloats, middle: int) -> AnyFloats:
-    """Return what `_ordered_tensor` returns."""
+    """Do the same as `_ordered_tensor` on an array."""
     median = raw[..., middle : middle + 1]
     up = median + np.logaddexp(raw[..., middle + 1 :], 0).cumsum(-1)
     down = median - np.logaddexp(raw[..., :middle][..., ::-1], 0).cumsum(-1)[..., ::-1]
@@ -168,21 +168,22 @@ def _scaled(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:
     return np.clip((rows - centre) / spread, -FARTHEST, FARTHEST).astype(np.float32)
 
 
-FIXED_FEATURES = 13  # features beside the predicted change at each step
-LATEST_ROWS = 3  # rows whose change is looked at beside that of the whole context
+FIXED_FEATURES = 13  # features other than the predicted change at each step
+LATEST_ROWS = 3  # rows over which the latest change is computed, in addition to the whole context
 
 
 def error_features(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, scale: AnyFloats) -> Float32s:
     """Return features (window, channel, feature), float32, of windows and their forecasts.
 
-    ``past`` (window, context, channel) and the forecast ``ahead`` (window, horizon, channel) are levels above rest, ``arm``
-    (window, context + horizon, 13) holds the hand's velocities in its last six columns, ``finger`` (window, context) the
-    width of the gripper in m, and ``scale`` (channel,) each channel's spread in training.
+    ``past`` (window, context, channel) and the forecast ``ahead`` (window, horizon, channel) are levels above rest,
+    ``arm`` (window, context + horizon, 13) contains the hand's velocities in its last six columns, ``finger`` (window,
+    context) the gripper's width in m, and ``scale`` (channel,) each channel's standard deviation in training.
 
-    Of a channel, in units of its scale: how far from rest it is; its spread over the context; its change over the context
-    and over the last rows, with the sign; its mean step; its part of rows that repeat; and the change that is predicted
-    for each step. Of the window: the spread over all channels, how many of the last rows repeat, how fast the
-    hand moves and turns, in the past and in the plan, and by how much the gripper moved.
+    Features of a channel, in units of its scale, are its level above rest, its standard deviation over the context, its
+    signed change over the context and over the last rows, its mean step, the fraction of repeated rows, and the
+    predicted change at each step. Features of the window are the standard deviation over all channels, the number of
+    repeats among the last rows, the hand's linear and angular speeds in the past and in the plan, and the gripper's
+    movement.
     """
     windows, context, channels = past.shape
     level = past / scale
@@ -216,28 +217,29 @@ def error_features(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: An
 
 
 FILE = "quantiles.safetensors"
-ERRORS = "errors."  # begins the names of the tensors of `ResidualQuantiles`
-CHUNK = 256  # windows whose quantiles are computed at once
+ERRORS = "errors."  # prefix of the tensor names of `ResidualQuantiles`
+CHUNK = 256  # windows per batch
 
 
 @dataclass(frozen=True)
 class ForecastQuantiles:
-    """Quantiles of a model's error and, to compare with, constant ones of its error and of persistence's."""
+    """Quantiles of a model's error and, for comparison, constant quantiles of its error and of persistence's."""
 
     errors: ResidualQuantiles
-    moved: AnyFloats  # (level, step), outwards, in the units of ``errors``
-    unconditional: AnyFloats  # (level, channel, step), of the model's error on calibration recordings, counts
-    persistence: AnyFloats  # (level, channel, step), of persistence's error on training recordings, counts
+    moved: AnyFloats  # (level, step), outward shift in the units of ``errors``
+    unconditional: AnyFloats  # (level, channel, step), of the model's error on calibration recordings, in counts
+    persistence: AnyFloats  # (level, channel, step), of persistence's error on training recordings, in counts
 
     @property
     def percents(self) -> tuple[int, ...]:
-        """The levels of the quantiles in percent, ascending."""
+        """Quantile levels in percent, ascending."""
         return task.percents(self.errors.levels)
 
     def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
-        """Return quantiles in counts above rest (window, step, channel, level), ascending.
+        """Return ascending quantiles (window, step, channel, level) in counts above rest.
 
-        They are those of the forecast ``ahead`` (window, step, channel), whose features are (window, channel, feature).
+        ``ahead`` (window, step, channel) is the forecast, and ``read`` (window, channel, feature) contains its
+        features.
         """
         quantiles = self.errors.predict(read)  # (window, channel, step, level)
         middle, unit = len(self.percents) // 2, self.errors.unit[None]
@@ -260,13 +262,13 @@ class ForecastQuantiles:
         promised: bool = False,
         seed: int = 0,
     ) -> Self:
-        """Return quantiles fitted on the errors of training recordings and corrected on those of calibration recordings.
+        """Fit quantiles on the errors of training recordings and correct them on those of calibration recordings.
 
-        Each quantile is moved until, of the calibration recordings, each weighing the same, as many values lie at or below
-        it as its level states: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019), each
-        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.calibration`). ``promised``: pairs of
-        quantiles are moved together so far that the band between them holds in a new recording with at least its level;
-        raises `TacpipeError` with too few recordings for that.
+        Each quantile is shifted until the fraction of calibration values at or below it equals its level, with equal
+        weight for each recording: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019),
+        separately for each side, with the pooled CDFs of recordings (`tacpipe.metrics.calibration`). With ``promised``,
+        pairs of quantiles are shifted together so that the band between them contains the values of a new recording
+        with at least its level's probability; raises `TacpipeError` if there are too few recordings.
         """
         errors = ResidualQuantiles.fit(training.features, training.errors, levels, seed=seed)
         predicted = errors.predict(calibration.features)
@@ -274,14 +276,14 @@ class ForecastQuantiles:
         return cls(errors, moved, _empirical(calibration.errors, levels), _empirical(training.changes, levels))
 
     def to_bytes(self) -> bytes:
-        """Return a file that `load` reads."""
+        """Return the content of a file that `load` reads."""
         tensors: dict[str, AnyArray] = {name: getattr(self, name) for name in ("moved", "unconditional", "persistence")}
         tensors |= {f"{ERRORS}{name}": value for name, value in self.errors.to_tensors().items()}
         return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
 
     @classmethod
     def load(cls, content: bytes, channels: int, horizon: int) -> Self:
-        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` if shapes do not fit."""
+        """Load the output of `to_bytes`. Raises `TacpipeError` for any other file, and `ValueError` if shapes do not fit."""
         arrays = model_files.arrays(content, FILE)
         quantiles = cls(
             ResidualQuantiles.from_tensors(tensors_under(ERRORS, arrays)),
@@ -306,20 +308,20 @@ class ForecastQuantiles:
 
 @dataclass(frozen=True)
 class WindowErrors:
-    """Errors of a model on some windows of recordings, and what its forecasts and inputs show."""
+    """Errors of a model on windows of recordings, and the features of its forecasts and inputs."""
 
     features: Float32s  # (window, channel, feature)
-    errors: Float32s  # (window, channel, step), true less predicted, counts
-    changes: Float32s  # (window, channel, step), true less the last row, counts
-    recordings: Int64s  # (window,), the number of the recording
+    errors: Float32s  # (window, channel, step), true minus predicted, counts
+    changes: Float32s  # (window, channel, step), true minus last row, counts
+    recordings: Int64s  # (window,), recording numbers
 
 
 def window_features(
     windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats, actions: str = "planned"
 ) -> Float32s:
-    """Return `error_features` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
+    """Return the `error_features` of a forecaster's windows; ``past`` (window, context, channel) are their levels.
 
-    The plan is not looked at for a model that reads none or a wrong one.
+    Ignores the plan for a model trained without plans or with wrong ones.
     """
     windows = windows if actions == "planned" else without_plan(windows)
     arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
@@ -327,7 +329,7 @@ def window_features(
 
 
 def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool) -> AnyFloats:
-    """Return by how many units each quantile is moved outwards (level, step)."""
+    """Return each quantile's outward shift (level, step) in units of the error."""
     levels, steps = errors.levels, errors.unit.shape[1]
     middle, channels = len(levels) // 2, errors.unit.shape[0]
     groups = np.repeat(calibration.recordings, channels)
@@ -352,5 +354,5 @@ def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:
 
 
 def fewer(starts: Int64s, limit: int) -> Int64s:
-    """Return at most ``limit`` of a recording's windows, evenly spread."""
+    """Return at most ``limit`` evenly spaced windows of a recording."""
     return starts[:: max(1, -(-len(starts) // limit))]

@@ -1,6 +1,6 @@
-"""Name the situation of the hand in a window, and sum errors of forecasts by situation.
+"""Classify the situation of the hand in each window, and sum forecast errors by situation.
 
-A window is named by its last row read and the rows to come, so names describe what was measured; no model reads them.
+Situations depend on a window's last input row and its future rows, so they describe measurements. No model reads them.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.metrics import intervals, regression
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 
-if TYPE_CHECKING:  # these import torch, and a report names situations without it
+if TYPE_CHECKING:  # these modules import torch, which a report does not need
     from tacpipe.tasks.forward.predictors import Prediction
     from tacpipe.tasks.forward.tracks import Track
 
 SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in motion", "holding still")
-WIDTH_M = 0.0005  # least change of the gripper's width where it closes or opens
-LOST = 0.05  # fraction of the load that is lost over the rows to come where an object slips
-PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # least speeds of a moving hand
+WIDTH_M = 0.0005  # minimum change of the gripper's width that counts as closing or opening
+LOST = 0.05  # fraction of the load lost over the future rows when an object slips
+PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # minimum speeds of a moving hand
 
 
 class SituationMeasures(TypedDict):
@@ -32,30 +32,30 @@ class SituationMeasures(TypedDict):
     windows: int
     recordings: int
     mae_counts: dict[str, dict[str, float]]  # by predictor and step
-    skill: dict[str, dict[str, float]]  # mean, low and high by step
+    skill: dict[str, dict[str, float]]  # mean, lower and upper bound by step
 
 
 class Motion(NamedTuple):
-    """Values that decide the situation: at the last row read (now) and the last row to come (then), each (window,)."""
+    """Values (window,) that determine the situation, at the last input row (now) and the last future row (then)."""
 
     touched_now: AnyFloats  # 1 in contact, else 0
     touched_then: AnyFloats
-    load_now: AnyFloats  # mean of absolute levels over channels
+    load_now: AnyFloats  # mean absolute level over channels
     load_then: AnyFloats
-    wider_m: AnyFloats  # growth of the gripper's width
-    pace_m_s: AnyFloats  # the hand's fastest from now to then
+    wider_m: AnyFloats  # increase of the gripper's width
+    pace_m_s: AnyFloats  # maximum speed of the hand from now to then
     turning_rad_s: AnyFloats
 
 
 def situation_numbers(motion: Motion) -> Int64s:
-    """Return the situation of each window (window,), a place in `SITUATIONS`; the first one that holds.
+    """Return each window's situation (window,) as an index into `SITUATIONS`, which is the first that applies.
 
     - no contact: nothing is touched now or then;
-    - closing: the gripper's width shrinks by more than ``WIDTH_M``, or contact begins;
-    - releasing: it grows by more than that, or contact ends;
-    - slipping: the load falls by more than ``LOST`` of itself with the gripper still;
+    - closing: the gripper's width decreases by more than ``WIDTH_M``, or contact begins;
+    - releasing: it increases by more than that, or contact ends;
+    - slipping: the load decreases by more than the fraction ``LOST`` while the gripper is still;
     - holding in motion: the hand is faster than ``PACE_M_S`` or ``TURNING_RAD_S``;
-    - holding still: all else.
+    - holding still: all other windows.
 
     >>> motion = Motion(*(np.array([value]) for value in (1, 1, 100.0, 99.0, 0.0001, 0.3, 0.0)))
     >>> lighter = motion._replace(load_then=np.array([90.0]))
@@ -74,7 +74,7 @@ def situation_numbers(motion: Motion) -> Int64s:
 
 
 def of_windows(track: Track, now: Int64s, horizon: int) -> Int64s:
-    """Return the situation of the windows of a recording whose last row read is ``now`` (window,)."""
+    """Return the situation of a recording's windows with the last input rows ``now`` (window,)."""
     if not len(now):
         return np.zeros(0, np.int64)
     end, ahead = now + horizon, now[:, None] + np.arange(horizon + 1)
@@ -94,22 +94,22 @@ def of_windows(track: Track, now: Int64s, horizon: int) -> Int64s:
 
 @dataclass
 class BySituation:
-    """Sums of errors by recording, predictor and situation."""
+    """Error sums by recording, predictor and situation."""
 
     horizon: int
     channels: int
-    windows: dict[str, Int64s] = field(default_factory=dict)  # windows by recording, (situation,)
+    windows: dict[str, Int64s] = field(default_factory=dict)  # number of windows by recording, (situation,)
     absolute: dict[tuple[str, str], AnyFloats] = field(
         default_factory=dict
-    )  # (situation, step), by recording, predictor
+    )  # (situation, step), by recording and predictor
 
     def count(self, recording: str, situations: Int64s) -> None:
-        """Count windows of a recording."""
+        """Count a recording's windows by situation."""
         counts = np.bincount(situations, minlength=len(SITUATIONS))
         self.windows[recording] = self.windows.get(recording, np.zeros(len(SITUATIONS), np.int64)) + counts
 
     def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
-        """Add the errors of one predictor on these windows."""
+        """Add one predictor's errors on these windows."""
         before = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
         for situation in np.unique(situations):
             chosen = situations == situation
@@ -118,10 +118,10 @@ class BySituation:
             )
 
     def summary(self) -> dict[str, SituationMeasures]:
-        """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
+        """Return windows, recordings, mean absolute errors by predictor and step, and the model's skill, by situation.
 
-        Skill is 1 - mean absolute error / that of persistence, the geometric mean of the ratios of recordings, by step and
-        over all, with its interval over recordings.
+        Skill is 1 minus the geometric mean over recordings of the mean absolute error relative to persistence's, by
+        step and over all steps, with an interval over recordings.
         """
         return {name: self._measures(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
 

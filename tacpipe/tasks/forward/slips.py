@@ -1,14 +1,14 @@
-"""Measure whether forecasts warn of a slip before it begins, by the load along the skin (shear).
+"""Measure whether forecasts warn of a slip before it begins, from the load along the skin (shear).
 
-An object that is about to slip pulls harder and harder along the skin, until friction gives way and the pull drops. So the
-score of a forecast is how far the shear load of a sensor is predicted to rise from now to a step, plus how far it is
-predicted to fall afterwards, at the step where the sum is largest; as a fraction of the load that presses on that sensor
-now, because friction holds in proportion to it. A forecast of no change has the score 0.
+The shear of an object that is about to slip increases until friction is overcome, and then drops. The score of a
+forecast is therefore the predicted increase of a sensor's shear load from now to a step plus the predicted decrease
+afterwards, at the step at which this sum is largest. It is relative to the load that currently presses on the sensor,
+because friction is proportional to it. A forecast of no change has the score 0.
 
-The shear load of a sensor is the length of the mean of its taxels along the axes x and y, the pressing load the size of
-their mean along z. A sensor that is hardly touched presses with next to nothing: the divisor is at least a floor, which
-`floors` makes of the spread of the same channels in training. Numerator, divisor and floor are of one unit, so that the
-score has none, and sensors of unlike units can be compared.
+The shear load of a sensor is the norm of the mean of its taxels along the axes x and y, and the pressing load is the
+magnitude of their mean along z. The pressing load of a sensor that is hardly touched is close to zero, so the divisor
+has a lower bound, which `floors` computes from the standard deviations of the same channels in training. Numerator,
+divisor and bound have the same unit, so the score has none, and sensors with different units can be compared.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 Layout = Sequence[Mapping[str, str]]
 
 ALONG = ("x", "y")  # axes along the skin
-PRESSING = "z"  # the axis into it
+PRESSING = "z"  # axis normal to the skin
 
 
 def skins(layout: Layout) -> tuple[str, ...]:
-    """Return the streams with channels along the skin, in the order of the channels.
+    """Return the streams that have channels along the skin, in channel order.
 
     >>> skins([{"stream": "left", "axis": "x"}, {"stream": "pad", "axis": "z"}, {"stream": "left", "axis": "z"}])
     ('left',)
@@ -44,7 +44,7 @@ def skins(layout: Layout) -> tuple[str, ...]:
 
 
 def shear(levels: AnyFloats, layout: Layout) -> Floats:
-    """Return the shear load (…, skin) of ``levels`` (…, channel) above rest, of channels that lie so.
+    """Return the shear load (…, skin) of ``levels`` (…, channel) above rest, whose channels have this layout.
 
     >>> layout = [{"stream": "left", "axis": axis} for axis in "xxyz"]
     >>> shear(np.array([[2.0, 4.0, -4.0, 100.0]]), layout).tolist()
@@ -55,15 +55,15 @@ def shear(levels: AnyFloats, layout: Layout) -> Floats:
 
 
 def pressing(levels: AnyFloats, layout: Layout) -> Floats:
-    """Return the load that presses on each skin (…, skin), or 0 if a sensor does not measure it."""
+    """Return the pressing load of each skin (…, skin), or 0 if the sensor does not measure it."""
     loads = [np.abs(_mean(levels, layout, skin, PRESSING)) for skin in skins(layout)]
     return np.stack(loads, axis=-1) if loads else np.zeros((*levels.shape[:-1], 0))
 
 
 def floors(spread: AnyFloats, layout: Layout) -> Floats:
-    """Return the least divisor of each skin (skin,), of the standard deviation of each channel in training (channel,).
+    """Return the minimum divisor of each skin (skin,), from each channel's standard deviation in training (channel,).
 
-    It is the mean deviation of the channels that press; of a sensor without any, of those along the skin.
+    It is the mean standard deviation of the pressing channels, or of the channels along the skin if there are none.
 
     >>> layout = [{"stream": "left", "axis": axis} for axis in "xyzz"]
     >>> floors(np.array([1.0, 3.0, 10.0, 30.0]), layout).tolist(), floors(np.array([1.0, 3.0]), layout[:2]).tolist()
@@ -84,20 +84,20 @@ def floors(spread: AnyFloats, layout: Layout) -> Floats:
 def rise_and_fall(ahead: AnyFloats, now: AnyFloats, layout: Layout, divisors: AnyFloats) -> Floats:
     """Return the score (window,) of forecasts ``ahead`` (window, step, channel) at levels ``now`` (window, channel).
 
-    The largest of all skins counts; ``divisors`` (skin,) is what `floors` gives. NaN if a forecast is not finite, and for
-    channels none of which lies along a skin.
+    The score is the maximum over skins. ``divisors`` (skin,) are the output of `floors`. The score is NaN if a forecast
+    is not finite, or if no channel is along a skin.
     """
     if not skins(layout):
         return np.full(len(now), np.nan)
     predicted, present = shear(ahead, layout), shear(now, layout)[:, None]  # (window, step, skin)
-    lowest = np.minimum.accumulate(predicted[:, ::-1], axis=1)[:, ::-1]  # least of each step and those after it
+    lowest = np.minimum.accumulate(predicted[:, ::-1], axis=1)[:, ::-1]  # minimum of each step and the later ones
     moved = ((predicted - present) + (predicted - lowest)).max(axis=1)
     score: Floats = (moved / np.maximum(pressing(now, layout), divisors)).max(axis=1)
     return np.maximum(score, 0.0)
 
 
 def _mean(levels: Any, layout: Layout, skin: str, axis: str) -> Floats:
-    """Return the mean (…,) of the channels of a skin along an axis, or 0 if it has none."""
+    """Return the mean (…,) of a skin's channels along an axis, or 0 if it has none."""
     chosen = [index for index, channel in enumerate(layout) if _on(channel, skin) and channel.get("axis") == axis]
     if not chosen:
         return np.zeros(levels.shape[:-1])
@@ -109,23 +109,23 @@ def _on(channel: Mapping[str, str], skin: str) -> bool:
     return channel.get("stream", "") == skin
 
 
-GAP_NS = 500_000_000  # least time between two events; an earlier one belongs to the event before
+GAP_NS = 500_000_000  # minimum time between two events; closer events are merged
 
 
 @dataclass(frozen=True)
 class Leads:
-    """The score of an alarm, against labelled events."""
+    """Score of an alarm on labelled events."""
 
-    events: int  # events with an alarm state in all of the time before
+    events: int  # events with an alarm state throughout the time before
     leads_ms: tuple[float, ...]  # time from alarm to event, for events with an alarm
-    false_alarms: int  # alarms that no event followed
-    hours: float  # time with an alarm state and without an event near
+    false_alarms: int  # number of alarms that no event followed
+    hours: float  # time with an alarm state and without a nearby event
 
 
 def events(t_ns: Times, active: Bools) -> Times:
-    """Return when events begin and when they were last there (event, 2), of whether one is there at ``t_ns`` (time,).
+    """Return first and last time of each event (event, 2); ``active`` marks the rows at ``t_ns`` (time,) in an event.
 
-    Those close together are one.
+    Events that are closer than `GAP_NS` are merged.
     """
     starts = np.flatnonzero(active & ~np.concatenate([[False], active[:-1]]))
     ends = np.flatnonzero(active & ~np.concatenate([active[1:], [False]]))
@@ -136,9 +136,10 @@ def events(t_ns: Times, active: Bools) -> Times:
 
 
 def near(t_ns: Times, events: Times, horizon_ns: int) -> Bools:
-    """Return which rows at ``t_ns`` (time,) are near one of the events ``events`` (event, 2): no alarm is false there.
+    """Return which rows at ``t_ns`` (time,) are near an event in ``events`` (event, 2).
 
-    That is from ``horizon_ns`` before it begins until `GAP_NS` after it was last there.
+    Alarms in these rows are not false. A row is near an event from ``horizon_ns`` before its start until
+    `GAP_NS` after its end.
     """
     rows = np.zeros(len(t_ns), dtype=bool)
     for begins_ns, ends_ns in events.tolist():
@@ -147,10 +148,10 @@ def near(t_ns: Times, events: Times, horizon_ns: int) -> Bools:
 
 
 def leads(t_ns: Times, states: Int64s, events: Times, horizon_ns: int, period_ns: int) -> Leads:
-    """Return what an alarm with ``states`` (time,) at ``t_ns`` (time,) was worth for events ``events`` (event, 2).
+    """Score an alarm with ``states`` (time,) at ``t_ns`` (time,) on the events ``events`` (event, 2).
 
-    An alarm leads an event by the time from its first row that is on within ``horizon_ns`` before. A false alarm is one that
-    is not `near` an event; it represents the horizon.
+    An alarm leads an event by the time from its first active row within the preceding ``horizon_ns``. A false alarm is
+    one that is not `near` an event, and it represents the whole horizon.
     """
     led: list[float] = []
     counted = 0
@@ -171,7 +172,7 @@ def leads(t_ns: Times, states: Int64s, events: Times, horizon_ns: int, period_ns
 
 
 class LeadSums(TypedDict):
-    """The score of alarms over several recordings."""
+    """Score of alarms over several recordings."""
 
     events: int
     led: int
@@ -182,7 +183,7 @@ class LeadSums(TypedDict):
 
 
 def summed(parts: Sequence[Leads]) -> LeadSums:
-    """Return what alarms were worth together, or None if there is nothing to divide by.
+    """Return the combined score of alarms; rates and medians without data are None.
 
     >>> both = summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])
     >>> both["events"], both["led"], both["median_lead_ms"], both["false_alarms_per_hour"], both["minutes"]
@@ -200,57 +201,58 @@ def summed(parts: Sequence[Leads]) -> LeadSums:
     }
 
 
-PER_HOUR = 60.0  # false alarms that `evaluate` sets levels for
-PARTS = 5  # parts of the recordings; each has the level that was set on the others
+PER_HOUR = 60.0  # false alarm rate for which `evaluate` sets levels
+PARTS = 5  # number of folds of the recordings; the level of each fold is set on the other folds
 
 
 @dataclass(frozen=True)
 class SlipRows:
-    """The rows of one recording."""
+    """Rows of one recording."""
 
     t_ns: Times  # (time,)
     slips: Bools | None  # (time,)
-    scores: dict[str, Floats] = field(default_factory=dict)  # (time,) by predictor, NaN without a forecast
+    scores: dict[str, Floats] = field(default_factory=dict)  # (time,) by predictor; NaN without a forecast
 
     @property
     def period_ns(self) -> int:
-        """Time from one row to the next, in the median."""
+        """Median time between rows."""
         return int(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 1
 
     def events(self) -> Times:
-        """Return when slips begin and end (event, 2)."""
+        """Return first and last time of each slip (event, 2)."""
         return events(self.t_ns, np.zeros(len(self.t_ns), bool) if self.slips is None else self.slips)
 
 
 class SlipScore(LeadSums):
-    """The score of a slip alarm."""
+    """Score of a slip alarm."""
 
-    recall: float | None  # fraction of the slips that an alarm preceded
+    recall: float | None  # fraction of slips preceded by an alarm
 
 
 @dataclass
 class SlipAlarms:
-    """The slip alarm's scores (`tacpipe.tasks.forward.slips`) of predictors, on recordings one after another."""
+    """Slip scores (`tacpipe.tasks.forward.slips`) of predictors, collected from one recording after another."""
 
     layout: Layout
-    floors: AnyFloats  # (skin,), of the model's training
+    floors: AnyFloats  # (skin,), computed from the model's training
     horizon: int
     recordings: list[SlipRows] = field(default_factory=list)
 
     @classmethod
     def of(cls, forecaster: Forecaster) -> Self:
-        """Return those of a model, without recordings yet."""
+        """Create the slip alarms of a model, without recordings."""
         layout = forecaster.codec.layout
         return cls(layout, floors(forecaster.channel_scale, layout), forecaster.horizon)
 
     def begin(self, track: Track) -> None:
-        """Add the rows of a recording, without predictions yet."""
+        """Add a recording's rows, without predictions."""
         self.recordings.append(SlipRows(track.t_ns, track.slips))
 
     def add_one(self, name: str, now: Int64s, present: AnyFloats, counts: AnyFloats) -> None:
-        """Add what one predictor gives, ``counts`` (window, step, channel), for windows whose last rows are ``now``.
+        """Add one predictor's forecasts ``counts`` (window, step, channel) for windows with the last rows ``now``.
 
-        They are of the recording that was begun last; ``present`` (window, channel) is what it has in these rows.
+        The windows are in the recording started last; ``present`` (window, channel) contains its levels in the rows
+        ``now``.
         """
         if name in WATCHED:
             last = self.recordings[-1]
@@ -258,10 +260,10 @@ class SlipAlarms:
             scores[now] = rise_and_fall(counts, present, self.layout, self.floors)
 
     def level(self, name: str, per_hour: float, selected: Sequence[int] | None = None) -> float:
-        """Return the level of a predictor's score for so many false alarms an hour, set on all or some recordings.
+        """Return a predictor's alarm level for this rate of false alarms, set on all or the selected recordings.
 
-        An alarm is false where it is not near a slip. Of a recording that does not state where it slips every alarm
-        counts as false. Infinite where there is no forecast.
+        An alarm is false if it is not near a slip. Every alarm in a recording without slip labels counts as false. The
+        level is infinite if there are no forecasts.
         """
         chosen = [self.recordings[place] for place in (range(len(self.recordings)) if selected is None else selected)]
         chosen = [recording for recording in chosen if name in recording.scores]
@@ -278,10 +280,11 @@ class SlipAlarms:
         )
 
     def scored(self, per_hour: float = PER_HOUR) -> dict[str, SlipScore]:
-        """Return by predictor what its alarm is worth on the recordings that state where they slip.
+        """Score each predictor's alarm on the recordings with slip labels.
 
-        Levels are set for ``per_hour`` false alarms: for each fifth of the recordings on the others, so that no recording
-        sets its own. Nothing if fewer than two recordings state it, or none slips.
+        Levels are set for ``per_hour`` false alarms. The level of each fifth of the recordings is set on the others, so
+        that no recording sets its own. Returns an empty dict if fewer than two recordings have labels, or none has a
+        slip.
         """
         labelled = [place for place, recording in enumerate(self.recordings) if recording.slips is not None]
         if len(labelled) < 2 or not any(

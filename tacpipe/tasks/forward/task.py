@@ -1,4 +1,4 @@
-"""Define the task ``forward``: which tactile signals follow from the planned motion."""
+"""Define the task ``forward``, which predicts tactile signals from the planned motion."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class ForwardTask(Task):
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 
-        It reads past tactile signals, past motion and the planned motion. ``--init`` gives a model to begin
-        with, including its weights and scalings.
+        It reads past tactile signals, past motion and the planned motion. ``--init`` starts from an existing model,
+        including its weights and scales.
 
         Example: tacpipe train forward data/segments --split data/split -o models/forward
         """
@@ -43,26 +43,26 @@ class ForwardTask(Task):
         return Result(files=files, notes=training.notes(params, files))
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
-        """Return the errors of forecasts next to those of the baselines; raises as `tacpipe.tasks.forward.evaluation`."""
+        """Return the errors of the forecasts and of the baselines; raises as `tacpipe.tasks.forward.evaluation`."""
         from tacpipe.tasks.forward import evaluation
 
         return evaluation.evaluate(model.files, recordings)
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return a table of forecasts for each recording; raises as `tacpipe.tasks.forward.prediction`."""
+        """Return each recording's table of forecasts; raises as `tacpipe.tasks.forward.prediction`."""
         from tacpipe.tasks.forward import prediction
 
         return prediction.predict(model.files, recordings, request.steps, request.quantiles)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> ForwardModel:
-        """Return the model among ``files``, trained behind the stages of ``chain``."""
+        """Load the model in ``files``, which was trained after the stages of ``chain``."""
         from tacpipe.tasks.forward.prediction import ForwardModel
 
         return ForwardModel.load(files, chain)
 
     @property
     def short_names(self) -> Mapping[str, str]:
-        """The first words of parts."""
+        """First words of metric parts."""
         return {"known objects": "known", "unseen objects": "unseen"}
 
     @property
@@ -87,7 +87,7 @@ class ForwardTask(Task):
         return ForwardReport(self.name)
 
     def demo(self, output: Path) -> Demo:
-        """Return the chain on simulated recordings, for the default model and that of the paper."""
+        """Return the demo on simulated recordings, with the default model and the paper's."""
         return demo(output)
 
 
@@ -95,7 +95,7 @@ TRIALS = 30
 
 
 def demo(output: Path) -> Demo:
-    """Return the commands from the simulation to the results, which write below ``output``."""
+    """Return the demo's commands from simulation to results, which write to ``output``."""
     names = ("recordings", "synced", "segments", "split", "latents", "model", "results", "paper-model", "paper-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["split"]]
@@ -113,7 +113,7 @@ def demo(output: Path) -> Demo:
 
 
 def chain(output: Path) -> list[list[str]]:
-    """Return the commands from the folder ``recordings`` below ``output`` to the results of the default model."""
+    """Return the commands from the folder ``recordings`` in ``output`` to the results of the default model."""
     place = {name: str(output / name) for name in ("recordings", "synced", "segments", "split", "model", "results")}
     split = ["--split", place["split"]]
     return [

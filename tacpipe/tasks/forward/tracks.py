@@ -1,4 +1,4 @@
-"""One recording as a forecaster reads it: latents, motion of the arm and raw channels side by side, and its windows."""
+"""Read a recording for a forecaster: latents, arm motion and raw channels by row, and the windows."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.io.spill import MappedArrays
 
-BLOCK_ROWS = 1 << 14  # looked at at once
-_EXACT_BITS = 16  # bits of an integer that float32 holds exactly
+BLOCK_ROWS = 1 << 14  # rows per block
+_EXACT_BITS = 16  # bits of an integer that float32 represents exactly
 
 
 class Levels:
-    """Levels above rest (time, channel), of which rows are computed when they are indexed, as of an array.
+    """Levels above rest (time, channel), an array whose rows are computed when they are indexed.
 
-    An hour at 50 Hz is half as large as an array of float64. What is returned has the values of
+    An hour at 50 Hz takes half the memory of a float64 array. Indexing returns the values of
     ``(stored.astype(float64) - rest).astype(dtype)``.
     """
 
     def __init__(self, stored: AnyFloats, rest_counts: AnyFloats, dtype: type[np.floating[Any]] = np.float64) -> None:
-        self.stored = stored  # (time, channel), in the precision in which the recording has it
+        self.stored = stored  # (time, channel), in the recording's precision
         self.rest_counts = rest_counts  # (channel,)
         self.dtype = dtype
 
@@ -52,7 +52,7 @@ class Levels:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Rows and channels."""
+        """Numbers of rows and channels."""
         return self.stored.shape
 
     def __getitem__(self, at: Any) -> AnyFloats:
@@ -69,15 +69,15 @@ class Levels:
         return Levels(self.stored, self.rest_counts, dtype)
 
     def between(self, first: int, last: int) -> Levels:
-        """Return the levels of the rows from ``first`` to before ``last``."""
+        """Return the levels of the rows from ``first`` to ``last``, exclusive."""
         return Levels(self.stored[first:last], self.rest_counts, self.dtype)
 
     def put_aside(self, mapped: MappedArrays) -> Levels:
-        """Return the same levels, whose rows lie in ``mapped``."""
+        """Return the same levels with their rows stored in ``mapped``."""
         return Levels(mapped.kept(self.stored), self.rest_counts, self.dtype)
 
     def finite(self) -> Bools:
-        """Return for each row (time,) whether all its levels are finite."""
+        """Return which rows (time,) contain only finite levels."""
         finite = np.ones(len(self), dtype=bool)
         for first in range(0, len(self), BLOCK_ROWS):
             block = slice(first, first + BLOCK_ROWS)
@@ -86,7 +86,7 @@ class Levels:
 
 
 def above_rest(table: pa.Table | Columns, channels: Sequence[str]) -> Levels:
-    """Return the levels of the channels above rest. Raises `TacpipeError` if one has no rest level."""
+    """Return the channels' levels above rest. Raises `TacpipeError` if a channel has no rest level."""
     rest_counts = tactile.rest_counts(table.schema, channels)
     narrow = all(_is_narrow(table.schema.field(name).type) for name in channels)
     stored = np.empty((table.num_rows, len(channels)), np.float32 if narrow else np.float64)
@@ -96,19 +96,19 @@ def above_rest(table: pa.Table | Columns, channels: Sequence[str]) -> Levels:
 
 
 def _is_narrow(kind: pa.DataType) -> bool:
-    """Return whether float32 holds every value of a column's type."""
+    """Return whether float32 represents every value of a column's type."""
     import pyarrow as pa
 
     small = pa.types.is_integer(kind) and kind.bit_width <= _EXACT_BITS
     return bool(small or pa.types.is_float32(kind) or pa.types.is_float16(kind))
 
 
-# a label, of `segment slips` or of a person; that of a stream of labels, as a published set has it; the simulator's truth
+# label from `segment slips` or a person; label stream of a published dataset; ground truth of the simulator
 COLUMNS = ("slip", "slip_slip", "gt_slip")
 
 
 def slips_of(table: pa.Table | Columns) -> Bools | None:
-    """Return where the object slips (time,), by label or the simulator's truth, or None if nothing states that."""
+    """Return when the object slips (time,), from a label or the simulator's ground truth; None if there is neither."""
     for name in COLUMNS:
         if name in table.column_names:
             return np.asarray(table.column(name).to_numpy()) > 0
@@ -119,39 +119,39 @@ POSE = poses.NAMED.columns
 VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
 ARM = POSE + VELOCITY + TURNING
-TURNED = slice(3, 7)  # columns of ``ARM`` with the quaternion
-POSED = len(POSE)  # columns of ``ARM`` that are the pose; velocities follow
+TURNED = slice(3, 7)  # quaternion columns of ``ARM``
+POSED = len(POSE)  # number of pose columns of ``ARM``, which velocities follow
 FINGER = "robot_finger_m"
 JOINTS = 7
-BY_POSES = "differences of poses"  # source of a plan's velocities, as models state it
-TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
+BY_POSES = "differences of poses"  # source of a plan's velocities, as written in models
+TRUTH = "gt_"  # prefix of the simulator's ground truth, which no model may read
 
 
 @dataclass(frozen=True)
 class Track:
-    """The rows of one recording; tactile channels in counts above rest, latents in the codec's unit."""
+    """Rows of one recording; tactile channels are in counts above rest, latents in the codec's unit."""
 
     name: str
     t_ns: Times  # (time,)
-    contact: Int64s  # (time,), below 0 where nothing is touched
-    groups: Int64s  # (time,), equal where rows follow one another without a gap
+    contact: Int64s  # (time,), negative without contact
+    groups: Int64s  # (time,), equal for consecutive rows without a gap
     usable: Bools  # (time,)
     latent: AnyFloats | Levels  # (time, latent), float32
     arm: AnyFloats  # (time, 13): `ARM`
-    finger: AnyFloats  # (time,), m, or 0 if it is not recorded
+    finger: AnyFloats  # (time,), m; 0 if it is not recorded
     tactile: AnyFloats | Levels  # (time, channel), float64
-    timeline: str = "uniform"  # the grid: uniform, logged or fresh
-    object: str | None = None  # the grasped object, where a label names it
-    slips: Bools | None = None  # (time,), where it slips, if that is known; for evaluation alone
-    # (time, 6), velocities that a plan of these poses has, or None if they are those of ``arm``
+    timeline: str = "uniform"  # grid: uniform, logged or fresh
+    object: str | None = None  # grasped object, if it is labelled
+    slips: Bools | None = None  # (time,), rows in which the object slips, if known; only for evaluation
+    # (time, 6), velocities of a plan with these poses; None: the velocities in ``arm``
     plan_velocity: AnyFloats | None = None
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
-        """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
+        """Return the first row of each window of ``context + horizon`` rows (window,)."""
         return window_starts(self.groups, self.usable, context, horizon, stride)
 
     def between(self, first: int, last: int) -> Track:
-        """Return the rows from ``first`` to before ``last``."""
+        """Return the rows from ``first`` to ``last``, exclusive."""
 
         def part_of(values: AnyFloats | Levels) -> AnyFloats | Levels:
             return values.between(first, last) if isinstance(values, Levels) else values[first:last]
@@ -165,7 +165,7 @@ class Track:
         return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **cut)
 
     def put_aside(self, mapped: MappedArrays) -> Track:
-        """Return the same track, whose rows lie in ``mapped``."""
+        """Return the same track with its rows stored in ``mapped``."""
         tactile = self.tactile.put_aside(mapped) if isinstance(self.tactile, Levels) else mapped.kept(self.tactile)
         latent: AnyFloats | Levels
         if not isinstance(self.latent, Levels):
@@ -182,23 +182,23 @@ class Track:
         return replace(self, tactile=tactile, latent=latent, **arrays)
 
     def planned(self, rows: Int64s) -> AnyFloats:
-        """Return the arm as a plan of its poses has it at ``rows`` (…), (…, 13): velocities are `plan_velocity`."""
+        """Return the arm at ``rows`` (…) as a plan contains it, (…, 13), with velocities from `plan_velocity`."""
         arm = self.arm[rows]
         if self.plan_velocity is not None:
             arm[..., POSED:] = self.plan_velocity[rows]
         return arm
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
-        """Return the first rows of the windows that lie within one contact (window,)."""
+        """Return the first row of each window within a single contact (window,)."""
         same = np.concatenate([[0], np.cumsum(np.diff(self.contact) != 0)])[: len(self.contact)]
         groups = self.groups * (int(same.max(initial=0)) + 1) + same
         return window_starts(groups, self.usable & (self.contact >= 0), context, horizon, stride)
 
 
 def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -> TacpipeError:
-    """Return the error for recordings without a window; where gaps may be the cause, it names them.
+    """Return the error for recordings without a window, which names gaps that may be the cause.
 
-    ``beginning`` are its first words, such as ``The training recordings hold``.
+    ``beginning`` is the start of the message, such as ``The training recordings hold``.
     """
     gaps = streams.describe_gaps(*(recording.columns() for recording in recordings.recordings.values()))
     advice = gaps or ["Give more or longer recordings, or shorten context and horizon."]
@@ -206,10 +206,9 @@ def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -
 
 
 def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
-    """Return the codec among a dataset's files, or the one that leaves channels as they are where there is none.
+    """Return the codec in a dataset's files, or the identity codec if there is none.
 
-    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` if table and files do not belong
-    together.
+    ``name`` is the name of the recording with this ``table``. Raises `TacpipeError` if table and files do not match.
     """
     latents = tactile.columns(table.schema, "latent")
     if codecs.DESCRIPTION in files:
@@ -234,7 +233,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> cod
 def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
     """Return the named columns as float64, shape (time, column).
 
-    Raises `TacpipeError` for a column that is absent, and for the simulator's ground truth.
+    Raises `TacpipeError` if a column is absent or belongs to the simulator's ground truth.
     """
     for name in names:
         if name.startswith(TRUTH):
@@ -249,10 +248,10 @@ def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
 
 
 def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
-    """Return the columns of the arm whose motion a model reads; of no arm where it needs none and there is none.
+    """Return the arm columns that a model reads as motion, or an empty pose if there is no arm and none is needed.
 
-    ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is
-    no arm to plan with, and what `tacpipe.channels.arm.pose` raises.
+    ``actions`` and ``arm`` are the params with these names. Raises `TacpipeError` with the recording's name if a plan
+    is needed and there is no arm, and the errors of `tacpipe.channels.arm.pose`.
     """
     schema = shard.columns().schema
     try:
@@ -267,11 +266,11 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
 
 
 def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Track:
-    """Return the track of a recording; its latents are those stored, or its channels where ``codec`` is raw.
+    """Return a recording's track, with its stored latents, or its channels if ``codec`` is raw.
 
-    ``pose`` names the columns of its arm; without them it rests where it is, and without a quaternion it never turns.
-    Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
-    recording where a column is absent or its channels are not the codec's.
+    ``pose`` contains the names of the arm's columns. Without a position the arm does not move, and without a quaternion
+    it does not turn. Rows with a value that is not finite or in a gap of any stream are unusable. Raises `TacpipeError`
+    with the recording's name if a column is absent or its channels are not the codec's.
     """
     table = shard.columns()
     try:
@@ -317,7 +316,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
 
 
 def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
-    """Return where the arm is (time, 3), m; the origin without an arm."""
+    """Return the arm's position (time, 3) in m, or the origin without an arm."""
     if not pose.position:
         return np.zeros((table.num_rows, 3))
     position = inputs(table, pose.position)
@@ -326,9 +325,9 @@ def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
 
 
 def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
-    """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN.
+    """Return unit quaternions (time, 4) with continuous signs; those that cannot be normalised become NaN.
 
-    Without a quaternion the arm is not turned.
+    Without a quaternion column, returns the identity.
     """
     if not pose.orientation:
         return np.tile([0.0, 0.0, 0.0, 1.0], (table.num_rows, 1))
@@ -337,7 +336,7 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
 
 
 def _opening(table: pa.Table | Columns) -> AnyFloats:
-    """Return the width between the fingers (time,), m, or 0 if none is recorded, or several."""
+    """Return the width between the fingers (time,) in m, or 0 if no width or more than one is recorded."""
     column = opening(table.schema)
     if not column:
         return np.zeros(table.num_rows)
@@ -347,13 +346,13 @@ def _opening(table: pa.Table | Columns) -> AnyFloats:
 
 
 def opening(schema: pa.Schema) -> str:
-    """Return the column of the width between the fingers; the empty text where there is none, or several."""
+    """Return the column of the width between the fingers, or an empty string if there is none or more than one."""
     columns = (FINGER,) if FINGER in schema.names else tactile.columns(schema, poses.WIDTH)
     return columns[0] if len(columns) == 1 else ""
 
 
 def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats) -> AnyFloats | None:
-    """Return the hand's linear and angular velocity (time, 6) from its joints, or None if they are not a known arm's."""
+    """Return the hand's linear and angular velocity (time, 6) from its joints, or None if the arm's model is unknown."""
     names, speeds = joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
@@ -363,7 +362,7 @@ def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats
 
 
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the columns of the angles and speeds of the arm's joints, or empty if it has none."""
+    """Return the columns of the arm's joint angles and joint speeds, or empty tuples if it has none."""
     if pose == poses.NAMED:
         numbers = range(1, JOINTS + 1)
         names = tuple(f"robot_joint{n}_rad" for n in numbers), tuple(f"robot_joint{n}_velocity_rad_s" for n in numbers)
@@ -383,37 +382,37 @@ def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, .
 
 
 def whole_numbers(table: pa.Table | Columns, name: str) -> Int64s:
-    """Return an integer column, shape (time,). Raises `TacpipeError` if it is absent."""
+    """Return an integer column (time,). Raises `TacpipeError` if it is absent."""
     if name not in table.column_names:
         raise TacpipeError(f"There is no column {name}. Run `tacpipe segment contacts` on the synchronized recordings.")
     return np.asarray(table.column(name).to_numpy(), dtype=np.int64)
 
 
 def aligned(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
-    """Return the arm's rows (time, 13) with the quaternions' common sign nearest to that of ``reference`` (4,).
+    """Return the arm's rows (time, 13) with the common sign of quaternions that is nearest to ``reference`` (4,).
 
-    A quaternion and its negative are the same rotation. Within a recording the sign is continuous already; between
-    recordings it is a matter of chance, and a model would take it for another pose.
+    A quaternion and its negative are the same rotation. The sign is continuous within a recording, but arbitrary
+    between recordings, and a model would interpret it as a different pose.
     """
     return negated(arm) if is_opposite(arm, reference) else arm
 
 
 def is_opposite(arm: AnyFloats, reference: AnyFloats) -> bool:
-    """Return whether the first finite one of the arm's rows (time, 13) has a quaternion nearer to minus ``reference``."""
+    """Return whether the first finite quaternion in the arm's rows (time, 13) is nearer to minus ``reference``."""
     finite = arm[np.isfinite(arm).all(axis=1), TURNED]
     return bool(len(finite) and finite[0] @ reference < 0)
 
 
 def negated(arm: AnyFloats) -> AnyFloats:
-    """Return the arm's rows (time, 13) with the quaternions' other sign."""
+    """Return the arm's rows (time, 13) with negated quaternions."""
     return np.hstack([arm[:, : TURNED.start], -arm[:, TURNED], arm[:, TURNED.stop :]])
 
 
 def rate_hz(tracks: Sequence[Track]) -> float:
-    """Return the median rate of the tracks' grids in Hz, or 0 if none has two rows.
+    """Return the median rate of the tracks' grids in Hz, or 0 if no track has two rows.
 
-    On rows as logged or fresh a step is a row, however long it takes; so rates may differ there. Else raises
-    `TacpipeError` if they do by more than 1 %, and where the tracks are not of one timeline.
+    A step on logged or fresh timelines is a row of any duration, so rates may differ there. Raises `TacpipeError` if
+    the tracks' timelines differ, or if rates on a uniform timeline differ by more than 1 %.
     """
     if len({track.timeline for track in tracks}) > 1:
         names_by_timeline = {track.timeline: track.name for track in tracks}

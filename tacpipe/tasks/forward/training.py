@@ -1,4 +1,4 @@
-"""Train a forecaster: from recordings and params to the files of a model."""
+"""Train a forecaster from recordings and params, and write the files of its model."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ if TYPE_CHECKING:
 
 
 HISTORY = "history.jsonl"
-CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they overlap, so hardly a row is left out
-BLOCK_ROWS = 1 << 14  # rows that are read at once
-IN_MEMORY = 1 << 27  # bytes of rows of recordings, before they lie on disk
-LINEAR = 20_000  # windows that the linear baselines are fitted on
-SHRINKING = 3000  # validation windows that the weights of the forecast are fitted on at most, evenly spread
+CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost no row is left out
+BLOCK_ROWS = 1 << 14  # rows per block
+IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk
+LINEAR = 20_000  # windows for fitting the linear baselines
+SHRINKING = 3000  # maximum number of evenly spaced validation windows for fitting the weights of the forecast
 
 
 def train(
@@ -77,12 +77,11 @@ def train(
     workspace: Path,
     init: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
+    """Return the files of a model trained on ``training``, with early stopping by its error on ``validation``.
 
-    Scales and baselines are fitted on the training recordings alone,
-    or scales taken over from the model ``init`` with its weights. The files name what ``auto`` became.
-    Raises `TacpipeError` if recordings lack columns or windows or hold what the architecture cannot read, and where
-    ``init`` has another shape or codec.
+    Scales and baselines are fitted only on the training recordings, unless scales and weights are taken from the model
+    ``init``. The files contain the values that replaced ``auto``. Raises `TacpipeError` if recordings lack columns or
+    windows or contain data that the architecture cannot read, and if ``init`` has another shape or codec.
     """
     if not training.recordings:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
@@ -162,7 +161,7 @@ def train(
 def _built(
     params: Params, codec: codecs.Codec, training_rows: Rows, start: Forecaster | None, device: str
 ) -> nn.Module:
-    """Return the network as training begins: with the scales of some training windows, or with all of ``start``."""
+    """Return the initial network, with scales fitted on some training windows, or with scales and weights of ``start``."""
     model = networks.build(params, codec).to(device)
     if len(training_rows.starts):
         sample = training_rows.pick(training_rows.evenly_spread(CALIBRATED))
@@ -176,7 +175,7 @@ def _built(
 
 @torch.no_grad()
 def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, watched: Rows) -> dict[str, Tensor]:
-    """Return the weight of the forecast at each step, fitted on validation windows; nothing for a forecast of levels."""
+    """Return each step's weight of the forecast, fitted on validation windows; empty for a forecast of levels."""
     model = networks.build(params, codec).eval()
     if not model.change_only:
         return {}
@@ -191,7 +190,7 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
 
 
 def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> ModelInputs:
-    """Return the columns that a model reads, as its configuration holds them."""
+    """Return the columns that a model reads, for its configuration."""
     inputs: ModelInputs = {
         "tactile": list(codec.channels),
         "layout": [dict(channel) for channel in codec.layout],
@@ -206,7 +205,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
 
 
 def _look_ahead(training: Dataset) -> LookAhead | None:
-    """Return how far the rows of the training recordings look ahead, or None if no recording states it."""
+    """Return how far rows of the training recordings look ahead, or None if no recording contains this information."""
     look_ahead = [
         (
             float(recording.attributes[streams.LOOK_AHEAD_MEAN] or 0),
@@ -222,7 +221,7 @@ def _look_ahead(training: Dataset) -> LookAhead | None:
 
 
 def _gap_ms(training: Dataset) -> dict[str, float]:
-    """Return the longest time without a gap by stream, the median over the recordings that state one."""
+    """Return the maximum time between samples without a gap by stream, as the median over recordings that contain it."""
     values: dict[str, list[float]] = {}
     for recording in training.recordings.values():
         for name, value in recording.attributes.items():
@@ -232,7 +231,7 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
 
 
 def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> AlarmLevels:
-    """Return the levels of alarms, set on the validation recordings."""
+    """Return the alarm levels, set on the validation recordings."""
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
         loads.begin(track)
@@ -243,7 +242,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> AlarmLevels:
 
 
 def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:
-    """Refuse latents that another codec made than the model's."""
+    """Raise an error if the recordings' latents come from another codec than the model's."""
     if codecs.TENSORS in model and codecs.TENSORS in recordings and model[codecs.TENSORS] != recordings[codecs.TENSORS]:
         kind = json.loads(model[codecs.DESCRIPTION])["kind"]
         raise TacpipeError(
@@ -253,13 +252,13 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
 
 
 def _aligned(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
-    """Return a track whose quaternions have the sign of ``reference``; where they had the other one, in ``mapped``."""
+    """Return a track whose quaternions have the sign of ``reference``; negated ones are stored in ``mapped``."""
     arm = tracks.aligned(track.arm, reference)
     return track if arm is track.arm else dataclasses.replace(track, arm=mapped.kept(arm))
 
 
 def _windows(part: Sequence[Track], params: Params, stride: int, device: str, mapped: MappedArrays) -> Rows:
-    """Return the rows of a part and its windows, all or those in contact."""
+    """Return the rows of a set of tracks and its windows, either all or those in contact."""
     context, horizon = params.context, params.horizon
     starts = [
         (track.starts if params.windows == "all" else track.contact_starts)(context, horizon, stride) for track in part
@@ -277,7 +276,7 @@ def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
 
 
 def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
-    """Refuse training recordings in which no channel ever moves: there is nothing to predict."""
+    """Raise an error if no channel of the training recordings ever changes, because there is nothing to predict."""
     if any(track.usable.any() for track in part) and all(not track.tactile[track.usable].any() for track in part):
         raise TacpipeError(
             f"None of the {len(codec.channels)} tactile channels ever moves in {len(part)} training recordings. "
@@ -286,10 +285,10 @@ def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
 
 
 def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
-    """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
+    """Return half of each feature's range and each channel's standard deviation over usable training rows."""
     ranges = [scaling.fit(track.latent[usable]) for track, usable in _usable(part, mapped)]
     if not ranges:
-        scaling.fit(part[0].latent[:0])  # states what to do
+        scaling.fit(part[0].latent[:0])  # raises an error that explains what to do
     total: AnyFloats = np.zeros(0)
     count = 0
     for track, usable in _usable(part, mapped):
@@ -307,7 +306,7 @@ def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
 
 
 def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track, Int64s]]:
-    """Yield each recording with its usable rows, some at a time."""
+    """Yield each recording with its usable rows, in batches."""
     for track in part:
         rows = np.flatnonzero(track.usable)
         for first in range(0, len(rows), BLOCK_ROWS):
@@ -316,13 +315,13 @@ def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track
 
 
 def _summed(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
-    """Return the sum of rows (row, channel) and of those before them (channel,), to the bit as numpy adds all at once."""
+    """Return ``total`` (channel,) plus rows (row, channel), bit-identical to a single numpy sum."""
     sums: AnyFloats = np.add.reduce(np.concatenate([total[None], rows]) if total.size else rows, axis=0)
     return sums
 
 
 def _described(codec: codecs.Codec) -> CodecDescription:
-    """Return what a model's configuration holds of its codec, and a short name for it."""
+    """Return a codec's description for a model's configuration, including a short name."""
     frames, latents = int(getattr(codec, "frames", 1)), len(codec.latents)
     name = {"raw": "raw", "pca": f"PCA-{latents}", "autoencoder": f"AE-C{frames}-{latents}"}.get(codec.kind, codec.kind)
     if codec.representation != "levels":
@@ -331,7 +330,7 @@ def _described(codec: codecs.Codec) -> CodecDescription:
 
 
 def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
-    """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
+    """Return the first usable quaternion of the training recordings (4,), the reference for the signs of all others."""
     return next((rows[0].astype(np.float64) for rows in quaternions if len(rows)), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
@@ -342,7 +341,7 @@ def _check_start(
     codec: codecs.Codec,
     recordings: Mapping[str, bytes],
 ) -> None:
-    """Raise `TacpipeError` if the model to begin with does not fit what is to be trained."""
+    """Raise `TacpipeError` if the initial model does not fit the params or recordings."""
     for name in ("architecture", "members", "hidden", "context", "horizon"):
         started_with, requested = getattr(start.params, name), getattr(params, name)
         if started_with != requested:
@@ -361,7 +360,7 @@ def _check_start(
 
 
 def _take_over(model: nn.Module, start: Forecaster) -> None:
-    """Give a network the weights of the model to begin with. Raises `TacpipeError` if they are of other shapes."""
+    """Copy the initial model's weights into a network. Raises `TacpipeError` if their shapes differ."""
     network = start.model.network if isinstance(start.model, Shrunk) else start.model
     shapes, expected = (
         {name: tuple(weight.shape) for name, weight in module.state_dict().items()} for module in (network, model)
@@ -376,7 +375,7 @@ def _take_over(model: nn.Module, start: Forecaster) -> None:
 
 
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
-    """Return notes on a trained model, from its ``files``: look-ahead, and an architecture that is not the best."""
+    """Return notes on a trained model from its ``files``: its look-ahead, and whether another architecture is better."""
     config = json.loads(files[CONFIG])
     rows = look_ahead_notes(config)
     raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
@@ -396,7 +395,7 @@ def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
 
 
 def _check_pose(start: Forecaster, pose: Pose) -> None:
-    """Raise `TacpipeError` if the model to begin with reads another arm than the recordings have."""
+    """Raise `TacpipeError` if the initial model reads another arm than the recordings contain."""
     if start.pose != pose:
         read, recorded = (", ".join(pose_read.columns) or "no arm" for pose_read in (start.pose, pose))
         raise TacpipeError(
