@@ -155,7 +155,7 @@ def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: W
 
 @stage(version=1, fit=fit_autoencoder)
 def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fitted) -> RecordingOutput:
-    """Encode frames by a small autoencoder of the training recordings.
+    """Encode frames with a small convolutional autoencoder.
 
     Each stream of frames becomes a stream of features with a row per frame. The network is trained on frames of the
     training recordings, of which 15 % are held out to stop the training. Streams without frames stay as they are.
