@@ -55,7 +55,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
         rounds,
     )
     lines = [
-        timing.at_most("tacpipe --help", times, "help", "bare typer program", 1.4),
+        timing.at_most("tacpipe --help", times, "help", "bare typer program", 1.0),
         timing.at_most("tacpipe --help", times, "help", "the same with rich help"),
     ]
     place = project(folder)
@@ -68,7 +68,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
             max(5, rounds // 2),
         )
         name = " ".join(word for word in command.split()[:3] if "/" not in word)
-        lines.append(timing.at_most(f"{name}, at a hit", times, "hit", "bare typer program", 2.0))
+        lines.append(timing.at_most(f"{name}, at a hit", times, "hit", "bare typer program", 1.3))
     hit, bare = (timing.cost(command, place) for command in (COMMANDS[1].split(), [timing.PYTHON, BARE]))
     lines.append(timing.memory_line("peak of memory of a hit", hit, "bare typer program", bare))
     return [*lines, *_unchanged_chain(place, rounds)]

@@ -49,7 +49,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
         },
         rounds,
     )
-    hit = timing.at_most(f"a hit at {TRIALS:,} shards", times, "hit", "bare typer program", 2.0)
+    hit = timing.at_most(f"a hit at {TRIALS:,} shards", times, "hit", "bare typer program", 1.3)
     return [hit, *_looks(tacpipe, max(3, rounds // 4)), _overhead(project, plugin, max(3, rounds // 5))]
 
 
@@ -89,6 +89,6 @@ def _overhead(project: Path, plugin: Path, rounds: int) -> timing.Line:
         f"{extra:.2f} ms",
         f"a loop that reads, calls and writes: {timing.median(times, 'plain') / TRIALS * 1000:.2f} ms a shard",
         f"{timing.ratio(times, 'stage', 'plain'):.2f}",
-        "below 5 ms",
-        extra < 5.0,
+        "below 1.5 ms",
+        extra < 1.5,
     )
