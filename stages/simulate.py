@@ -171,7 +171,7 @@ class GelParams:
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
     grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
-    frame_rate_hz: PositiveInt = 25  # frames per second of each camera
+    frame_rate_hz: Annotated[PositiveInt, Unit("Hz")] = 25  # frames per second of each camera
     drop_probability: Fraction = 0.002  # fraction of frames that are lost
     noise_scale: NonNegativeFloat = 1.0  # times the noise of the cameras
     # mean and standard deviation of a frame's latency

@@ -318,9 +318,8 @@ class V4l2Link(Descriptor):
     def _entry(self, filled: tuple[Any, ...]) -> tuple[int, bytes]:
         """Return the frame of a buffer with its stamp."""
         index, _, size, flags, _, seconds, microseconds, _, number, *_ = filled
-        t_us = seconds * 1_000_000 + microseconds
-        if flags & STAMP_KIND != MONOTONIC:
-            t_us = time.monotonic_ns() // 1000
+        now_us = time.monotonic_ns() // 1000
+        t_us = min(seconds * 1_000_000 + microseconds, now_us) if flags & STAMP_KIND == MONOTONIC else now_us
         t_ns = max(t_us * 1000, self._last_ns + 1000)
         self._last_ns = t_ns
         content = self._memory[index][:size]
