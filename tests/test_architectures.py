@@ -315,15 +315,15 @@ def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_byt
     params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
     fitted, refitted = (estimators.FittedEstimator.fit(params, frames, materials) for _ in range(2))
-    content = estimators.packed({"biotac": fitted}, params)
-    assert content == estimators.packed({"biotac": refitted}, params)
+    content = estimators.pack_estimators({"biotac": fitted}, params)
+    assert content == estimators.pack_estimators({"biotac": refitted}, params)
     assert b"pickle" not in content
-    read = estimators.unpacked(content, "model.skops", params)["biotac"]
+    read = estimators.unpack_estimators(content, "model.skops", params)["biotac"]
     assert np.array_equal(read.scores(slides(1)[0]), fitted.scores(slides(1)[0]))
     assert read.classes == (0, 1, 2)
     assert (fitted.scores(frames).argmax(axis=1) == materials).mean() > 0.8
     with pytest.raises(TacpipeError, match=r"model\.skops is not a file of skops"):
-        estimators.unpacked(content[:-30], "model.skops", params)
+        estimators.unpack_estimators(content[:-30], "model.skops", params)
 
 
 def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_packages_run_nothing(
@@ -333,13 +333,13 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
 
     params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
-    content = estimators.packed({"biotac": estimators.FittedEstimator.fit(params, frames, materials)}, params)
+    content = estimators.pack_estimators({"biotac": estimators.FittedEstimator.fit(params, frames, materials)}, params)
     rng = np.random.default_rng(0)
     for _ in range(40):
         changed = bytearray(content)
         changed[rng.integers(len(changed))] ^= int(rng.integers(1, 256))
         try:
-            estimators.unpacked(bytes(changed), "model.skops", params)
+            estimators.unpack_estimators(bytes(changed), "model.skops", params)
         except TacpipeError as error:
             assert "model.skops" in str(error)
     with zipfile.ZipFile(io.BytesIO(content)) as file:
@@ -351,7 +351,7 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
             for member, data in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
                 file.writestr(member, data)
         with pytest.raises(TacpipeError, match=rf"holds {module}\.{name}"):
-            estimators.unpacked(archive.getvalue(), "model.skops", params)
+            estimators.unpack_estimators(archive.getvalue(), "model.skops", params)
 
 
 def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:
@@ -361,13 +361,14 @@ def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts
     forest, trusting = (build_train_params("material", architecture=name) for name in ("forest", "trusting"))
     fitted = {"biotac": estimators.FittedEstimator.fit(forest, frames, materials)}
     with pytest.raises(TacpipeError, match=r"sklearn\.tree\._tree\.Tree"):
-        estimators.packed(fitted, forest)
-    content = estimators.packed(fitted, trusting)
+        estimators.pack_estimators(fitted, forest)
+    content = estimators.pack_estimators(fitted, trusting)
     assert np.array_equal(
-        estimators.unpacked(content, "model.skops", trusting)["biotac"].scores(frames), fitted["biotac"].scores(frames)
+        estimators.unpack_estimators(content, "model.skops", trusting)["biotac"].scores(frames),
+        fitted["biotac"].scores(frames),
     )
     with pytest.raises(TacpipeError, match=r"holds sklearn\.tree\._tree\.Tree"):
-        estimators.unpacked(content, "model.skops", forest)
+        estimators.unpack_estimators(content, "model.skops", forest)
 
 
 def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None:

@@ -27,7 +27,7 @@ from tacpipe.simulation.grasp_scene import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
 from tacpipe.tasks.forward.networks import ACTIONS
-from tacpipe.tasks.material.losses import EVERY, PAIRINGS
+from tacpipe.tasks.material.losses import BATCH_STEPS, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
 from tacpipe.tasks.touch.members import LOSSES
 from tacpipe.training.scaling import KINDS
@@ -255,7 +255,7 @@ def test_every_param_has_a_help_text(name: str) -> None:
         ("train.forward", "actions", ACTIONS),
         ("train.material", "decoder", DECODERS),
         ("train.material", "pairing", PAIRINGS),
-        ("train.material", "subsample_percent", (100, 90, *EVERY)),
+        ("train.material", "subsample_percent", (100, 90, *BATCH_STEPS)),
         ("train.material", "scaling", KINDS),
         ("train.touch", "inputs", MODES),
         ("train.touch", "normalisation", NORMALISATIONS),

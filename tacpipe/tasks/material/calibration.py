@@ -50,7 +50,7 @@ def calibrate(
     """
     classifier = Classifier.load(model)
     training_by_sensor, validation_by_sensor = (classifier.read(part, labelled=True) for part in (training, validation))
-    _check(classifier, training_by_sensor, validation_by_sensor)
+    _check_slides(classifier, training_by_sensor, validation_by_sensor)
     calibrations: dict[str, SensorCalibration] = {}
     about: dict[str, UnknownDescription] = {}
     for sensor in classifier.layouts:
@@ -73,14 +73,14 @@ def calibrate(
             "threshold": calibrations[sensor].threshold,
             "false_unknown": request.false_unknown,
             "auroc_left_out": areas,
-            "calibration_error": _errors(scores, labels, calibrations[sensor].temperature),
+            "calibration_error": _calibration_errors(scores, labels, calibrations[sensor].temperature),
         }
     config = classifier.config.copy()
     config["known"] = about
     return {**model, CONFIG: model_files.to_json(config), CALIBRATION_FILE: pack_calibrations(calibrations)}
 
 
-def _errors(scores: Any, labels: Any, temperature: float) -> dict[str, float]:
+def _calibration_errors(scores: Any, labels: Any, temperature: float) -> dict[str, float]:
     """Return the expected calibration error before and after scaling by the temperature, on the slides it was fitted on."""
     errors = {}
     for name, divisor in (("before", 1.0), ("after", temperature)):
@@ -94,7 +94,7 @@ def _with_learned_labels(classifier: Classifier, slides: Slides, held_out: set[i
     return slides.select(np.isin(slides.materials, [number for number in classifier.classes if number not in held_out]))
 
 
-def _check(classifier: Classifier, training: BySensor, validation: BySensor) -> None:
+def _check_slides(classifier: Classifier, training: BySensor, validation: BySensor) -> None:
     """Raise `TacpipeError` for sensors without slides, and for validation slides that the model was trained on."""
     for part, role in ((training, "train"), (validation, "val")):
         missing = sorted(set(classifier.layouts) - set(part))
@@ -150,7 +150,7 @@ class Answers:
         if learned.any():
             labels = np.searchsorted(self.classifier.classes, slides.materials[learned])
             before, after = (
-                _stated(scores[learned], labels, right[learned], divisor)
+                _probability_fit(scores[learned], labels, right[learned], divisor)
                 for divisor in (1.0, sensor_calibration.temperature)
             )
             self.calibration[sensor] = {
@@ -211,7 +211,7 @@ class Answers:
         return {ANSWERS: text.getvalue().encode()}
 
 
-def _stated(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) -> StatedProbabilities:
+def _probability_fit(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) -> StatedProbabilities:
     """Return how the softmax of scores (slide, class) / temperature fits the slides' labels (slide,)."""
     probabilities = calibration.probabilities(scores, divisor)
     confidence = probabilities.max(axis=1)

@@ -31,7 +31,7 @@ from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
 from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, MaterialConfig, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
-from tacpipe.tasks.material.slides import SlideLayout, Slides, difference
+from tacpipe.tasks.material.slides import SlideLayout, Slides, describe_difference
 from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.training.scaling import Affine
 
@@ -132,7 +132,7 @@ class ReadoutReader(Reader):
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
-        return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
+        return ReaderOutput(expand_scores(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
 @dataclass(frozen=True)
@@ -149,11 +149,13 @@ class SpectraReader(Reader):
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods, and spectra as latents, of slides (slide, time, channel) in device counts."""
         spectra = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
-        return ReaderOutput(spread(self.transfer.learned.scores(spectra), self.transfer.classes, self.classes), spectra)
+        return ReaderOutput(
+            expand_scores(self.transfer.learned.scores(spectra), self.transfer.classes, self.classes), spectra
+        )
 
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes learned from other sensors only."""
-        return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
+        return expand_scores(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,7 @@ class EstimatorReader(Reader):
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the estimator's scores of slides (slide, time, channel) in device counts."""
-        return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
+        return ReaderOutput(expand_scores(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
 class Classifier:
@@ -213,10 +215,10 @@ class Classifier:
             )
         with model_files.validated("the model"):
             classifier = cls(files, chain)
-            classifier._try()
+            classifier._check_parts()
         return classifier
 
-    def _try(self) -> None:
+    def _check_parts(self) -> None:
         """Read a slide of noise of each sensor, so that incompatible parts raise an error."""
         if not self.layouts or not self.classes or len({*self.classes}) != len(self.classes):
             raise ValueError(f"there are {len(self.layouts)} sensors and {len(self.classes)} classes")
@@ -241,7 +243,7 @@ class Classifier:
         posterior under equal priors. Scores of ``minirocket`` and ``statistics`` are distances to class means without a
         fixed scale, so their softmax only ranks the classes. `predict` describes the arguments.
         """
-        return self.probabilities_of(self.scores(slides, sensor), self._sensor(sensor))
+        return self.probabilities_of(self.scores(slides, sensor), self._resolve_sensor(sensor))
 
     def probabilities_of(self, scores: Float32s, sensor: str) -> Float32s:
         """Return the probabilities (slide, class) for scores (slide, class) of a sensor's slides."""
@@ -257,9 +259,11 @@ class Classifier:
         """
         frames = np.asarray(slides, np.float32)
         scores = self.scores(frames, sensor)
-        return self.answered(scores, frames[None] if frames.ndim == 2 else frames, self._sensor(sensor))
+        return self.answers_from_scores(
+            scores, frames[None] if frames.ndim == 2 else frames, self._resolve_sensor(sensor)
+        )
 
-    def answered(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
+    def answers_from_scores(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
         """Return the answers for slides (slide, time, channel) of a sensor, from their scores (slide, class)."""
         if not self.calibrations:
             raise UsageError(
@@ -278,7 +282,7 @@ class Classifier:
             else sensor_calibration.score(scores, frames) < sensor_calibration.threshold
         )
 
-    def _sensor(self, sensor: str) -> str:
+    def _resolve_sensor(self, sensor: str) -> str:
         """Return the sensor of slides: ``sensor`` or, if that is empty, the only one."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
@@ -288,7 +292,7 @@ class Classifier:
 
     def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
-        layout = self.layout(self._sensor(sensor))
+        layout = self.layout(self._resolve_sensor(sensor))
         frames = np.asarray(slides, np.float32)
         frames = frames[None] if frames.ndim == 2 else frames
         shape = (layout.frames, len(layout.channels))
@@ -328,9 +332,9 @@ class Classifier:
     def check(self, slides: Slides) -> None:
         """Raise `TacpipeError` if the layout of slides differs from that of the training slides."""
         layout = self.layout(slides.layout.sensor)
-        if not layout.alike(slides.layout):
+        if not layout.is_compatible(slides.layout):
             raise TacpipeError(
-                f"{slides.names[0]} {difference(layout, slides.layout)} as the model was trained on. "
+                f"{slides.names[0]} {describe_difference(layout, slides.layout)} as the model was trained on. "
                 f"Segment it with the same params, or train on slides like it."
             )
 
@@ -411,14 +415,14 @@ class StoredClassifier:
         return {sensor: kind.from_tensors(tensors_under(f"{name}.{sensor}.", arrays)) for sensor in self.layouts}
 
     def _estimators(self, params: Estimator, file: str) -> dict[str, FittedEstimator]:
-        fitted = estimators.unpacked(self.files[file], file, params)
+        fitted = estimators.unpack_estimators(self.files[file], file, params)
         return {name: fitted[name] for name in self.layouts}
 
 
-def spread(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:
+def expand_scores(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:
     """Return scores of ``scored_classes`` as columns of all ``classes``, with -inf for classes without a score.
 
-    >>> spread(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()
+    >>> expand_scores(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()
     [[1.0, -inf, 2.0]]
     """
     spread_scores = np.full((len(scores), len(classes)), -np.inf, np.float32)

@@ -28,8 +28,8 @@ from tacpipe.tasks.material.losses import Network
 from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
 
 SCHEMA = "schema.json"
-WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all archive members
-TRIED = 2  # number of slides for a trial
+MODIFICATION_TIME = (1980, 1, 1, 0, 0, 0)  # modification time of all archive members
+TRIAL_SLIDES = 2  # number of slides for a trial
 MIN_PROBABILITY = 1e-12  # lower bound of probabilities before the logarithm
 MAX_UNPACKED_BYTES = 2**31  # maximum unpacked size of a file
 
@@ -49,7 +49,7 @@ class FittedEstimator:
         """
         fitted = cls(params.build(params.seed), params.features)
         fitted.estimator.fit(fitted._features(frames), materials)
-        fitted.scores(frames[:TRIED])
+        fitted.scores(frames[:TRIAL_SLIDES])
         return fitted
 
     @property
@@ -88,7 +88,7 @@ class FittedEstimator:
         return features
 
 
-def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
+def pack_estimators(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
     """Return the file content of fitted estimators by sensor. Raises `TacpipeError` if it could not be read back."""
     with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import dumps, get_untrusted_types
@@ -100,15 +100,15 @@ def packed(fitted: Mapping[str, FittedEstimator], params: Estimator) -> bytes:
             f"The estimator of {params.architecture} cannot be stored without pickle ({plain(str(error), 200)}). Build it "
             f"of estimators of scikit-learn, with functions of a module and not lambda."
         ) from error
-    if refused := _refused(get_untrusted_types(data=content), params):
+    if refused := _untrusted_types(get_untrusted_types(data=content), params):
         raise TacpipeError(
             f"The estimator of {params.architecture} holds {refused}, which skops does not validate when it is read. Name "
             f"what you trust in TRUSTED of {type(params).__name__}, or build another estimator."
         )
-    return _canonical(content)
+    return _make_reproducible(content)
 
 
-def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEstimator]:
+def unpack_estimators(content: bytes, name: str, params: Estimator) -> dict[str, FittedEstimator]:
     """Return the estimators by sensor in the file ``name``.
 
     Raises `TacpipeError` if it is not a skops file, or has types that the architecture does not trust.
@@ -120,7 +120,7 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEs
             if sum(member.file_size for member in file.infolist()) > MAX_UNPACKED_BYTES:
                 raise TacpipeError(f"{name} unpacks to more than {MAX_UNPACKED_BYTES >> 30} GiB, so it is not read.")
         untrusted_types = get_untrusted_types(data=content)
-        if refused := _refused(untrusted_types, params):
+        if refused := _untrusted_types(untrusted_types, params):
             raise TacpipeError(
                 f"{name} holds {refused}, which the architecture {params.architecture} does not trust. Train the "
                 f"model again."
@@ -136,7 +136,7 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, FittedEs
         ) from error
 
 
-def _refused(types: Iterable[str], params: Estimator) -> str:
+def _untrusted_types(types: Iterable[str], params: Estimator) -> str:
     """Return, as text, the types that are neither in the architecture's package nor trusted by it."""
     package = type(params).__module__.partition(".")[0]
     foreign = [name for name in types if name not in params.TRUSTED and not _is_defined_in(package, name)]
@@ -158,40 +158,42 @@ def _is_defined_in(package: str, name: str) -> bool:
     return isinstance(module, str) and module.partition(".")[0] == package
 
 
-def _canonical(content: bytes) -> bytes:
+def _make_reproducible(content: bytes) -> bytes:
     """Return a skops file without times and with sequential numbers for memory addresses, so that it is reproducible."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {member: file.read(member) for member in file.namelist()}
     numbers: dict[Any, int] = {}
-    described = _renumbered(json.loads(members[SCHEMA]), numbers)
+    described = _renumber(json.loads(members[SCHEMA]), numbers)
     renamed = {SCHEMA: json.dumps(described, indent=1, sort_keys=True).encode()}
-    renamed |= {_member(member, numbers): content for member, content in members.items() if member != SCHEMA}
+    renamed |= {
+        _renumber_file_name(member, numbers): content for member, content in members.items() if member != SCHEMA
+    }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
         for member, content in sorted(renamed.items()):
-            about = zipfile.ZipInfo(member, WRITTEN)
+            about = zipfile.ZipInfo(member, MODIFICATION_TIME)
             about.compress_type = zipfile.ZIP_DEFLATED
             file.writestr(about, content)
     return buffer.getvalue()
 
 
-def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
+def _renumber(node: Any, numbers: dict[Any, int]) -> Any:
     """Return a description with ``__id__`` numbered from 1 in order of occurrence, and the file names to match."""
     if isinstance(node, list):
-        return [_renumbered(child, numbers) for child in node]
+        return [_renumber(child, numbers) for child in node]
     if not isinstance(node, Mapping):
         return node
     return {
         name: numbers.setdefault(value, len(numbers) + 1)
         if name == "__id__"
-        else _member(value, numbers)
+        else _renumber_file_name(value, numbers)
         if name == "file"
-        else _renumbered(value, numbers)
+        else _renumber(value, numbers)
         for name, value in node.items()
     }
 
 
-def _member(name: str, numbers: dict[Any, int]) -> str:
+def _renumber_file_name(name: str, numbers: dict[Any, int]) -> str:
     """Return a member's name with its number instead of the memory address from skops."""
     stem, dot, ending = name.partition(".")
     return f"{numbers.setdefault(int(stem), len(numbers) + 1)}{dot}{ending}" if stem.isdigit() else name
@@ -216,9 +218,9 @@ def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Netwo
 def check_network(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
     """Raise `TacpipeError` if a network does not return scores for ``slides`` (slide, time, channel)."""
     training = network.training
-    output = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
+    output = network.eval()(slides[:TRIAL_SLIDES].transpose(0, 1).contiguous(), decode=False)
     network.train(training)
-    scores, shape = getattr(output, "scores", None), (len(slides[:TRIED]), classes)
+    scores, shape = getattr(output, "scores", None), (len(slides[:TRIAL_SLIDES]), classes)
     if not isinstance(scores, Tensor) or tuple(scores.shape) != shape:
         returned = str(tuple(scores.shape)) if isinstance(scores, Tensor) else type(scores).__name__
         raise TacpipeError(

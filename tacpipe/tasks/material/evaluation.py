@@ -129,11 +129,11 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         },
     )
     with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # read, then classify
-        for sensor, slides in _read(classifier, recordings, advance).items():
+        for sensor, slides in _read_slides(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
             if is_learned.any() or not classifier.calibrations:
                 counted = slides.select(is_learned) if classifier.calibrations else slides
-                evaluated[sensor] = _evaluated(classifier, counted, trained_on)
+                evaluated[sensor] = _evaluate_sensor(classifier, counted, trained_on)
             advance(len(slides), sensor)
     if not evaluated:
         raise TacpipeError(
@@ -171,14 +171,14 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     return Result({PREDICTIONS: RecordingOutput(table, selection.combine_origins(attributes.values()))}, files)
 
 
-def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
+def _read_slides(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
     """Return labelled slides; with a calibrated classifier their classes may be unknown to it."""
     key = classifier.naming.key
     all_labelled = all(shard.attributes.get(key) is not None for shard in recordings.recordings.values())
     return classifier.read(recordings, labelled=not (classifier.calibrations and all_labelled), advance=advance)
 
 
-def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> Evaluated:
+def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str]) -> Evaluated:
     """Return the predictions of all predictors for the slides of one sensor."""
     sensor = slides.layout.sensor
     foreign = [index for index, material in enumerate(slides.materials) if int(material) not in classifier.classes]
@@ -195,7 +195,7 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
     params = classifier.params
     mapped = bool(params.aligned_sensor)  # all sensors already have the frozen sensor's classifier
     if classifier.config.get("joint") and output.latents is not None and not mapped:
-        predicted[SWAPPED] = _exchanged(classifier, sensor, output.latents)
+        predicted[SWAPPED] = _exchanged_predictions(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames
         if name != MEAN_LEVEL and output.latents is not None:
@@ -215,11 +215,11 @@ def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> 
         counted=counted,
     )
     if held_out and output.latents is not None:
-        evaluated.zero_shot = _by_another(classifier, sensor, output.latents, held_out)
+        evaluated.zero_shot = _zero_shot_predictions(classifier, sensor, output.latents, held_out)
     return evaluated
 
 
-def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
+def _exchanged_predictions(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
     """Return the materials predicted by another sensor's classifier, in terms of this sensor's materials.
 
     Sensors aligned with permuted classes share a space in which each material has the position of its partner.
@@ -246,7 +246,9 @@ def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> F
     return classifier.readers[sensor].scores_by(classifier.readers[classifier.partner(sensor)], latents)
 
 
-def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]) -> tuple[Int64s, Int64s]:
+def _zero_shot_predictions(
+    classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]
+) -> tuple[Int64s, Int64s]:
     """Return another sensor's predictions: among all materials, and among held-out ones only."""
     scores = _partner_scores(classifier, sensor, latents)
     is_held_out = np.isin(classifier.classes, held_out)

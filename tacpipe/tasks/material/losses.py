@@ -27,7 +27,7 @@ from tacpipe.training.loop import precise
 
 NONE = -1  # index of a missing slide in a row of a batch, and class of a slide without label
 PAIRINGS = ("random", "fixed", "permuted")
-EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of batches for a subsampled sensor -> it learns from each n-th batch
+BATCH_STEPS = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of batches of a subsampled sensor -> it uses each n-th
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class BatchPairs:
         """Raise an error for incompatible options."""
         if self.pairing not in PAIRINGS:
             raise TacpipeError(f"pairing is {self.pairing!r}; it must be {', '.join(PAIRINGS)}.")
-        if self.subsample_percent not in (100, 90, *EVERY):
+        if self.subsample_percent not in (100, 90, *BATCH_STEPS):
             raise TacpipeError(
-                f"subsample_percent is {self.subsample_percent}; it must be 100, 90, {', '.join(map(str, EVERY))}."
+                f"subsample_percent is {self.subsample_percent}; it must be 100, 90, {', '.join(map(str, BATCH_STEPS))}."
             )
         if self.subsample_sensor and self.subsample_sensor not in self.classes:
             raise TacpipeError(
@@ -76,7 +76,7 @@ class BatchPairs:
         slide_batches = []
         for number, batch in enumerate(batches):
             slides_by_sensor = dict(zip(self.classes, batch.clone(), strict=True))
-            if self.subsample_sensor and not visited(number, self.subsample_percent):
+            if self.subsample_sensor and not uses_batch(number, self.subsample_percent):
                 slides_by_sensor[self.subsample_sensor][:] = NONE
             if any((slide_rows != NONE).any() for slide_rows in slides_by_sensor.values()):
                 slide_batches.append(slides_by_sensor)
@@ -86,11 +86,11 @@ class BatchPairs:
         """Return the slide of each sensor in each row (sensor, row), in the order of the epoch."""
         seeded = torch.Generator().manual_seed(self.seed)
         pairs = None if self.pairing != "fixed" and self.shuffle else seeded
-        rows = self._paired(pairs)
+        rows = self._pair_rows(pairs)
         order = torch.randperm(rows.shape[1], generator=None if self.shuffle else seeded)
         return rows[:, order]
 
-    def _paired(self, generator: torch.Generator | None) -> Tensor:
+    def _pair_rows(self, generator: torch.Generator | None) -> Tensor:
         """Return rows (sensor, row) of one class each, followed by rows with a single slide without label."""
         blocks = []
         first = next(iter(self.classes.values()))
@@ -101,7 +101,7 @@ class BatchPairs:
                 sensor_class = number if classes is first or self.partners is None else self.partners[number]
                 at = (classes == sensor_class).nonzero()[:, 0]
                 members.append(at[torch.randperm(len(at), generator=generator)])
-            blocks.append(_side_by_side(members))
+            blocks.append(_stack_padded(members))
         for place, classes in enumerate(self.classes.values()):
             unlabelled = (classes == NONE).nonzero()[:, 0]
             block = torch.full((len(self.classes), len(unlabelled)), NONE)
@@ -110,18 +110,18 @@ class BatchPairs:
         return torch.cat(blocks, dim=1)
 
 
-def visited(number: int, percent: int) -> bool:
+def uses_batch(number: int, percent: int) -> bool:
     """Return whether a subsampled sensor learns from the batch with this number, from 0.
 
     The published code uses batches whose number is a multiple of 2, 4, 6 or 9 for 50, 25, 17 and 11 %, i.e. 288, 160,
     96 and 64 of 576 slides. No multiple gives 90 %; here each tenth batch is skipped, which leaves 512.
 
-    >>> [32 * sum(visited(i, percent) for i in range(18)) for percent in (100, 90, 50, 25, 17, 11)]
+    >>> [32 * sum(uses_batch(i, percent) for i in range(18)) for percent in (100, 90, 50, 25, 17, 11)]
     [576, 512, 288, 160, 96, 64]
     """
     if percent == 90:
         return number % 10 != 0
-    return percent == 100 or number % EVERY[percent] == 0
+    return percent == 100 or number % BATCH_STEPS[percent] == 0
 
 
 def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
@@ -135,7 +135,7 @@ def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
     return {int(number): int(partner) for number, partner in zip(order, np.roll(order, 1), strict=True)}
 
 
-def _side_by_side(members: Sequence[Tensor]) -> Tensor:
+def _stack_padded(members: Sequence[Tensor]) -> Tensor:
     """Stack index tensors as rows of one tensor, padding the shorter ones with NONE."""
     longest = max(map(len, members))
     block = torch.full((len(members), longest), NONE)
@@ -235,9 +235,9 @@ class JointWork:
                 output[sensor], loss = self._sensor_losses(sensor, model.get_submodule(sensor), chosen)
                 total = total.to(loss.device) + loss
         if self.joint:
-            aligned = self._alignment(batch, output)
+            aligned = self._pair_loss(batch, output)
             if self.weights.alignment_loss == "contrast":
-                aligned = self._contrast(batch, output)
+                aligned = self._contrastive_loss(batch, output)
             if aligned is not None and epoch >= self.weights.align_from:
                 total = total + self.weights.alignment * aligned
         return total, max(int((rows != NONE).sum()) for rows in batch.values())
@@ -264,12 +264,12 @@ class JointWork:
             total = total + weights.reconstruction * loss
         return output, total
 
-    def _alignment(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
+    def _pair_loss(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
         """Return the mean squared difference of latents in rows shared by two sensors, averaged over pairs of sensors."""
         pair_losses = []
         for sensor, partner in combinations(output, 2):
             latents, valid = zip(
-                *(self._by_row(batch[name], output[name], name) for name in (sensor, partner)), strict=True
+                *(self._latents_by_row(batch[name], output[name], name) for name in (sensor, partner)), strict=True
             )
             in_both = valid[0] & valid[1]
             if in_both.any():
@@ -280,7 +280,7 @@ class JointWork:
         self._sums.add("alignment", mean, 1)
         return mean
 
-    def _contrast(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
+    def _contrastive_loss(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
         """Return the contrastive loss between two sensors' slides of the same class, against all others.
 
         This is the supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2)
@@ -292,7 +292,7 @@ class JointWork:
         losses = []
         for sensor, partner in permutations(output, 2):
             (from_, valid), (to, partner_valid) = (
-                self._by_row(batch[name], output[name], name) for name in (sensor, partner)
+                self._latents_by_row(batch[name], output[name], name) for name in (sensor, partner)
             )
             has_class, partner_has_class = (
                 (classes != NONE).to(valid.device) & valid,
@@ -312,7 +312,7 @@ class JointWork:
                 losses.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
         return torch.stack(losses).mean() if losses else None
 
-    def _by_row(self, rows: Tensor, output: NetworkOutput, sensor: str) -> tuple[Tensor, Tensor]:
+    def _latents_by_row(self, rows: Tensor, output: NetworkOutput, sensor: str) -> tuple[Tensor, Tensor]:
         """Return latents (row, latent), and a mask of rows with a labelled slide."""
         filled = rows != NONE
         latents = output.latents.new_zeros(len(rows), output.latents.shape[1])

@@ -48,7 +48,7 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
         sensors += [sensor] * len(slides)
         outputs.append(classifier.readers[sensor].read(slides.frames))
         if probabilities:
-            answers += classifier.answered(outputs[-1].scores, slides.frames, sensor)
+            answers += classifier.answers_from_scores(outputs[-1].scores, slides.frames, sensor)
             likely.append(classifier.calibrations[sensor].probabilities(outputs[-1].scores))
     scores = np.concatenate([output.scores for output in outputs])
     columns: list[tuple[pa.Field, Any]] = [

@@ -83,7 +83,7 @@ def train_network(
     joint = params.learns_jointly and len(training_slides) > 1
     mapped_to = params.aligned_sensor
     if joint:
-        _same_materials(training_slides, Naming.from_json(config))
+        _require_same_materials(training_slides, Naming.from_json(config))
     kinds = recurrent_autoencoder.chosen(
         params.headers, {name: len(sensor_slides.layout.channels) for name, sensor_slides in training_slides.items()}
     )
@@ -98,13 +98,13 @@ def train_network(
         params.hold_out, config["classes"], training_slides, Naming.from_json(config)
     )
     if start:
-        _same_space(start, mapped_to, config, training_slides)
+        _require_same_space(start, mapped_to, config, training_slides)
         shapes[mapped_to] = AutoencoderShape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = recordings.add_earlier(config["trained_on"], start.config["trained_on"])
     training, validation = (
         {
-            name: _scaled(params, config, sensor_slides, scalings[name], held_out_materials, device, place)
+            name: _scaled_slides(params, config, sensor_slides, scalings[name], held_out_materials, device, place)
             for place, (name, sensor_slides) in enumerate(part.items())
         }
         for part in (training_slides, validation_slides)
@@ -116,13 +116,13 @@ def train_network(
     work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
-        built = _built(params, shapes, start, mapped_to).to(device)
+        built = _build_networks(params, shapes, start, mapped_to).to(device)
         for name, network in built.items():
             estimators.check_network(network, params, training[name].frames, shapes[name].classes)
         return built
 
     trained = loop.train(build, work, loop.Schedule.from_params(params, params.seed), workspace)
-    config["validation"] = _validation(trained.history, work.joint)
+    config["validation"] = _best_epochs(trained.history, work.joint)
     files = _files(trained, config, params)
     if params.baselines:
         files[BASELINES] = _network_baselines(Classifier.load(files), training_slides, params)
@@ -190,7 +190,7 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
     )
 
 
-def _scaled(
+def _scaled_slides(
     params: NetworkParams,
     config: MaterialConfig,
     slides: Slides,
@@ -206,14 +206,14 @@ def _scaled(
         for number, material in enumerate(config["classes"])
         if material not in held_out_materials[name]
     }
-    materials = readouts.permuted(params, slides.materials, place)
+    materials = readouts.permute_labels(params, slides.materials, place)
     classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
     return ScaledSlides(torch.from_numpy(scaled.apply(slides.frames)).to(device), classes.to(device))
 
 
-def _same_materials(training_slides: BySensor, naming: Naming) -> None:
+def _require_same_materials(training_slides: BySensor, naming: Naming) -> None:
     """Raise an error for joint learning if a sensor lacks a material that another has."""
     materials = {
         name: {int(material) for material in sensor_slides.materials} for name, sensor_slides in training_slides.items()
@@ -228,7 +228,7 @@ def _same_materials(training_slides: BySensor, naming: Naming) -> None:
             )
 
 
-def _same_space(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> None:
+def _require_same_space(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> None:
     """Raise an error if the --init model lacks the frozen sensor or has other materials."""
     if frozen_sensor not in slides:
         raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
@@ -252,7 +252,7 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
     return reader
 
 
-def _built(
+def _build_networks(
     params: NetworkParams, shapes: Mapping[str, AutoencoderShape], start: Classifier | None, frozen: str
 ) -> nn.ModuleDict:
     """Return the networks by sensor; that of ``frozen`` is copied and frozen, and all others use its classifier."""
@@ -271,7 +271,7 @@ def _built(
     return built
 
 
-def _validation(history: Sequence[Line], joint: bool) -> BestEpochs:
+def _best_epochs(history: Sequence[Line], joint: bool) -> BestEpochs:
     """Return the epoch of each sensor's weights, and the validation accuracy at that epoch."""
 
     def chosen(sensor: str) -> Line:
@@ -292,9 +292,9 @@ def _network_baselines(trained: Classifier, training_slides: BySensor, params: P
         latents = trained.readers[name].read(slides.frames).latents
         assert latents is not None
         shuffled = np.random.default_rng([params.seed, 3, place]).permutation(slides.materials)
-        arrays |= readouts.stored(MEAN_LEVEL, name, Level.fit(slides.frames, slides.materials))
-        arrays |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
-    return readouts.packed(arrays)
+        arrays |= readouts.baseline_tensors(MEAN_LEVEL, name, Level.fit(slides.frames, slides.materials))
+        arrays |= readouts.baseline_tensors(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
+    return readouts.pack(arrays)
 
 
 @dataclass(frozen=True)
@@ -310,20 +310,20 @@ class TrainingSlides:
 
     def fit_rockets(self, params: Minirocket) -> dict[str, bytes]:
         """Return the files of random convolutions and a readout for each sensor."""
-        return readouts.rockets(params, self.config, self.training, self.validation)
+        return readouts.fit_rockets(params, self.config, self.training, self.validation)
 
     def fit_statistics(self, params: Statistics) -> dict[str, bytes]:
         """Return the files of statistics and a readout for each sensor."""
-        return readouts.statistics(params, self.config, self.training, self.validation)
+        return readouts.fit_statistics(params, self.config, self.training, self.validation)
 
     def fit_spectra(self, params: Spectra) -> dict[str, bytes]:
         """Return the files of spectra, through which sensors learn materials from each other."""
         excluded = slides_of.held_out_materials(params.hold_out, self.config["classes"], self.training, self.naming)
-        return readouts.spectra(params, self.config, self.training, self.validation, excluded)
+        return readouts.fit_spectra(params, self.config, self.training, self.validation, excluded)
 
     def fit_estimators(self, params: Estimator) -> dict[str, bytes]:
         """Return the files of one fitted estimator of scikit-learn per sensor."""
-        return readouts.estimators(params, self.config, self.training, self.validation)
+        return readouts.fit_estimators(params, self.config, self.training, self.validation)
 
     def train_networks(self, params: NetworkParams) -> dict[str, bytes]:
         """Return the files of one network per sensor, trained by the shared loop."""

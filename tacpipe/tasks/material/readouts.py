@@ -22,8 +22,7 @@ from tacpipe.tasks.material.classifier import (
     WEIGHTS,
     ReadoutModel,
 )
-from tacpipe.tasks.material.estimators import FittedEstimator
-from tacpipe.tasks.material.estimators import packed as packed_estimators
+from tacpipe.tasks.material.estimators import FittedEstimator, pack_estimators
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.params import (
     LEVEL_VIEWS,
@@ -41,24 +40,24 @@ from tacpipe.tasks.material.slides import BySensor, Slides
 Arrays = dict[str, np.ndarray]
 
 
-def rockets(
+def fit_rockets(
     params: Minirocket, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of random convolutions and a readout per sensor."""
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
         strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
         tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
         if params.baselines:
             shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
-            baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= stored(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
+            baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
+            baselines |= baseline_tensors(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
     return _files(config, tensors, baselines)
 
 
-def estimators(
+def fit_estimators(
     params: Estimator, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of one scikit-learn estimator per sensor."""
@@ -66,19 +65,19 @@ def estimators(
     shuffled: dict[str, FittedEstimator] = {}
     levels: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
         fitted[name] = FittedEstimator.fit(params, frames, materials)
         if params.baselines:
             permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
-            levels |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
+            levels |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             shuffled[name] = FittedEstimator.fit(params, frames, permutation)
-    files = {CONFIG: model_files.to_json(config), ESTIMATORS: packed_estimators(fitted, params)}
+    files = {CONFIG: model_files.to_json(config), ESTIMATORS: pack_estimators(fitted, params)}
     if params.baselines:
-        files |= {BASELINES: packed(levels), SHUFFLED_ESTIMATORS: packed_estimators(shuffled, params)}
+        files |= {BASELINES: pack(levels), SHUFFLED_ESTIMATORS: pack_estimators(shuffled, params)}
     return files
 
 
-def statistics(
+def fit_statistics(
     params: Statistics, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
     """Return the files of channel statistics and a readout per sensor.
@@ -88,19 +87,19 @@ def statistics(
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
         fitted = StatisticsClassifier.fit(frames, materials)
         tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
         if params.baselines:
             shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
-            baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= stored(PERMUTED_LABELS, name, StatisticsClassifier.fit(frames, shuffled))
+            baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
+            baselines |= baseline_tensors(PERMUTED_LABELS, name, StatisticsClassifier.fit(frames, shuffled))
             for kind, view in LEVEL_VIEWS.items():
-                baselines |= stored(kind, name, StatisticsClassifier.fit(frames, materials, view=view))
+                baselines |= baseline_tensors(kind, name, StatisticsClassifier.fit(frames, materials, view=view))
     return _files(config, tensors, baselines)
 
 
-def spectra(
+def fit_spectra(
     params: Spectra,
     config: MaterialConfig,
     training_slides: BySensor,
@@ -118,7 +117,7 @@ def spectra(
     labelled: dict[str, transfer.Labelled] = {}
     baselines: Arrays = {}
     for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
         free = ~np.isin(materials, list(held_out[name]))
         frames, materials = frames[free], materials[free]
         labelled[name] = transfer.Labelled(
@@ -126,8 +125,8 @@ def spectra(
         )
         if params.baselines:
             shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
-            baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= stored(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
+            baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
+            baselines |= baseline_tensors(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
     learned = {name: {int(number) for number in sensor_labels.labels} for name, sensor_labels in labelled.items()}
     missing = sorted(set(config["classes"]) - set().union(*learned.values()))
     if missing:
@@ -175,37 +174,37 @@ def _samplings(speeds: str, training_slides: BySensor) -> dict[str, Sampling]:
     return samplings
 
 
-def _labelled(
+def _training_arrays(
     params: Minirocket | Statistics | Spectra | Estimator,
     training_slides: Slides,
     validation_slides: Slides | None,
     place: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials for training, with those of validation if the params request them."""
-    frames, materials = training_slides.frames, permuted(params, training_slides.materials, place)
+    frames, materials = training_slides.frames, permute_labels(params, training_slides.materials, place)
     if params.use_validation and validation_slides is not None and params.labels == "true":
         frames = np.concatenate([frames, validation_slides.frames])
         materials = np.concatenate([materials, validation_slides.materials])
     return frames, materials
 
 
-def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
+def permute_labels(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
     """Return labels, permuted among the slides if the params request it as a control."""
     if params.labels == "true":
         return materials
     return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
-def stored(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:
+def baseline_tensors(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:
     """Return the tensors of a baseline, under unique names."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 
 
-def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
+def pack(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return arrays as file content."""
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
 def _files(config: MaterialConfig, tensors: Arrays, baselines: Arrays) -> dict[str, bytes]:
-    files = {CONFIG: model_files.to_json(config), WEIGHTS: packed(tensors)}
-    return {**files, BASELINES: packed(baselines)} if baselines else files
+    files = {CONFIG: model_files.to_json(config), WEIGHTS: pack(tensors)}
+    return {**files, BASELINES: pack(baselines)} if baselines else files

@@ -43,7 +43,7 @@ from tacpipe.models.tensors import tensors_under
 COMPONENTS = 300  # maximum number of components
 PATTERNS = "patterns."  # prefix of the tensor names of patterns
 NAMES = ("classes", "centre", "projection", "gain", "overall", "slides", "labels")
-STEADY = 1e-6  # standard deviation below which a feature counts as constant
+MIN_STD = 1e-6  # standard deviation below which a feature counts as constant
 MIN_SQUARED_DISTANCE = 1e-9  # lower bound of squared distances
 
 
@@ -71,14 +71,14 @@ class ClassDistance:
         patterns = Rocket.fit(with_profile(frames))
         features = _features(frames, patterns)
         centre, spread = features.mean(axis=0), features.std(axis=0)
-        standardise = np.where(spread > STEADY, 1 / np.maximum(spread, STEADY), 0)
+        standardise = np.where(spread > MIN_STD, 1 / np.maximum(spread, MIN_STD), 0)
         scaled = (features - centre) * standardise
         basis = np.linalg.svd(scaled, full_matrices=False)[2][:COMPONENTS].T  # (feature, component)
         classes, index = np.unique(labels, return_inverse=True)
         components = scaled @ basis
         covariance, _ = ledoit_wolf(components - _means(components, index)[index], assume_centered=True)
         variances, axes = np.linalg.eigh(covariance)
-        gain = 1 / np.sqrt(np.maximum(variances, STEADY * variances.max() or 1.0))
+        gain = 1 / np.sqrt(np.maximum(variances, MIN_STD * variances.max() or 1.0))
         means = _means(components @ axes * gain, index)
         offsets = means - means.mean(axis=0)
         between, directions = np.linalg.eigh(offsets.T @ offsets / max(1, len(classes) - 1))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 STREAM = "slide"
 TACTILE = "tactile"
-NEAR = 0.02  # maximum relative difference between the rates of a sensor's slides
+MAX_RATE_DIFFERENCE = 0.02  # maximum relative difference between the rates of a sensor's slides
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,12 @@ class SlideLayout:
     rate_hz: float
     layout: str = "time"  # time: frames in time order; authors: in the published order
 
-    def alike(self, other: SlideLayout) -> bool:
+    def is_compatible(self, other: SlideLayout) -> bool:
         """Return whether both layouts are compatible: rates may differ slightly, as timestamps do, or be unknown."""
         difference_hz = abs(self.rate_hz - other.rate_hz)
-        near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= NEAR * max(self.rate_hz, other.rate_hz)
+        near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= MAX_RATE_DIFFERENCE * max(
+            self.rate_hz, other.rate_hz
+        )
         return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
     def to_json(self) -> StoredLayout:
@@ -127,7 +129,9 @@ def read(
     if missing:
         listed_sensors = ", ".join(sorted(present_sensors)) or "none"
         raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {listed_sensors}. Give others.")
-    return {sensor: _bundle(sensor_slides, naming, labelled) for sensor, sensor_slides in sorted(by_sensor.items())}
+    return {
+        sensor: _stack_slides(sensor_slides, naming, labelled) for sensor, sensor_slides in sorted(by_sensor.items())
+    }
 
 
 def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[str]:
@@ -180,14 +184,17 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
     return values
 
 
-def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool) -> Slides:
+def _stack_slides(
+    sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool
+) -> Slides:
     """Return the slides of one sensor, after a check that their layouts are compatible."""
     first, layout, _ = sensor_slides[0]
     for shard, compared, _ in sensor_slides:
-        if not layout.alike(compared):
+        if not layout.is_compatible(compared):
             raise TacpipeError(
-                f"{shard.name} {difference(layout, compared)} as {first.name}; slides of a sensor are alike. `tacpipe "
-                f"segment slides` keeps as many frames of each (--frames, and --trigger load without static pressure)."
+                f"{shard.name} {describe_difference(layout, compared)} as {first.name}; slides of a sensor are alike. "
+                f"`tacpipe segment slides` keeps as many frames of each (--frames, and --trigger load without static "
+                f"pressure)."
             )
     return Slides(
         layout,
@@ -199,10 +206,10 @@ def _bundle(sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], na
     )
 
 
-def difference(expected: SlideLayout, layout: SlideLayout) -> str:
+def describe_difference(expected: SlideLayout, layout: SlideLayout) -> str:
     """Return a description of the difference between two layouts.
 
-    >>> difference(SlideLayout("a", ("x",), 400, 100.0), SlideLayout("a", ("x",), 75, 100.0))
+    >>> describe_difference(SlideLayout("a", ("x",), 400, 100.0), SlideLayout("a", ("x",), 75, 100.0))
     'has 75 frames, not 400'
     """
     if layout.channels != expected.channels:

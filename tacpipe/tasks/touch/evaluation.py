@@ -148,10 +148,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     with terminal.progress_bar(
         "evaluate", 2 * len(recordings.recordings)
     ) as advance:  # each grasp is read and then predicted
-        return _evaluated(model, predictor, grasps_of.read(recordings, advance=advance), recordings, advance)
+        return _evaluation_result(model, predictor, grasps_of.read(recordings, advance=advance), recordings, advance)
 
 
-def _evaluated(
+def _evaluation_result(
     model: Mapping[str, bytes], predictor: Predictor, grasps: Grasps, recordings: Dataset, advance: Callable[..., None]
 ) -> Result:
     """Return the result of a model on grasps; ``advance`` updates the progress bar after their prediction."""
@@ -171,9 +171,9 @@ def _evaluated(
     streams = {name: readings_table(readings) for name, readings in predicted.items()}
     del predicted[TRUE]
     trained = set(predictor.config["trained_on"].values())
-    in_training = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.same_reading(
-        grasps
-    )
+    in_training = np.array(
+        [digest in trained for digest in grasps.digests], bool
+    ) | predictor.baselines.has_training_reading(grasps)
     is_known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
     fresh = _scores(grasps, predicted, ~in_training, is_known)
     masks = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training, "seen": in_training}
@@ -191,7 +191,7 @@ def _evaluated(
     }
     if predictor.quantiles is not None:
         files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
-    streams[GRASPS] = _about(grasps, in_training, is_known)
+    streams[GRASPS] = _grasp_table(grasps, in_training, is_known)
     attributes = selection.combine_origins(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
@@ -287,7 +287,7 @@ def _by_object_csv(scores: TouchScores) -> bytes:
     return text.getvalue().encode()
 
 
-def _about(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
+def _grasp_table(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
     """Return one row per grasp: recording, object, session, time, and whether grasp and object are known."""
     return pa.table(
         {

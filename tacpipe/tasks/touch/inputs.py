@@ -153,7 +153,7 @@ def _check(inputs: CloudInputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
 
 
 UNIT_M = 0.05  # length that is scaled to 1
-PLACES = 3  # patch about g1, patch about g2, whole cloud
+PATCH_COUNT = 3  # patch about g1, patch about g2, whole cloud
 
 
 @dataclass(frozen=True)
@@ -201,12 +201,12 @@ class PatchSources:
             require_colours(names, clouds)
         for cloud, grasp in zip(clouds, grasps, strict=True):
             points = local_points(cloud.points_m, grasp)
-            self.near.append([_about(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)])
+            self.near.append([_indices_near(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)])
             parts = [points / UNIT_M]
             if patches.coloured and cloud.colours is not None:
                 parts.append(cloud.colours / 127.5 - 1.0)
             self.clouds.append(np.concatenate(parts, axis=1).astype(np.float32))
-        self.numbers = _numbers(grasps, patches.placed)
+        self.numbers = _grasp_features(grasps, patches.placed)
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
         """Return sampled patches (cloud, patch, point, channel) and grasp features (cloud, number)."""
@@ -219,11 +219,11 @@ class PatchSources:
 
     def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]]) -> Arrays:
         count = self.patches.points
-        points = np.empty((len(draws), PLACES, count, self.patches.channels), np.float32)
+        points = np.empty((len(draws), PATCH_COUNT, count, self.patches.channels), np.float32)
         for row, (index, rng) in enumerate(draws):
             cloud = self.clouds[index]
             for place, indices in enumerate((*self.near[index], np.arange(len(cloud)))):
-                points[row, place] = cloud[indices[_chosen(len(indices), count, rng)]]
+                points[row, place] = cloud[indices[_random_indices(len(indices), count, rng)]]
         return points, self.numbers[[index for index, _ in draws]]
 
 
@@ -236,14 +236,14 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
             )
 
 
-def _about(points: Floats, place_m: float, radius_m: float) -> Indices:
+def _indices_near(points: Floats, place_m: float, radius_m: float) -> Indices:
     """Return the indices of the points within a radius of a contact, or the nearest point if there are none."""
     away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
     inside = np.flatnonzero(away <= radius_m)
     return inside if len(inside) else np.array([int(away.argmin())])
 
 
-def _chosen(total: int, count: int, rng: np.random.Generator) -> Indices:
+def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices:
     """Return ``count`` random indices below ``total``; an index repeats only after all have been used."""
     if count <= total:
         chosen: Indices = rng.choice(total, count, replace=False, shuffle=False)
@@ -251,6 +251,6 @@ def _chosen(total: int, count: int, rng: np.random.Generator) -> Indices:
     return np.concatenate([np.arange(total), rng.integers(0, total, count - total)])
 
 
-def _numbers(grasps: Sequence[Grasp], placed: bool) -> Float32s:
+def _grasp_features(grasps: Sequence[Grasp], placed: bool) -> Float32s:
     rows = [[grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if placed else []) for grasp in grasps]
     return np.array(rows, np.float32)

@@ -176,8 +176,8 @@ class Limits:
                     "low_mm": low,
                     "high_mm": None if math.isinf(high) else high,
                     "pairs": max((estimates.pairs for estimates in by_target.values()), default=0),
-                    "likeness": {name: _numbers(estimates.likeness) for name, estimates in by_target.items()},
-                    "pair_skill": {name: _numbers(estimates.pair_skill) for name, estimates in by_target.items()},
+                    "likeness": {name: _estimate_json(estimates.likeness) for name, estimates in by_target.items()},
+                    "pair_skill": {name: _estimate_json(estimates.pair_skill) for name, estimates in by_target.items()},
                 }
                 for low, high, by_target in self.near
             ],
@@ -218,7 +218,7 @@ def limits(
     largest_size = max(counts.values()) * (FOLDS - 1) // FOLDS
     curve = [trial.point(size) for size in sorted({min(size, largest_size) for size in sizes})]
     near = table(grasps.readings, contacts_m, grasps.objects)
-    return Limits(counts, near, curve, trial.other_finger(), draws, trees)
+    return Limits(counts, near, curve, trial.skills_with_other_finger(), draws, trees)
 
 
 def steps(sizes: Iterable[int], draws: int) -> int:
@@ -242,7 +242,7 @@ class _Trial:
         skill, trained = self._skills(size, dict.fromkeys(self.grasps.readings, self.rows), f"{size} grasps an object")
         return Point(size, trained, skill)
 
-    def other_finger(self) -> Skills:
+    def skills_with_other_finger(self) -> Skills:
         """Return the skill of forests that also read the other finger, trained on all training grasps."""
         readings = self.grasps.readings
         rows = {
@@ -259,10 +259,10 @@ class _Trial:
         trained = []
         for draw in range(self.draws):
             rng = np.random.default_rng([self.seed, draw])
-            folds = stratified(self.grasps.objects, rng)
+            folds = stratified_folds(self.grasps.objects, rng)
             for fold in range(FOLDS):
                 trained_on, tested = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
-                chosen = drawn(trained_on, self.grasps.objects, size, rng)
+                chosen = sample_grasps(trained_on, self.grasps.objects, size, rng)
                 trained.append(len(chosen))
                 for name, values in readings.items():
                     leaf = max(1, min(LEAF, len(chosen) // 4))
@@ -280,7 +280,7 @@ class _Trial:
         return skills, float(np.mean(trained))
 
 
-def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
+def stratified_folds(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
     """Return the fold (grasp,), 0 to 4, of each grasp, with each object's grasps distributed evenly over folds."""
     names = np.asarray(objects)
     folds = np.zeros(len(names), np.int64)
@@ -290,15 +290,15 @@ def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
     return folds
 
 
-def drawn(candidates: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
+def sample_grasps(candidates: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
     """Return ``size`` random grasps of each object among ``candidates`` (grasp,), or all if it has fewer."""
     names = np.asarray(objects)[candidates]
     return np.concatenate([rng.permutation(candidates[names == name])[:size] for name in sorted(set(names))])
 
 
 def _by_target(skills: Skills) -> dict[str, dict[str, float | None]]:
-    return {name: _numbers(estimate) for name, estimate in skills.items()}
+    return {name: _estimate_json(estimate) for name, estimate in skills.items()}
 
 
-def _numbers(estimate: Estimate) -> dict[str, float | None]:
+def _estimate_json(estimate: Estimate) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else value for name, value in estimate._asdict().items()}

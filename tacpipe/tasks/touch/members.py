@@ -27,11 +27,11 @@ from tacpipe.training.scaling import Affine
 
 LOSSES = ("rmse", "balanced")
 EPSILON = 1e-6  # added inside the square root, as in the group's published code
-WATCHED = 64  # batch size in validation
+VALIDATION_BATCH = 64  # batch size in validation
 SEEDS = 2**62
 
 
-class Drawn(Protocol):
+class PointSampler(Protocol):
     """Sampler of points: `CloudSources` or `PatchSources` of `tacpipe.tasks.touch.inputs`."""
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
@@ -45,7 +45,7 @@ class Drawn(Protocol):
 class ScaledGrasps:
     """Grasps for training or validation, with their scaled readings."""
 
-    sources: Drawn
+    sources: PointSampler
     values: Tensor  # (grasp, value)
 
     def __len__(self) -> int:
@@ -120,12 +120,12 @@ def output(model: nn.Module, arrays: Arrays) -> Tensor:
     return values
 
 
-def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Float32s:
+def predictions(model: nn.Module, sources: PointSampler, count: int, draws: int) -> Float32s:
     """Return the network's predictions for the first ``count`` grasps, averaged over ``draws``: (grasp, value), scaled."""
     rows = []
     with torch.no_grad():
-        for first in range(0, count, WATCHED):
-            indices = range(first, min(first + WATCHED, count))
+        for first in range(0, count, VALIDATION_BATCH):
+            indices = range(first, min(first + VALIDATION_BATCH, count))
             visits = torch.stack([output(model, sources.fixed(indices, visit)) for visit in range(draws)])
             rows.append(visits.mean(dim=0))
     return torch.cat(rows).cpu().numpy()
@@ -162,7 +162,7 @@ class ForestMember:
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
             raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
-        by_target = averaged((group, forest.predict(rows)) for group, forest in self.forests)
+        by_target = average_by_target((group, forest.predict(rows)) for group, forest in self.forests)
         return np.concatenate([by_target[target] for target in self.targets], axis=1)
 
 
@@ -183,17 +183,17 @@ class NetworkMember:
         return np.asarray(self.scale.restore(values), np.float64)
 
 
-def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
+def split_by_target(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
     """Split the columns of values (grasp, value) by target."""
     ends = np.cumsum([biotac_sp.width(target) for target in targets])[:-1]
     return dict(zip(targets, np.split(values, ends, axis=1), strict=True))
 
 
-def averaged(predictions: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
+def average_by_target(predictions: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
     """Return the mean of several predictions by target (grasp, value); each contains its targets' values as columns."""
     by_target: dict[str, list[Floats]] = {}
     for targets, values in predictions:
-        for target, target_values in parted(values, targets).items():
+        for target, target_values in split_by_target(values, targets).items():
             by_target.setdefault(target, []).append(target_values)
     return {target: np.mean(values, axis=0) for target, values in by_target.items()}
 
@@ -218,13 +218,13 @@ def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
     return built
 
 
-def checked(params: PointNetwork) -> None:
+def check_sizes(params: PointNetwork) -> None:
     """Raise `ValueError` for sizes far above those of any params of `tacpipe train touch`."""
     for name, value in (("draws", params.draws), ("points", params.points)):
         if not 0 < value <= MAX_POINTS:
             raise ValueError(f"{name} is {value}")
 
 
-def sources(params: PointNetwork, grasps: Grasps) -> Drawn:
+def sources(params: PointNetwork, grasps: Grasps) -> PointSampler:
     """Return the point sampler of a network. Raises `TacpipeError` if a grasp lacks an input."""
     return params.point_inputs.sources(grasps.names, grasps.clouds, grasps.grasps)

@@ -82,7 +82,7 @@ class Baselines:
             },
         }
 
-    def same_reading(self, grasps: Grasps) -> Bools:
+    def has_training_reading(self, grasps: Grasps) -> Bools:
         """Return a mask (grasp,) of grasps whose reading equals that of a training grasp, because it was logged twice."""
         before, now = (
             np.concatenate([values[name] for name in self.readings], axis=1)
@@ -220,7 +220,7 @@ class Predictor:
         device = devices.kind()
         with model_files.validated("the model"):
             loaded_members = [
-                _member(params, about, tensors_under(f"{number}.", tensors), device)
+                _load_member(params, about, tensors_under(f"{number}.", tensors), device)
                 for number, about in enumerate(config["members"])
             ]
             baselines = None
@@ -249,7 +249,7 @@ class Predictor:
 
         Raises `TacpipeError` if a grasp lacks inputs of the model: colours, points, the wrist.
         """
-        by_target = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
+        by_target = members.average_by_target((member.targets, member.predict(grasps)) for member in self.members)
         predicted = {target: by_target[target] for target in self.targets}
         if self.shrinkage is None:
             return predicted
@@ -290,7 +290,7 @@ class Predictor:
         ]
 
 
-def _member(params: Params, about: MemberDescription, tensors: dict[str, Tensor], device: str) -> members.Member:
+def _load_member(params: Params, about: MemberDescription, tensors: dict[str, Tensor], device: str) -> members.Member:
     targets = tuple(about["targets"])
     width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:
@@ -309,5 +309,5 @@ def _member(params: Params, about: MemberDescription, tensors: dict[str, Tensor]
     if not isinstance(params, PointNetwork):
         raise ValueError(f"the architecture {params.architecture} has a network")
     network = model_files.filled(lambda: members.network(params, targets), tensors_under("network.", tensors))
-    members.checked(params)
+    members.check_sizes(params)
     return members.NetworkMember(targets, network.to(device).eval(), scale, params)

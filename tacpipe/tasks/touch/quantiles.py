@@ -67,7 +67,7 @@ class ReadingQuantiles:
             errors = (calibration.readings[target] - values) / unit
             model_offsets[target] = _quantiles(errors, levels, promised)[:, None] * unit
             constant_offsets[target] = np.quantile(training_values - training_values.mean(axis=0), levels, axis=0)
-            object_offsets[target] = np.quantile(_about_objects(training_values, training.objects), levels, axis=0)
+            object_offsets[target] = np.quantile(_minus_object_means(training_values, training.objects), levels, axis=0)
         return cls(levels, {MODEL: model_offsets, CONSTANT: constant_offsets, OBJECT_MEAN: object_offsets})
 
     def to_bytes(self) -> bytes:
@@ -190,7 +190,7 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
     return offsets
 
 
-def _about_objects(values: Floats, objects: Sequence[str]) -> Floats:
+def _minus_object_means(values: Floats, objects: Sequence[str]) -> Floats:
     """Return readings (grasp, value) minus the mean of the grasps of the same object."""
     deviations = np.empty_like(values)
     names = np.array(objects)

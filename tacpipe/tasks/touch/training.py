@@ -27,7 +27,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members, predictor
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import require_colours
-from tacpipe.tasks.touch.members import Drawn, ScaledGrasps, TouchWork
+from tacpipe.tasks.touch.members import PointSampler, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.params import MemberDescription, Params, PointNetwork, TouchConfig, Trees
 from tacpipe.tasks.touch.predictor import (
     BASELINES,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-LEAVES = (2, 4, 8)  # leaf sizes to try
+LEAF_SIZES = (2, 4, 8)  # leaf sizes to try
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
     groups: list[tuple[str, ...]] = [(target,) for target in targets]
     if params.adds_joint_forest and len(targets) > 1:
         groups.append(tuple(targets))
-    forests, leaves = _forests(params, rows, readings, groups)
+    forests, leaves = _fit_forests(params, rows, readings, groups)
     description: MemberDescription = {
         "kind": FOREST,
         "targets": list(targets),
@@ -165,8 +165,8 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
 
         def predict(in_training: Bools) -> dict[str, Floats]:
             training_readings = {target: values[in_training] for target, values in readings.items()}
-            grown, _ = _forests(params, rows[in_training], training_readings, groups)
-            return members.averaged((group, forest.predict(rows[~in_training])) for group, forest in grown)
+            grown, _ = _fit_forests(params, rows[in_training], training_readings, groups)
+            return members.average_by_target((group, forest.predict(rows[~in_training])) for group, forest in grown)
 
         shrunk = predictor.fit_shrinkage(readings, training.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
@@ -175,7 +175,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
         )
 
 
-def _forests(
+def _fit_forests(
     params: Trees, rows: Floats, readings: Mapping[str, Floats], groups: Sequence[tuple[str, ...]]
 ) -> tuple[list[tuple[tuple[str, ...], Forest]], list[int]]:
     """Return a forest for each group of targets, which predicts their values as columns, and the leaf sizes."""
@@ -183,16 +183,16 @@ def _forests(
     for group in groups:
         values = np.concatenate([readings[target] for target in group], axis=1)
         unit = members.units(values, group)
-        leaf = params.leaf or _leaf(rows, values / unit, params)
+        leaf = params.leaf or _best_leaf_size(rows, values / unit, params)
         forest = Forest.fitted(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
         forests.append((group, forest.times(unit)))
         leaves.append(leaf)
     return forests, leaves
 
 
-def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
+def _best_leaf_size(rows: Floats, values: Floats, params: Trees) -> int:
     """Return the leaf size with the least out-of-bag error."""
-    fitting = [leaf for leaf in LEAVES if 2 * leaf <= len(rows)] or LEAVES[:1]
+    fitting = [leaf for leaf in LEAF_SIZES if 2 * leaf <= len(rows)] or LEAF_SIZES[:1]
     if len(fitting) == 1:
         return fitting[0]
     errors = [Forest.out_of_bag_error(rows, values, leaf=leaf, seed=params.seed) for leaf in fitting]
@@ -213,12 +213,12 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
     parameters = 0
     groups = [tuple(targets)] if params.multi_target else [(target,) for target in targets]
     for at, group in enumerate(groups):
-        scale = _scale(training, group, params.loss)
-        work = _work(params, scale, (training_sources, validation_sources), group, device)
+        scale = _output_scale(training, group, params.loss)
+        work = _network_work(params, scale, (training_sources, validation_sources), group, device)
         for number in range(params.networks):
             place = grasps.workspace / f"{'-'.join(group)}-{number}"
             schedule = loop.Schedule.from_params(params, params.seed + 1000 * number)
-            build = functools.partial(_built, params, group, device)
+            build = functools.partial(_build_network, params, group, device)
             labels: NetworkLabels = {
                 "target": "all" if params.multi_target else group[0],
                 "network": number,
@@ -234,7 +234,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
                 labels=labels,
             )
             kept = trained.weights if params.select == "best" else trained.last
-            parameters += _weights_learned(params, group)
+            parameters += _parameter_count(params, group)
             about: MemberDescription = {"kind": NETWORK, "targets": list(group)}
             named = {f"network.{name}": value for name, value in kept.items()}
             named |= {
@@ -245,40 +245,40 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
     model.config["parameters"] = parameters
 
 
-def _work(
-    params: PointNetwork, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
+def _network_work(
+    params: PointNetwork, scale: Affine, parts: Sequence[tuple[PointSampler, Grasps]], group: Sequence[str], device: str
 ) -> TouchWork:
     """Return the training of a network; the first of ``parts`` is for training, the second for validation."""
     training, watched = (
-        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(grasps, group))).to(device))
+        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_target_values(grasps, group))).to(device))
         for drawn, grasps in parts
     )
-    return TouchWork(training, watched, params.batch, params.loss, _weights(group).to(device))
+    return TouchWork(training, watched, params.batch, params.loss, _loss_weights(group).to(device))
 
 
-def _built(params: PointNetwork, targets: Sequence[str], device: str) -> nn.Module:
+def _build_network(params: PointNetwork, targets: Sequence[str], device: str) -> nn.Module:
     return members.network(params, targets).to(device)
 
 
-def _weights_learned(params: PointNetwork, targets: Sequence[str]) -> int:
+def _parameter_count(params: PointNetwork, targets: Sequence[str]) -> int:
     """Return the number of trainable parameters of a network, without running means of batch normalisation."""
     with torch.device("meta"):  # only shapes are needed
         return sum(weight.numel() for weight in members.network(params, targets).parameters())
 
 
-def _side_by_side(grasps: Grasps, group: Sequence[str]) -> Floats:
+def _target_values(grasps: Grasps, group: Sequence[str]) -> Floats:
     return np.concatenate([grasps.readings[target] for target in group], axis=1)
 
 
-def _scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
+def _output_scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
     """Return the output scale: fixed ranges for the letter's loss, otherwise mean and spread of each value."""
     if loss != "rmse":
-        return Affine.fit(_side_by_side(training, group), "standard")
+        return Affine.fit(_target_values(training, group), "standard")
     ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])
     return Affine(ranges[:, 0], ranges[:, 1] - ranges[:, 0])
 
 
-def _weights(group: Sequence[str]) -> Tensor:
+def _loss_weights(group: Sequence[str]) -> Tensor:
     """Return loss weights (value,) with mean 1 that give every target the same total weight."""
     shares = [1 / biotac_sp.width(target) for target in group for _ in range(biotac_sp.width(target))]
     weights = torch.tensor(shares)

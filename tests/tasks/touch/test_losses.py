@@ -74,7 +74,7 @@ def test_the_papers_loss_is_the_root_of_the_mean_square_over_grasps_and_values()
 
 def test_the_balanced_loss_counts_every_target_alike() -> None:
     group = ("pdc_th", "e_th")
-    weights = training._weights(group)
+    weights = training._loss_weights(group)
     assert weights.shape == (25,)
     assert weights.mean().item() == pytest.approx(1)
     assert weights[0].item() == pytest.approx(weights[1:].sum().item())

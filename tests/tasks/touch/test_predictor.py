@@ -89,7 +89,7 @@ def test_a_tree_ensemble_predicts_the_mean_of_a_targets_own_forest_and_that_of_a
 
 
 def test_values_side_by_side_part_into_their_targets() -> None:
-    parts = members.parted(np.arange(52.0).reshape(2, 26), ("pdc_th", "e_mf", "pdc_mf"))
+    parts = members.split_by_target(np.arange(52.0).reshape(2, 26), ("pdc_th", "e_mf", "pdc_mf"))
     assert list(parts) == ["pdc_th", "e_mf", "pdc_mf"]
     assert (parts["pdc_th"].tolist(), parts["pdc_mf"].tolist()) == ([[0], [26]], [[25], [51]])
     assert parts["e_mf"][1].tolist() == list(range(27, 51))

@@ -88,14 +88,14 @@ def test_no_pair_implies_nothing() -> None:
 
 def test_folds_spread_each_object_and_a_size_is_of_each_object() -> None:
     objects = ["cup"] * 10 + ["bowl"] * 7
-    folds = limits_of.stratified(objects, np.random.default_rng(0))
+    folds = limits_of.stratified_folds(objects, np.random.default_rng(0))
     assert np.bincount(folds[:10]).tolist() == [2] * 5
     assert sorted(np.bincount(folds[10:]).tolist()) == [1, 1, 1, 2, 2]
     candidates = np.flatnonzero(folds != 0)
-    chosen = limits_of.drawn(candidates, objects, 3, np.random.default_rng(0))
+    chosen = limits_of.sample_grasps(candidates, objects, 3, np.random.default_rng(0))
     assert sorted(objects[at] for at in chosen) == ["bowl"] * 3 + ["cup"] * 3
     assert set(chosen) <= set(candidates)
-    assert len(limits_of.drawn(candidates, objects, 99, np.random.default_rng(0))) == len(candidates)
+    assert len(limits_of.sample_grasps(candidates, objects, 99, np.random.default_rng(0))) == len(candidates)
 
 
 @pytest.mark.long

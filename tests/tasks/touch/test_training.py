@@ -340,5 +340,5 @@ def test_without_baselines_nothing_that_was_felt_is_kept(tmp_path: Path) -> None
 
 
 def test_sizes_of_leaves_that_are_tried_are_those_the_help_names() -> None:
-    assert training.LEAVES == (2, 4, 8)
+    assert training.LEAF_SIZES == (2, 4, 8)
     assert len(OBJECTS) == 2

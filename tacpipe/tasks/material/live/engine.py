@@ -1,6 +1,6 @@
 """Convert the blocks of a live session to predictions of a material model.
 
-A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones (`parts`).
+A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones (`split_slides`).
 Several times a second the current slide is classified from all samples up to that time. The last prediction of a slide,
 from all of its samples, is final.
 """
@@ -21,7 +21,7 @@ from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
-from tacpipe.tasks.material.live.slide import Answer, Parting, SlideSoFar, after, up_to
+from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, SlideSplitter, rows_after, rows_until
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,7 +34,7 @@ THROWN = "blocks were thrown away under overload"
 
 
 @dataclass(frozen=True)
-class Begun:
+class RunningRecording:
     """Indicates a running recording to a process that replaces another one and lacks the earlier samples."""
 
     def to_json(self) -> Json:
@@ -58,16 +58,16 @@ class MaterialEngine(Engine):
     ) -> None:
         """Store the sensors and settings. If ``pause_ns`` is 0, a recording is one slide."""
         super().__init__(sensors, settle_ns)
-        self._parting = Parting(slide, finger, pause_ns) if pause_ns else None
+        self._splitter = SlideSplitter(slide, finger, pause_ns) if pause_ns else None
         self._number = 1  # index of the slide in its recording
         self.every_ns = every_ns
         self._late = 0
         self._finger, self._slide, self._description = finger, slide, description
-        self._lacks = ""  # reason why this recording gets no more predictions
+        self._stop_reason = ""  # reason why this recording gets no more predictions
         self._continues = False
         self._decoders: dict[str, Decoder] = {}
         self._tables: dict[str, pa.Table] = {}
-        self._over: set[str] = set()  # streams without further data for the recording
+        self._ended_streams: set[str] = set()  # streams without further data for the recording
         self._due_ns: int | None = None
         self._read_ns = 0  # end of the samples that were read
 
@@ -77,9 +77,9 @@ class MaterialEngine(Engine):
         return self._late
 
     @property
-    def beginning(self) -> Begun | None:
+    def beginning(self) -> RunningRecording | None:
         """Marker of a running recording."""
-        return Begun() if self.running else None
+        return RunningRecording() if self.running else None
 
     def describe(self, model: str) -> MaterialDescription:
         """Return the description of the session's messages."""
@@ -91,12 +91,12 @@ class MaterialEngine(Engine):
 
     def begin_recording(self, offset_ns: int) -> None:
         """Start a recording."""
-        self._lacks, self._continues = RESTARTED if self._continues else "", False
+        self._stop_reason, self._continues = RESTARTED if self._continues else "", False
         self._due_ns, self._read_ns = None, 0
-        self._decoders, self._tables, self._over = {}, {}, set()
+        self._decoders, self._tables, self._ended_streams = {}, {}, set()
         self._number = 1
-        if self._parting is not None:
-            self._parting.begin()
+        if self._splitter is not None:
+            self._splitter.begin()
 
     def end_recording(self) -> None:
         """Wait for the ends of its streams; a recording ends with the last of them."""
@@ -104,7 +104,7 @@ class MaterialEngine(Engine):
     def overflow(self) -> None:
         """Stop predictions for this recording, because blocks are missing."""
         super().overflow()
-        self._lacks = THROWN
+        self._stop_reason = THROWN
 
     def begin_stream(self, stream: str) -> None:
         """Decode a stream from the start of the recording."""
@@ -112,7 +112,7 @@ class MaterialEngine(Engine):
 
     def end_stream(self, stream: str) -> None:
         """Mark a stream as ended for the recording."""
-        self._over.add(stream)
+        self._ended_streams.add(stream)
 
     def take_note(self, stream: str, note: StreamNote) -> None:
         """Process a note on a stream; lost bytes are reported to its decoder."""
@@ -125,31 +125,35 @@ class MaterialEngine(Engine):
         self._keep(stream, chunks)
 
     def _keep(self, stream: str, block: Chunks | StreamNote) -> None:
-        if stream in self._decoders and stream not in self._over:
+        if stream in self._decoders and stream not in self._ended_streams:
             self._decoders[stream].take(block)
 
     def due_ns(self, now_ns: int) -> int:
         """Return the monotonic time of the next call of `step`."""
-        return now_ns + IDLE_NS if self._due_ns is None or self._over else max(self._due_ns, now_ns + IDLE_NS // 20)
+        return (
+            now_ns + IDLE_NS
+            if self._due_ns is None or self._ended_streams
+            else max(self._due_ns, now_ns + IDLE_NS // 20)
+        )
 
     def step(self, now_ns: int) -> list[MaterialMessage]:
         """Return the final messages of ended slides, followed by the message that is due."""
         if self._offset_ns is None:
             return []
-        if self._over:
-            return self.finish() if self._over >= set(self.sensors) else []
+        if self._ended_streams:
+            return self.finish() if self._ended_streams >= set(self.sensors) else []
         if self._due_ns is not None and now_ns < self._due_ns:
             return []
         if self._due_ns is not None:
             self.skipped += (now_ns - self._due_ns) // self.every_ns
         self._due_ns = now_ns + self.every_ns
-        return self._answered(now_ns + self._offset_ns - self.settle_ns, final=False)
+        return self._messages_until(now_ns + self._offset_ns - self.settle_ns, final=False)
 
     def finish(self) -> list[MaterialMessage]:
         """Return the remaining final messages of the ended recording."""
         if self._offset_ns is None:
             return []
-        messages = self._answered(0, final=True)
+        messages = self._messages_until(0, final=True)
         self._offset_ns = None
         return messages
 
@@ -158,35 +162,35 @@ class MaterialEngine(Engine):
         if self._offset_ns is not None and message.made_from_t_ns:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
-    def _answered(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
+    def _messages_until(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
         """Return the messages for all samples up to a time; a recording's final message uses all samples."""
         began_s = time.perf_counter()
         self._fetch(final=final)
         if final:
             last = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
             until_ns = int(max(last, default=self._read_ns))
-        messages = self._final_ones(until_ns)
+        messages = self._final_messages(until_ns)
         if not messages or self._finger in self._tables:  # otherwise the next slide has no samples yet
             messages.append(self._message(until_ns, final=final))
         messages[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
         return messages
 
-    def _final_ones(self, until_ns: int) -> list[MaterialMessage]:
+    def _final_messages(self, until_ns: int) -> list[MaterialMessage]:
         """Return the final messages of slides that ended by ``until_ns``, and discard their samples."""
         messages: list[MaterialMessage] = []
-        while self._parting is not None and not self._lacks:
-            end_ns = self._parting.end_ns(self._tables, until_ns)
+        while self._splitter is not None and not self._stop_reason:
+            end_ns = self._splitter.end_ns(self._tables, until_ns)
             if end_ns is None:
                 break
             messages.append(self._message(end_ns, final=True))
-            self._tables = after(self._tables, end_ns)
+            self._tables = rows_after(self._tables, end_ns)
             self._number += 1
-            self._parting.begin()
+            self._splitter.begin()
         return messages
 
     def _message(self, until_ns: int, *, final: bool) -> MaterialMessage:
         """Return the message for the slide's samples up to a time."""
-        streams = up_to(self._tables, until_ns)
+        streams = rows_until(self._tables, until_ns)
         newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
         answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
         self._read_ns = max(self._read_ns, until_ns)
@@ -206,18 +210,18 @@ class MaterialEngine(Engine):
         )
 
     def _answer(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
-        if self._lacks:
-            return Answer(None, cause=self._lacks)
+        if self._stop_reason:
+            return Answer(None, cause=self._stop_reason)
         if self._finger not in streams:
             return Answer(None, cause=f"nothing comes from {self._finger}")
         if silent_ns > GAP_NS:
             return Answer(None, cause=f"nothing new comes from {self._finger}")
         t_ns = streams[self._finger].column("t_ns")
         if t_ns[-1].as_py() - t_ns[0].as_py() > MAX_DURATION_NS:
-            self._lacks = (
+            self._stop_reason = (
                 f"the recording is longer than {MAX_DURATION_NS / 1e9:g} s; begin another one for the next slide"
             )
-            return Answer(None, cause=self._lacks)
+            return Answer(None, cause=self._stop_reason)
         return self._slide.answer(streams)
 
     def _fetch(self, *, final: bool) -> None:
@@ -228,7 +232,7 @@ class MaterialEngine(Engine):
         for name, decoder in self._decoders.items():
             batches = decoder.last() if final else decoder.batches()
             new_tables = [decoder.columns(batch, self._offset_ns).table() for batch in batches]
-            if not new_tables or self._lacks:
+            if not new_tables or self._stop_reason:
                 continue
             self._late += sum(int((table.column("t_ns").to_numpy() <= self._read_ns).sum()) for table in new_tables)
             before = [self._tables[name]] if name in self._tables else []

@@ -24,7 +24,7 @@ from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS
 from tacpipe.tasks.material.live.messages import MATERIAL, MIN_SEEN
-from tacpipe.tasks.material.slides import STREAM, difference
+from tacpipe.tasks.material.slides import STREAM, describe_difference
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -66,7 +66,7 @@ def slide_params(steps: Sequence[Step]) -> Any:
 
 
 @dataclass(frozen=True)
-class Held:
+class RecordingSoFar:
     """Streams of a recording so far, with the interface that stages read."""
 
     tables: Mapping[str, pa.Table]
@@ -124,7 +124,7 @@ class SlideSoFar:
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
         """Return the prediction for a recording of these streams that ends now."""
-        recording = Held(streams, self._attributes)
+        recording = RecordingSoFar(streams, self._attributes)
         try:
             segmented = self._stage(replace(self._params, crop="none"), recording)
         except TacpipeError:
@@ -134,18 +134,22 @@ class SlideSoFar:
         newest_ns = finger("so far", streams).column("t_ns")[-1].as_py()
         is_over = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
         try:
-            cut, lacks = self._cut(recording, table)
+            cut, lacks = self._slide_rows(recording, table)
             layout, frames = slides_of.frames(cut, self._sensor, self._classifier.quantities)
         except TacpipeError as error:
             return Answer(None, rows, 0.0, is_over, str(error))
         answer = Answer(None, rows, min(1.0, len(frames) / self.frames), is_over)
         if layout.channels != self._layout.channels or len(frames) > self.frames:
-            return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+            return replace(
+                answer, cause=f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
+            )
         if len(frames) < self.frames and not (self.any_length and answer.fraction >= self._least_fraction):
             enough = f"{self._least_fraction:.0%} of {self.frames}" if self.any_length else str(self.frames)
             return replace(answer, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
-        if not lacks and not self._layout.alike(layout):
-            return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+        if not lacks and not self._layout.is_compatible(layout):
+            return replace(
+                answer, cause=f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
+            )
         scores = self._reader.read(frames[None]).scores
         if self._classifier.is_unknown(scores, frames[None], self._sensor)[0]:
             return replace(answer, scores=scores[0], cause=UNLIKE)
@@ -164,7 +168,9 @@ class SlideSoFar:
         if finger_stream not in tables:
             return False
         try:
-            slide = self._stage(replace(self._params, crop="none"), Held(tables, self._attributes)).streams[STREAM]
+            slide = self._stage(replace(self._params, crop="none"), RecordingSoFar(tables, self._attributes)).streams[
+                STREAM
+            ]
         except TacpipeError:  # no slide has started
             return False
         newest_ns, last_ns = (table.column("t_ns")[-1].as_py() for table in (tables[finger_stream], slide))
@@ -175,21 +181,21 @@ class SlideSoFar:
         """Whether a slide ends only when the arm stops."""
         return bool(self._params.trigger != "load")
 
-    def _cut(self, recording: Held, table: pa.Table) -> tuple[Any, bool]:
+    def _slide_rows(self, recording: RecordingSoFar, table: pa.Table) -> tuple[Any, bool]:
         """Return the rows of the slide, as the stage selects them or as far as available, and whether it did."""
         params = self._params
         first = params.offset_frames if params.crop == "offset" else 0
         if params.crop == "none" or table.num_rows - first >= params.frames:
             cut = self._stage(params, recording)
-            return Held(cut.streams, {**recording.attributes, **cut.attributes}), False
+            return RecordingSoFar(cut.streams, {**recording.attributes, **cut.attributes}), False
         remaining = table.slice(min(first, table.num_rows))
-        return Held({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
+        return RecordingSoFar({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
 
 
 MOMENT_NS = 100_000_000  # interval between checks of a part, starting at the finger's first sample
 
 
-class Parting:
+class SlideSplitter:
     """Detects the ends of slides in the samples of a part of a recording."""
 
     def __init__(self, slide: SlideSoFar, finger: str, pause_ns: int) -> None:
@@ -211,17 +217,17 @@ class Parting:
         first_ns = int(tables[self._finger].column("t_ns")[0].as_py())
         while (at_ns := first_ns + (self._moments + 1) * MOMENT_NS) <= until_ns:
             self._moments += 1
-            if self._slide.is_over(up_to(tables, at_ns), self._finger, self._pause_ns):
+            if self._slide.is_over(rows_until(tables, at_ns), self._finger, self._pause_ns):
                 return at_ns
         return None
 
 
-def up_to(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
+def rows_until(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
     """Return the rows of each stream up to a time; empty streams are omitted."""
     return {name: tables[name].slice(0, count) for name, count in _counts(tables, t_ns).items() if count}
 
 
-def after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
+def rows_after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
     """Return the rows of each stream after a time; empty streams are omitted."""
     counts = _counts(tables, t_ns)
     return {name: tables[name].slice(count) for name, count in counts.items() if count < tables[name].num_rows}
@@ -234,22 +240,24 @@ def _counts(tables: Tables, t_ns: int) -> dict[str, int]:
     }
 
 
-def parts(slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables) -> Iterator[tuple[int, dict[str, pa.Table]]]:
+def split_slides(
+    slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables
+) -> Iterator[tuple[int, dict[str, pa.Table]]]:
     """Yield the end and the streams of each part of a recording; if ``pause_ns`` is 0, there is one part."""
     remaining = {name: table for name, table in tables.items() if table.num_rows}
     last_ns = max((int(table.column("t_ns")[-1].as_py()) for table in remaining.values()), default=0)
-    parting = Parting(slide, finger, pause_ns)
-    parted = False
-    while pause_ns and (end_ns := parting.end_ns(remaining, last_ns)) is not None:
-        yield end_ns, up_to(remaining, end_ns)
-        remaining, parted = after(remaining, end_ns), True
-        parting.begin()
-    if finger in remaining or not parted:
+    splitter = SlideSplitter(slide, finger, pause_ns)
+    was_split = False
+    while pause_ns and (end_ns := splitter.end_ns(remaining, last_ns)) is not None:
+        yield end_ns, rows_until(remaining, end_ns)
+        remaining, was_split = rows_after(remaining, end_ns), True
+        splitter.begin()
+    if finger in remaining or not was_split:
         yield last_ns, remaining
 
 
-PAUSE, LEAST = "live_pause_s", "live_least"  # attributes with the settings of a session's recording
-UNREAD = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that sessions do not read
+PAUSE_ATTR, LEAST_ATTR = "live_pause_s", "live_least"  # attributes with the settings of a session's recording
+UNREAD_STREAMS = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that sessions do not read
 Row = tuple[str, int, int, Answer]  # recording, index of the slide, end of the samples that were read, prediction
 
 
@@ -271,7 +279,7 @@ def predict(model: Model, recordings: Dataset) -> Result:
 
 
 def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
-    tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD}
+    tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD_STREAMS}
     attributes = recording.attributes
     table = finger(recording.name, tables)
     stream = next(name for name, candidate in tables.items() if candidate is table)
@@ -279,10 +287,10 @@ def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[R
         attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))
     )
     rate_hz = attributes.get("rate_hz")
-    least_seen = float(attributes.get(LEAST) or MIN_SEEN)
+    least_seen = float(attributes.get(LEAST_ATTR) or MIN_SEEN)
     slide = SlideSoFar(classifier, params, sensor, least_seen, float(rate_hz) if rate_hz else None)
-    pause_ns = round(float(attributes.get(PAUSE) or 0.0) * 1e9)
-    numbered_parts = enumerate(parts(slide, stream, pause_ns, tables), start=1)
+    pause_ns = round(float(attributes.get(PAUSE_ATTR) or 0.0) * 1e9)
+    numbered_parts = enumerate(split_slides(slide, stream, pause_ns, tables), start=1)
     return [(recording.name, number, end_ns, slide.answer(part)) for number, (end_ns, part) in numbered_parts]
 
 

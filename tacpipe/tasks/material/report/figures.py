@@ -233,7 +233,7 @@ def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
 def count_nearest_partners(
     first: SlidePredictions, second: SlidePredictions, partners: Mapping[int, int]
 ) -> tuple[int, int]:
-    """Return how many materials are nearest to their partner by class means, and how many there are.
+    """Return how many materials are nearest to their partner by class means, and how many were compared.
 
     All latents are used. ``partners`` maps materials to those of the other sensor; missing materials map to themselves.
     """

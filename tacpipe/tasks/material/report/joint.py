@@ -57,9 +57,9 @@ PRINTED_BASIS = (
 )
 
 
-ALIKE = 2.0  # latents of permuted pairs count as equally close as those of real pairs up to this factor
-APART = 0.2  # loss of accuracy with exchanged classifiers above which sensors are not aligned
-LOSS = 0.05  # additional loss of accuracy with exchanged classifiers compared with real pairs
+MAX_DISTANCE_RATIO = 2.0  # latents of permuted pairs count as equally close as those of real pairs up to this factor
+MAX_SWAP_LOSS = 0.2  # loss of accuracy with exchanged classifiers above which sensors are not aligned
+MAX_EXTRA_SWAP_LOSS = 0.05  # additional loss of accuracy with exchanged classifiers compared with real pairs
 NO_CONTROL = (
     "No run with permuted materials is among the results, so whether labels alone drive the alignment was not tested."
 )
@@ -94,13 +94,13 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
         }
         for at, item in enumerate((joint, permuted))
     ]
-    if max(costs[0].values()) > APART:
+    if max(costs[0].values()) > MAX_SWAP_LOSS:
         return (
             f"Even real pairs have not aligned: exchanged classifiers name {100 * max(costs[0].values()):.1f} points "
             f"fewer slides right than the sensors' own, so the control has nothing to be compared with."
         )
-    aligns = alignments[1] <= ALIKE * alignments[0]
-    works = all(costs[1][sensor] - costs[0][sensor] <= LOSS for sensor in costs[0])
+    aligns = alignments[1] <= MAX_DISTANCE_RATIO * alignments[0]
+    works = all(costs[1][sensor] - costs[0][sensor] <= MAX_EXTRA_SWAP_LOSS for sensor in costs[0])
     numbers = (
         f"latent difference {number(alignments[1]).text} against {number(alignments[0]).text}; classifiers exchanged: "
         + ", ".join(
@@ -374,12 +374,12 @@ def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
 
 def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
     """Return the runs with held-out materials, grouped if they differ only in these materials, by sensor."""
-    alike: dict[str, list[Method]] = {}
+    groups: dict[str, list[Method]] = {}
     for method in methods:
         if any("zero_shot" in result.metrics for result in method.details):
-            alike.setdefault(method.key_without("hold_out"), []).append(method)
+            groups.setdefault(method.key_without("hold_out"), []).append(method)
     scored_methods = []
-    for same in alike.values():
+    for same in groups.values():
         runs: list[tuple[ZeroShotAccuracy, Method]] = [
             (result.metrics["zero_shot"], method)
             for method in same

@@ -119,7 +119,11 @@ def settings(results: Sequence[MaterialResult]) -> list[Settings]:
             most_slides[sensor] = max(count, most_slides.get(sensor, 0))
     fractions: list[float] = []
     return [
-        {**_settings(result), "elsewhere": place != main, **_few(result, all_slides.get(place, {}), fractions)}
+        {
+            **_settings(result),
+            "elsewhere": place != main,
+            **_reduced_counts(result, all_slides.get(place, {}), fractions),
+        }
         for result, place in zip(results, places, strict=True)
     ]
 
@@ -244,7 +248,7 @@ def _settings(run: MaterialResult) -> Settings:
     }
 
 
-def _few(run: MaterialResult, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
+def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run if reduced, and the reduced sensors if not all are.
 
     Numbers are rounded to those of earlier runs with about as many slides; their fractions are stored in ``described``.
@@ -295,7 +299,7 @@ def question_on(run: ComparedRun, sensor: str) -> Question | None:
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 
-def named_right(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
+def correct_by_recording(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
     """Return (correct, 1) for each slide of a sensor by recording, where correct is 1 or 0."""
     rows = result.predictions.of(sensor)
     triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
@@ -307,7 +311,9 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
     classes = len(result.config.get("classes", ()))
     questions = {}
     for sensor in result.sensors:
-        sums = {predictor: named_right(result, sensor, predictor) for predictor in result.predictions.predicted}
+        sums = {
+            predictor: correct_by_recording(result, sensor, predictor) for predictor in result.predictions.predicted
+        }
         if classes:
             sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
         part = ", ".join(filter(None, (sensor_title(sensor), place)))

@@ -88,15 +88,15 @@ class TouchReport(TaskReport):
         methods = context.methods
         if not methods:
             return figures.cloud_folds(context.others, {})
-        parted = grouped_by_split(methods)
-        first = (context.winner(next(iter(context.parts))) if context.parts else None) or default_method(parted[0])
+        groups = grouped_by_split(methods)
+        first = (context.winner(next(iter(context.parts))) if context.parts else None) or default_method(groups[0])
         chosen = {
             grasp.recording: f"{grasp.place} by error" for grasp in figures.choose_grasps(first.details[0].predictions)
         }
         folds: list[Fold] = []
-        for group in parted:
+        for group in groups:
             result = group[0].details[0]
-            place = f": {describe_split(result.split, result.simulated)}" if len(parted) > 1 else ""
+            place = f": {describe_split(result.split, result.simulated)}" if len(groups) > 1 else ""
             folds += blocks.fold(f"By object{place}", *tables_by_object(group))
             drawn = figures.loss_charts(group)
             folds += blocks.fold(f"Training{place}", Charts(drawn)) if drawn else []

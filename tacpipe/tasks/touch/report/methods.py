@@ -88,7 +88,7 @@ def method_names(results: Sequence[TouchResult]) -> list[str]:
     names_by_key: dict[str, str] = {}
     for architecture in {settings.architecture for settings in results}:
         same = {key: settings for key, settings in settings_by_key.items() if settings["architecture"] == architecture}
-        usual = _usual_settings([(settings, runs[key]) for key, settings in same.items()])
+        usual = _most_common_settings([(settings, runs[key]) for key, settings in same.items()])
         distinct = distinct_names([(architecture, settings) for settings in same.values()], usual)
         names_by_key |= {
             key: " · ".join([*_first_names(settings), *marks(differing)])
@@ -170,14 +170,14 @@ def _first_names(settings: Settings) -> list[str]:
     ]
 
 
-def _usual_settings(alike: Sequence[tuple[Settings, int]]) -> list[tuple[str, Scalar]]:
+def _most_common_settings(settings_and_runs: Sequence[tuple[Settings, int]]) -> list[tuple[str, Scalar]]:
     """Return the most common setting by name, given (settings, number of runs); ties are resolved by runs.
 
     Splits and simulated grasps are never marked, because they have their own headings. Colour is part of the base name.
     """
     usual = []
-    for name in sorted({name for settings, _ in alike for name in settings}):
-        values_and_runs = [(settings[name], runs) for settings, runs in alike if name in settings]
+    for name in sorted({name for settings, _ in settings_and_runs for name in settings}):
+        values_and_runs = [(settings[name], runs) for settings, runs in settings_and_runs if name in settings]
         values = [value for value, _ in values_and_runs]
         weights = [
             (values.count(candidate), sum(runs for value, runs in values_and_runs if value == candidate))
@@ -199,7 +199,7 @@ RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
 )
-IN_A_ROW = 0.75  # fraction of successive grasps of the same object above which objects were not interleaved
+MAX_IN_A_ROW = 0.75  # fraction of successive grasps of the same object above which objects were not interleaved
 
 
 def caution(methods: Sequence[Method]) -> str:
@@ -209,7 +209,9 @@ def caution(methods: Sequence[Method]) -> str:
     counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]
     same, follow_any = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     return (
-        RECORDED.format(same=f"{same:,}", all=f"{follow_any:,}") if follow_any and same / follow_any >= IN_A_ROW else ""
+        RECORDED.format(same=f"{same:,}", all=f"{follow_any:,}")
+        if follow_any and same / follow_any >= MAX_IN_A_ROW
+        else ""
     )
 
 

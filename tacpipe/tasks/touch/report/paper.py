@@ -249,16 +249,16 @@ def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Meth
 
     If there are several such families, the one with the most rows, then with the most runs, is returned.
     """
-    alike: dict[str, dict[object, Method]] = {}
+    families: dict[str, dict[object, Method]] = {}
     for method in methods:
         value = method.settings.get(form.setting)
         if method.settings["architecture"] == PAPER and value in form.names and score_on_target(method):
-            alike.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
+            families.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
 
     def place(by_value: Mapping[object, Method]) -> tuple[int, int]:
         return len(by_value), sum(len(method.runs) for method in by_value.values())
 
-    return max(alike.values(), key=place, default={})
+    return max(families.values(), key=place, default={})
 
 
 def score_on_target(method: Method) -> Score | None:
