@@ -1,4 +1,4 @@
-"""Parse the options of ``tacpipe acquire`` and print its report; `stages/acquire.py` records."""
+"""Parse the options of ``tacpipe acquire`` and print its report; `stages/acquire.py` does the recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.recording.trials import Recorded
 
 SCHEMA_VERSION = 1
-RATE_OFF = 0.1  # Largest relative deviation from the rig file's rate that is not reported
+RATE_OFF = 0.1  # Maximum relative deviation from the rig file's rate that is not reported
 
 
 def add(program: typer.Typer, help_text: str) -> None:
@@ -104,7 +104,7 @@ def add(program: typer.Typer, help_text: str) -> None:
         recorded, lost = commands.record(parsed_rig, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
         _report(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
-        if lost and as_json:  # The JSON object on stdout has the error already.
+        if lost and as_json:  # The JSON object on stdout already contains the error.
             terminal.note(f"tacpipe: {failed}")
             raise typer.Exit(failed.exit_code)
         if lost:
@@ -112,7 +112,7 @@ def add(program: typer.Typer, help_text: str) -> None:
 
 
 def _dry_run(commands: Any, rig: Rig, *, as_json: bool) -> str:
-    """Return the figures of every stream of a rig, as lines or as one JSON object."""
+    """Measure every stream of a rig and return the figures as lines or as one JSON object."""
     from dataclasses import asdict
 
     from tacpipe.recording.recorder import complete_rig

@@ -1,4 +1,4 @@
-"""Add the command ``tacpipe candidates``: possible grasps on an object, with the touch that a model predicts for each."""
+"""Add the command ``tacpipe candidates``, which prints possible grasps on an object and a model's prediction for each."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _on_terminal() -> bool:
 
 
 def _cloud(path: Path, recording: str | None) -> Cloud:
-    """Return the cloud of a file, or of one recording of a dataset."""
+    """Return the cloud from a file, or from one recording of a dataset."""
     from tacpipe.clouds import files
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.engine import pipeline
@@ -143,7 +143,7 @@ def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
 
 
 def _row(rank: int, candidate: Candidate) -> Row:
-    """Return a candidate's values by column; the unit ends a column's name."""
+    """Return a candidate's values by column; column names end with the unit."""
     from tacpipe.clouds.grasp import POINTS, WRIST
 
     grasp = candidate.grasp
@@ -175,7 +175,7 @@ def _csv(rows: list[Row]) -> str:
 
 
 def _require_names(output: Path | None, picture: Path | None) -> None:
-    """Raise `UsageError` before anything is computed if an output has another suffix or belongs to another program."""
+    """Raise `UsageError` before any computation if an output has a wrong suffix or is a file of another program."""
     if output is not None:
         if output.suffix.lower() != ".csv":
             raise UsageError(f"{output} must end in .csv, because the command writes CSV. --json prints JSON instead.")
@@ -192,7 +192,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _print_table(rows: list[Row]) -> None:
-    """Print a compact table: points in millimetres, and the pressure and mean electrode value of each finger."""
+    """Print a compact table: points in millimetres, and each finger's pressure and mean electrode value."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

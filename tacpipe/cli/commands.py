@@ -1,4 +1,4 @@
-"""Add the commands other than stages: those that manage datasets and the store."""
+"""Add the commands that are not stages, which manage datasets and the store."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def _version(program: typer.Typer) -> None:
 
 
 def _from_module(name: str) -> Callable[[typer.Typer], None]:
-    """Return the function that adds the command of a module of its own, which is imported when the command is needed."""
+    """Return a function that imports the module of a command and adds the command."""
 
     def add(program: typer.Typer) -> None:
         importlib.import_module(f"tacpipe.cli.{name}").add(program, SUMMARIES.get(name) or registry.group_help(name))
@@ -212,9 +212,9 @@ def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options:
 
 @contextlib.contextmanager
 def _ends_with_its_reader() -> Iterator[None]:
-    """While a result is printed, end this process when nobody reads it, as Unix tools do: `tacpipe show DATASET | head`.
+    """End this process silently if the reader of stdout has gone, as Unix tools do: `tacpipe show DATASET | head`.
 
-    Before and after, a connection that is lost raises an error instead.
+    Outside of this context, a lost connection raises an error instead.
     """
     before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
@@ -244,15 +244,15 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
 
 
 def summary(name: str) -> str:
-    """Return the line of a command in the list of all: of `SUMMARIES`, or of the module that is named after it."""
+    """Return the one-line summary of a command, from `SUMMARIES` or from the docstring of the command's module."""
     return SUMMARIES.get(name) or registry.group_help(name).partition("\n")[0]
 
 
-SHOWN = 20  # Largest number of recordings whose changes are printed
+SHOWN = 20  # Maximum number of recordings whose changes are printed
 
 
 def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclude: str | None, include: bool) -> None:
-    """Raise `UsageError` if labels come from a table and from the command line."""
+    """Raise `UsageError` if labels are passed both as a table and on the command line."""
     if names or sets or exclude is not None or include:
         raise UsageError(
             "--from names recordings and labels itself. Leave out names, --label, --exclude and --include."
@@ -260,7 +260,7 @@ def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclu
 
 
 def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
-    """Raise `UsageError` for options of --from without it, and where no recording is named."""
+    """Raise `UsageError` if options of --from are used without it, or if no recording is named."""
     if key or dry_run:
         raise UsageError("--key and --dry-run belong to --from. Leave them out, or give a table with --from.")
     if not names:
@@ -268,7 +268,7 @@ def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
 
 
 def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) -> None:
-    """Set the labels of a table on a dataset's recordings, or print what would change."""
+    """Set the labels in a table on a dataset's recordings, or print the changes if ``dry_run`` is true."""
     from tacpipe.datasets import labels
     from tacpipe.formats.table.label_table import LabelTable, read_label_table
 
@@ -303,7 +303,7 @@ def _described(
     count: int,
     unmatched: Sequence[str],
 ) -> str:
-    """Return one line per recording whose labels would change, then their number."""
+    """Return one line per recording whose labels would change, and a line with the number of recordings."""
     lines = [
         f"{plain(name)}: "
         + ", ".join(f"{plain(key)} {_shown(current[name].get(key))} → {_shown(value)}" for key, value in labels.items())

@@ -1,4 +1,4 @@
-"""Compare results of evaluations: one table per task and question, as text, JSON or CSV."""
+"""Compare evaluation results in one table per task and question, as text, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 METRICS = "metrics.json"
-_LISTED = 3  # Largest number of values that a cell lists
-_DIGITS = 9  # Significant digits, the same as in stored headlines
+_LISTED = 3  # Maximum number of values listed in a cell
+_DIGITS = 9  # Significant digits, as in stored headlines
 
 
 class RowJson(TypedDict):
-    """A method in a comparison; numbers that are undefined are None."""
+    """A method in a comparison; undefined numbers are None."""
 
     name: str
     kind: str
-    settings: dict[str, Attribute]  # values in which the methods differ
+    settings: dict[str, Attribute]  # settings in which the methods differ
     errors: dict[str, float | None]
     baseline: str | None
     gain: float | None
@@ -49,7 +49,7 @@ class RowJson(TypedDict):
 
 
 class ComparisonJson(TypedDict):
-    """The methods of one question."""
+    """The methods compared on one question."""
 
     task: str
     part: str
@@ -63,7 +63,7 @@ class ComparisonJson(TypedDict):
 
 
 class ComparisonsJson(TypedDict):
-    """All comparisons, as ``tacpipe compare --json`` prints them."""
+    """All comparisons, in the format of ``tacpipe compare --json``."""
 
     schema_version: int
     comparisons: list[ComparisonJson]
@@ -71,25 +71,25 @@ class ComparisonsJson(TypedDict):
 
 @dataclass(frozen=True)
 class Compared:
-    """Results by requested path, and their comparisons."""
+    """Results by requested path, with their comparisons."""
 
     results: Mapping[str, Dataset]
     comparisons: Sequence[Comparison]
     pooled: bool
-    places: Mapping[str, str] = field(default_factory=dict)  # Paths of datasets by manifest digest
+    places: Mapping[str, str] = field(default_factory=dict)  # Dataset paths by manifest digest
 
     def paths(self, row: engine.ComparisonRow) -> list[str]:
-        """Return the paths of the results of a row."""
+        """Return the paths of a row's results."""
         places = {id(result): path for path, result in self.results.items()}
         return [places[id(run.dataset)] for run in row.method.runs]
 
     def unused(self) -> list[str]:
-        """Return the paths of results without anything to compare."""
+        """Return the paths of results that contain nothing to compare."""
         used = {path for comparison in self.comparisons for row in comparison.rows for path in self.paths(row)}
         return [path for path in self.results if path not in used]
 
     def differing(self, rows: Iterable[engine.ComparisonRow]) -> dict[str, list[str]]:
-        """Return the columns in which rows of methods differ, by name: settings, data, and without pooling the result."""
+        """Return the columns in which the rows differ, by name: settings, data and, without pooling, the result."""
         all_rows = list(rows)
         names = dict.fromkeys(name for row in all_rows for name in row.differing)
         columns = {name: [_text(row.differing.get(name, "")) for row in all_rows] for name in names}
@@ -99,12 +99,12 @@ class Compared:
         return {name: cells for name, cells in columns.items() if len(set(cells)) > 1}
 
     def _data(self, result: Dataset) -> str:
-        """Return the paths of the datasets that a result was evaluated on; of a missing one the start of its digest."""
+        """Return the paths of a result's evaluation datasets; missing datasets are shown by the start of their digest."""
         datasets = result.source.inputs.get("datasets", ())
         return " ".join(self.places.get(dataset["manifest"], dataset["dataset"][:8]) for dataset in datasets)
 
     def to_json(self) -> ComparisonsJson:
-        """Return all comparisons as plain values, undefined numbers as null."""
+        """Return all comparisons as plain values, with undefined numbers as null."""
         return {"schema_version": 1, "comparisons": [self._json(comparison) for comparison in self.comparisons]}
 
     def _json(self, comparison: Comparison) -> ComparisonJson:
@@ -140,7 +140,7 @@ class Compared:
         }
 
     def to_csv(self) -> str:
-        """Return one line per predictor and question; each setting and each error has its column."""
+        """Return a CSV with one line per predictor and question, and a column for each setting and error."""
         flat = [
             {
                 "task": comparison["task"],
@@ -162,7 +162,7 @@ class Compared:
         return text.getvalue().rstrip("\n")
 
     def tables(self) -> list[TerminalTable]:
-        """Return one table per task, kind of errors and unit: methods the best first, below them their best baseline."""
+        """Return one table per task, kind of error and unit: methods with the best first, then their best baseline."""
         by_columns: dict[tuple[str, ...], list[Comparison]] = {}
         for comparison in self.comparisons:
             measure = comparison.measure
@@ -176,10 +176,10 @@ class Compared:
         competing = [[row for row in comparison.rows if _competes(row)] for comparison in comparisons]
         all_rows = [row for rows in competing for row in rows]
         differing, names = self.differing(all_rows), [_first_name(row) for row in all_rows]
-        if len(set(names)) == 1 and "result" in differing:  # All rows have the same method, so results name them
+        if len(set(names)) == 1 and "result" in differing:  # All rows have the same method, so paths distinguish them
             names = differing.pop("result")
         baselines = [row.baseline for row in all_rows]
-        names_baselines = len({*baselines}) > len(comparisons)  # The best baselines differ within a question
+        names_baselines = len({*baselines}) > len(comparisons)  # Methods of one question have different best baselines
         pooled = any(row.runs > 1 for row in all_rows)
         heads = ["", *differing, *measure.columns, measure.name, "95 % interval"]
         heads += [*(["vs"] if names_baselines else []), "n", *(["runs"] if pooled else [])]
@@ -237,9 +237,9 @@ class Compared:
 
 
 def run(paths: Sequence[Path], *, pool: bool) -> Compared:
-    """Return the comparison of results; a warning names those without anything to compare.
+    """Compare results and warn about those that contain nothing to compare.
 
-    Raises `UsageError` for a dataset that is not a result, and where none holds anything to compare.
+    Raises `UsageError` for a dataset that is not a result, and if no result contains anything to compare.
     """
     results = {str(path): pipeline.open_dataset(path) for path in paths}
     for path, result in results.items():
@@ -258,7 +258,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
 
 
 def _competes(row: engine.ComparisonRow) -> bool:
-    """Return whether a row is of a trained method: a model, or a control that was trained too."""
+    """Return whether a row is a trained method, i.e. a model or a trained control."""
     return row.kind == "model" or (row.kind == "control" and row.predictor == "model")
 
 
@@ -280,14 +280,14 @@ def _style(row: engine.ComparisonRow) -> str:
 
 
 def _places(results: Sequence[Path]) -> dict[str, str]:
-    """Return the paths of the store's datasets, relative to the working directory, by manifest digest."""
+    """Return the paths of the store's datasets by manifest digest, relative to the working directory."""
     paths = {str(root["manifest"]): Path(root["path"]) for root in locate(*results).roots.all()}
     here = Path.cwd()
     return {name: str(path.relative_to(here) if path.is_relative_to(here) else path) for name, path in paths.items()}
 
 
 def _below(path: str, paths: Sequence[str]) -> str:
-    """Return a path without the folders that all paths begin with.
+    """Return a path without the parent folders that all paths have in common.
 
     >>> _below("results/a/0", ["results/a/0", "results/b/0"]), _below("results/a", ["results/a"])
     ('a/0', 'results/a')

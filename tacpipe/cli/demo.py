@@ -1,4 +1,4 @@
-"""Run a small version of the whole pipeline on simulated recordings, with the commands that a lab would type."""
+"""Run a small version of the whole pipeline on simulated recordings, with the commands that a user would type."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEXT = """Open the page below in a browser. What to try next:
 
 
 def run_rig(output: Path, rig_file: Path) -> Path:
-    """Emulate a rig, record it live, run the chain on the recordings, and return the path of the report.
+    """Emulate a rig, record it live, process the recordings, and return the path of the report.
 
     Raises `TacpipeError` if a command fails.
     """
@@ -34,7 +34,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     serving = subprocess.Popen([sys.executable, "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
     try:
-        if not serving.stdout.readline():  # It prints the path of its rig file once all streams are served.
+        if not serving.stdout.readline():  # The command prints the path of its rig file once all streams are served.
             raise TacpipeError(f"The demo stopped: {rig_file} could not be emulated.")
         acquire, *chain = demo_rig(output)
         _run([acquire])
@@ -46,12 +46,12 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 
 
 def _run(commands: list[list[str]]) -> None:
-    """Run commands one after another. Print one line for each, and the errors of one that fails."""
+    """Run commands in sequence and print one line for each, and the errors if one fails."""
     for command in commands:
         terminal.note("$ tacpipe " + " ".join(command))
         quiet = [] if command[0] == "show" else ["--quiet"]
         process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
-        with termination.reporting(""):  # The command reports interrupts itself.
+        with termination.reporting(""):  # The command itself reports interrupts.
             try:
                 code = process.wait()
             except KeyboardInterrupt:
@@ -63,7 +63,7 @@ def _run(commands: list[list[str]]) -> None:
 
 
 def headline_of(result: Path) -> str:
-    """Return one sentence on the model of a result against its best baseline."""
+    """Return a sentence that compares the model of a result with its best baseline."""
     from tacpipe.cli import headline_table
     from tacpipe.metrics import headline
 
@@ -72,9 +72,9 @@ def headline_of(result: Path) -> str:
 
 
 def run(output: Path) -> Path:
-    """Run the commands, showing each, and return the path of the report.
+    """Run the demo's commands, print each, and return the path of the report.
 
-    Raises `TacpipeError` if one of them fails.
+    Raises `TacpipeError` if a command fails.
     """
     extras.require("The demo", *LEARNING)
     _run(demo_commands(output))
@@ -86,19 +86,19 @@ def run(output: Path) -> Path:
     return demo_page(output)
 
 
-LIVE_S, LIVE_TRIALS = 30, 6  # length and trials of the emulated rig
-EMULATED = "emulated"  # the folder of the emulated rig's own rig file
+LIVE_S, LIVE_TRIALS = 30, 6  # recorded seconds and trials of the emulated rig
+EMULATED = "emulated"  # folder of the rig file written by the emulation
 
 
 def demo_commands(output: Path) -> list[list[str]]:
-    """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
+    """Return the commands of all tasks' demos and of the results page, without the leading ``tacpipe``."""
     demos = demo_parts(output)
     datasets = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
     return [*(words for demo in demos for words in demo.commands), ["report", *datasets, "-o", str(demo_page(output))]]
 
 
 def demo_rig(output: Path) -> list[list[str]]:
-    """Return the commands after the emulated rig is up: 30 s recorded live, then the chain to a forecast."""
+    """Return the commands that record the running emulated rig for 30 s and process the recordings up to a forecast."""
     recordings = str(output / "recordings")
     live = ["--trials", str(LIVE_TRIALS), "--duration-s", str(LIVE_S / LIVE_TRIALS)]
     return [
@@ -110,10 +110,10 @@ def demo_rig(output: Path) -> list[list[str]]:
 
 
 def demo_parts(output: Path) -> list[Demo]:
-    """Return the parts of all tasks that have one."""
+    """Return the demos of all tasks that have one."""
     return [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
 
 
 def demo_page(output: Path) -> Path:
-    """Return the path of the page of results."""
+    """Return the path of the results page."""
     return output / "report.html"

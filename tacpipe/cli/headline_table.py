@@ -1,4 +1,4 @@
-"""Read the headlines of a result from the store and print them, in colours on a terminal and else as plain text."""
+"""Read a result's headlines from the store and print them, in colour on a terminal and otherwise as plain text."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ EMPTY = "No recording was left to evaluate the model on: it has seen all of them
 
 
 def of_output(output: Path, file: str) -> list[Headline] | None:
-    """Return the headlines in ``file`` of the dataset at ``output``, with verified bytes; None without the file."""
+    """Return the headlines in ``file`` of the dataset at ``output`` after verification, or None if there is no such file."""
     entry = manifest.find(output).manifest.files.get(file)
     return read(locate(output).read(entry["digest"])) if entry else None
 
 
 def read(content: bytes) -> list[Headline]:
-    """Return the headlines of a file, with the current names of methods, which may have changed since they were stored."""
+    """Return the headlines in a file, with current method names, which may have changed since they were stored."""
     return [replace(entry, method=method(entry.task, entry.method)) for entry in headline.read(content)]
 
 
 def method(task: object, stored: ParamValue) -> str:
-    """Return today's name of a method of a task, an architecture that may have been renamed since it was stored."""
+    """Return the current name of a task's method, whose architecture may have been renamed since it was stored."""
     return str(params_of.with_current_names(f"train.{task}", {"architecture": stored})["architecture"])
 
 
 def table(headlines: Sequence[Headline]) -> TerminalTable:
-    """Return the table of one headline or more: under each part the model, and below it its best baseline."""
+    """Return a table of headlines: for each part, the model and below it its best baseline."""
     first = headlines[0]
     heads = ["", *first.columns, first.measure, "95 % interval", "n"]
     groups = []
@@ -54,14 +54,14 @@ def table(headlines: Sequence[Headline]) -> TerminalTable:
             baselines = [row for row in entry.table_baselines if row is not entry.best]
             rows += [TerminalRow([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
         groups.append(RowGroup(entry.where, rows))
-    errors = list(range(1, len(first.columns)))  # Results are ranked by the last column.
+    errors = list(range(1, len(first.columns)))  # The last column ranks the results.
     return TerminalTable(
         heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)]
     )
 
 
 def caption(headlines: Sequence[Headline]) -> str:
-    """Return what the columns mean, what n counts, and among how many baselines the best was found."""
+    """Explain the columns, the unit of n, and the number of baselines from which the best was chosen."""
     counts = dict.fromkeys(len(entry.baselines) for entry in headlines if entry.baselines)
     best = f"vs: the best of {' or '.join(map(str, counts))} baselines. " if counts else ""
     return f"n: {', '.join(dict.fromkeys(entry.cluster for entry in headlines))}. {best}{headline.caption(headlines)}"
@@ -76,12 +76,12 @@ _VERDICTS = {
 
 
 def text(headlines: Sequence[Headline], width: int = terminal.WIDTH) -> str:
-    """Return headlines as lines of text: their table, or a sentence where there is none."""
+    """Return headlines as lines of text: their table, or a sentence if there are none."""
     return table(headlines).text(width) if headlines else EMPTY
 
 
 def show(headlines: Sequence[Headline]) -> None:
-    """Print headlines on stderr."""
+    """Print headlines to stderr."""
     if headlines:
         terminal.show(table(headlines), on_stdout=False)
     else:

@@ -1,4 +1,4 @@
-"""Render ``--help``, with options in panels, and ``-h`` on one screen; refuse addresses, such as ``s3://``, as paths."""
+"""Format ``--help`` with option panels and ``-h`` on one screen, and reject URLs such as ``s3://`` as paths."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from typer.core import TyperCommand, TyperGroup
 from tacpipe.io.files import local
 
 REQUIRED, PARAMS, RUN, OUTPUT, OPTIONS = "Required", "Params", "Run", "Output", "Options"
-PANELS = {  # Panels of the options that commands share. The params of a stage name theirs.
+PANELS = {  # Panels of options that several commands have. The params of a stage specify their own.
     **dict.fromkeys(("preset", "params_file", "block", "set_", "print_params"), PARAMS),
     **dict.fromkeys(("split", "fold", "role", "codec", "init", "extend"), "Data"),
     **dict.fromkeys(("jobs", "executor", "skip_bad", "check", "compare", "rerun", "replace", "dry_run"), RUN),
     **dict.fromkeys(("output", "json_", "as_json", "quiet", "help"), OUTPUT),
 }
-LAST = (PARAMS, RUN, OUTPUT)  # Panels that follow all others.
+LAST = (PARAMS, RUN, OUTPUT)  # Panels shown after all others.
 COMMON = (
     "architecture",
     "epochs",
@@ -36,12 +36,12 @@ COMMON = (
     "json_",
     "help",
 )
-# Earlier names of options. They still work, and no help shows them.
+# Former names of options, which still work but are not shown in help.
 OLD_NAMES = {"--duration": "--duration-s", "--set": "--label", "--store": "--remote"}
-EXAMPLE = "Example: "  # Starts a paragraph with a command line, which is printed without line breaks.
-BRIEF_LINES = 40  # Lines that ``-h`` prints at most.
+EXAMPLE = "Example: "  # Start of a paragraph with a command line, which is printed without line breaks.
+BRIEF_LINES = 40  # Maximum number of lines that ``-h`` prints.
 TYPES = {"integer": "INTEGER", "int": "INTEGER", "float": "NUMBER", "path": "PATH", "file": "PATH"}
-SECTIONS = {  # Commands in the order in which ``tacpipe --help`` lists them. Stages of other packages follow.
+SECTIONS = {  # Commands in the order of ``tacpipe --help``. Stages from other packages come last.
     "Record": ("acquire", "live", "sensors"),
     "Import and export": ("ingest", "simulate", "export"),
     "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
@@ -53,12 +53,12 @@ PLUG_INS = "Plug-ins"
 
 
 class PanelCommand(TyperCommand):
-    """A command whose help shows its options in panels: the one an option names, else that of `PANELS`."""
+    """Command whose help groups options in panels, which an option specifies or `PANELS` defines."""
 
-    brief = False  # True shows only the common options.
+    brief = False  # whether to show only common options
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse a command line, in which options may have the names of `OLD_NAMES` where the command has none of them."""
+        """Parse a command line. Accepts an option name in `OLD_NAMES` if the command has no option of that name."""
         options = {name for param in self.params for name in (*param.opts, *param.secondary_opts)}
         renamed = {old: new for old, new in OLD_NAMES.items() if new in options and old not in options}
         end = args.index("--") if "--" in args else len(args)
@@ -68,7 +68,7 @@ class PanelCommand(TyperCommand):
         )
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return what follows the command's name: arguments, required options, and a word for the others."""
+        """Return the usage after the command's name: arguments, required options, and a placeholder for other options."""
         params = self.get_params(ctx)
         arguments = [_argument_name(param) for param in params if param.param_type_name == "argument"]
         required = [
@@ -79,7 +79,7 @@ class PanelCommand(TyperCommand):
         return [*arguments, *required, "[OPTIONS]"]
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        """Write the description, of which ``-h`` shows the first paragraph, and the examples as they can be pasted."""
+        """Write the description, of which ``-h`` shows only the first paragraph, and examples that can be pasted."""
         paragraphs = plain(inspect.cleandoc(self.help or "").partition("\f")[0]).split("\n\n")
         examples = [" ".join(text.split()).removeprefix(EXAMPLE) for text in paragraphs if text.startswith(EXAMPLE)]
         description = [text for text in paragraphs if not text.startswith(EXAMPLE)]
@@ -94,7 +94,7 @@ class PanelCommand(TyperCommand):
                     formatter.write(f"{'':{formatter.current_indent}}{example}\n")
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments, the required options, then each panel of options, in the order of the options."""
+        """Write the arguments and required options, then each panel, with options in their original order."""
         params: list[Any] = [param for param in self.get_params(ctx) if not getattr(param, "hidden", False)]
         panels: dict[str, list[Any]] = {"Arguments": [], REQUIRED: []}
         for param in params:
@@ -108,7 +108,7 @@ class PanelCommand(TyperCommand):
                 formatter.write_dl([_record(param, ctx) for param in panels[name]])
 
     def _write_brief(self, ctx: Any, formatter: Any, panels: Mapping[str, list[Any]]) -> None:
-        """Write the arguments and required options, then the options that fit on one screen, the common ones first."""
+        """Write the arguments and required options, then as many options as fit on one screen, common ones first."""
         for name in filter(panels.get, ("Arguments", REQUIRED)):
             with formatter.section(name):
                 formatter.write_dl([_brief_record(param, ctx) for param in panels[name]])
@@ -129,13 +129,13 @@ class PanelCommand(TyperCommand):
 
 
 class BriefCommand(PanelCommand):
-    """A command whose help is that of ``-h``."""
+    """Command that prints the help of ``-h``."""
 
     brief = True
 
 
 class HelpGroup(TyperGroup):
-    """A group of commands whose help shows the complete summary of each."""
+    """Group of commands whose help shows each command's complete summary."""
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         """Write the description."""
@@ -146,7 +146,7 @@ class HelpGroup(TyperGroup):
                 formatter.write_text(text)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one line per command: its name and the first line of its help; in sections for the program itself."""
+        """Write each command's name and the first line of its help, grouped in sections for the main program."""
         rows = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -159,11 +159,11 @@ class HelpGroup(TyperGroup):
 
 
 def unrequested() -> None:
-    """Represent a command that was not requested, in help alone."""
+    """Serve as a placeholder in help for commands that were not requested."""
 
 
 def _sections(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    """Return the commands of ``rows`` by section; those that no section names are of other packages."""
+    """Return the commands of ``rows`` by section; commands outside all sections come from other packages."""
     sections = {title: tuple(name for name in names if name in rows) for title, names in SECTIONS.items()}
     listed = {name for names in sections.values() for name in names}
     sections[PLUG_INS] = tuple(name for name in rows if name not in listed)
@@ -171,7 +171,7 @@ def _sections(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
 
 
 def plain(text: str) -> str:
-    """Return a text without the backticks of its markup."""
+    """Return a text without backticks."""
     return re.sub(r"`+([^`\n]+)`+", r"\1", text)
 
 
@@ -184,13 +184,13 @@ def _panel(param: Any) -> str:
 
 
 def _argument_name(param: Any) -> str:
-    """Return the name of an argument in the usage line: in brackets where it can be left out."""
+    """Return an argument's name in the usage line, in brackets if it is optional."""
     name = str(param.metavar or param.name).upper() + ("..." if param.nargs == -1 else "")
     return name if param.required else f"[{name}]"
 
 
 def _metavar(param: Any, ctx: Any) -> str:
-    """Return the placeholder of an option's value: its choices, or its type."""
+    """Return the placeholder of an option's value, which is its choices or its type."""
     if param.metavar:
         return str(param.metavar)
     placeholder = param.get_help_record(ctx)[0].split(" ", maxsplit=2 if len(param.opts) > 1 else 1)[-1]
@@ -199,7 +199,7 @@ def _metavar(param: Any, ctx: Any) -> str:
 
 
 def _record(param: Any, ctx: Any) -> tuple[str, str]:
-    """Return how a parameter is written, and its help with its default."""
+    """Return a parameter's syntax, and its help text with the default."""
     if param.param_type_name == "argument":
         return _argument_name(param).strip("[]"), f"{plain(param.help or '')}{'' if param.required else ' [optional]'}"
     names = ", ".join(sorted(param.opts, key=len))
@@ -216,7 +216,7 @@ def _record(param: Any, ctx: Any) -> tuple[str, str]:
 
 
 def _sentence(text: str) -> str:
-    """Return the help of an option as a sentence; the name of a choice at its start stays as it is typed.
+    """Return an option's help as a sentence, without capitalizing a choice at its start.
 
     >>> _sentence("rate of the rows (Hz) [default: 50]"), _sentence("hold: newest sample"), _sentence("")
     ('Rate of the rows (Hz). [default: 50]', 'hold: newest sample.', '')
@@ -231,17 +231,17 @@ def _sentence(text: str) -> str:
 
 
 def _brief_record(param: Any, ctx: Any) -> tuple[str, str]:
-    """Return the record of a parameter with the first clause of its help."""
+    """Return a parameter's record with only the first clause of its help."""
     names, text = _record(param, ctx)
     default = re.search(r" \[default: [^\]]+\]$", text)
     clause = re.split(r"; |: |\. |\.$", text[: default.start()] if default else text)[0]
-    if " " not in clause:  # The name of the first choice.
+    if " " not in clause:  # The clause is only the name of the first choice.
         clause = text.partition(";")[0]
     return names, clause + (default[0] if default else "")
 
 
 def apply(program: typer.Typer, *, brief: bool) -> None:
-    """Give every command and group of ``program`` this help, the one of ``-h`` where ``brief`` is true."""
+    """Set the help format of every command and group of ``program``, that of ``-h`` if ``brief`` is true."""
     program.info.cls = HelpGroup
     for group in program.registered_groups:
         group.cls = HelpGroup
@@ -252,7 +252,7 @@ def apply(program: typer.Typer, *, brief: bool) -> None:
 
 
 def refuse_addresses(program: typer.Typer) -> None:
-    """Have every command of ``program`` refuse addresses in all its arguments and options that are paths."""
+    """Make every command of ``program`` reject URLs in arguments and options that are paths."""
     for group in program.registered_groups:
         if group.typer_instance is not None:
             refuse_addresses(group.typer_instance)

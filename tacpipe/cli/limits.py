@@ -1,4 +1,4 @@
-"""Add the command ``tacpipe limits``, which measures limits of touch prediction and the value of more grasps."""
+"""Add the command ``tacpipe limits``, which estimates the limits of touch prediction and the benefit of more grasps."""
 
 from __future__ import annotations
 

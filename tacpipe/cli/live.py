@@ -1,4 +1,4 @@
-"""Add the command ``tacpipe live``: a trained model answers while a rig runs and is recorded."""
+"""Add the command ``tacpipe live``, which runs a trained model on a live rig and records the rig."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.recording.recorder import Recorder
 
 SCHEMA_VERSION = 1
-REPEATED = ("publish",)  # Settings whose option can be repeated, once per item
+REPEATED = ("publish",)  # Settings whose option may be repeated, once per item
 HELP = """
 
 What the table [live] of the rig file states need not be given; options of the command win.
@@ -43,7 +43,7 @@ Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alar
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the command to ``program``, with the options of the settings of every task whose models run live."""
+    """Add the command to ``program``, with an option for each setting of every task whose models can run live."""
 
     def live(
         rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
@@ -75,13 +75,13 @@ def add(program: typer.Typer, summary: str) -> None:
     ]
     complete = signature.replace(parameters=[*fixed, *_options()])
     function: Any = live
-    function.__signature__ = complete  # Typer reads the signature and the annotations.
+    function.__signature__ = complete  # Typer reads both the signature and the annotations.
     function.__annotations__ = {name: parameter.annotation for name, parameter in complete.parameters.items()}
     program.command("live", help=summary + HELP)(live)
 
 
 def _options() -> list[inspect.Parameter]:
-    """Return an option for each common setting and for each setting of a task; the first task that has a name counts."""
+    """Return the options of common settings and of each task's settings; the first task to define a name wins."""
     from tacpipe.live import settings
 
     options = _options_for(settings.Settings, None)
@@ -127,7 +127,7 @@ def _run(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Run a session and print what it did."""
+    """Run a session and print its summary."""
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
@@ -178,7 +178,7 @@ def _lines(supervisor: Supervisor) -> list[str]:
 
 
 def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:
-    """Run the rig without recording it."""
+    """Run the rig without recording."""
     from tacpipe.recording import clock
 
     began_s = clock.now_s()
@@ -208,7 +208,7 @@ def _report(
         terminal.result_json({**value, **error})
     elif output is not None:
         terminal.result(output)
-    if failed is not None and as_json:  # The JSON object on stdout has the error already.
+    if failed is not None and as_json:  # The JSON object on stdout already contains the error.
         terminal.note(f"tacpipe: {failed}")
         raise typer.Exit(failed.exit_code)
     if failed is not None:

@@ -1,7 +1,8 @@
-"""Run the command line: one command per registered stage, and those that manage datasets and the store.
+"""Run the command line, which has a command per registered stage and commands that manage datasets and the store.
 
-Only the requested command is built, and only its module imported: ``tacpipe --help``, shell completion and a hit must not
-wait for torch, pyarrow, pandas, scikit-learn or open3d. A command is built after the signal handlers are installed.
+Only the requested command is built, and only its module is imported: ``tacpipe --help``, shell completion and a cache
+hit must not wait for torch, pyarrow, pandas, scikit-learn or open3d. Signal handlers are installed before a command is
+built.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # Set by the shell: complete_bash, co
 
 
 def words_to_complete(environment: Mapping[str, str] = os.environ) -> list[str] | None:
-    """Return the words after ``tacpipe`` of the line that the shell completes, or None if it completes nothing.
+    """Return the words after ``tacpipe`` on the line that the shell completes, or None outside of completion.
 
-    The word at the cursor is the last one, unless the line ends in a space.
+    The last word is the one at the cursor, unless the line ends with a space.
 
     >>> words_to_complete({"_TACPIPE_COMPLETE": "complete_bash", "COMP_WORDS": "tacpipe train fo"})
     ['train', 'fo']
@@ -40,7 +41,7 @@ def words_to_complete(environment: Mapping[str, str] = os.environ) -> list[str] 
     line = environment.get("COMP_WORDS") or environment.get("_TYPER_COMPLETE_ARGS", "")
     try:
         line_words = shlex.split(line)
-    except ValueError:  # The line has an open quotation mark.
+    except ValueError:  # The line contains an unclosed quotation mark.
         line_words = line.split()
     return line_words[1:]
 
@@ -56,12 +57,12 @@ Exit codes: 0 done, 1 to 6 and 130 as in docs/reference/exit-codes.md.
 """
 
 
-MAX_WIDTH = 1_000  # Columns of help: the terminal's, up to this.
-ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # Abbreviations that help and completion do not list
+MAX_WIDTH = 1_000  # Maximum width of help in columns; a narrower terminal's width is used.
+ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # Aliases that are not listed in help and completion
 
 
 def app(arguments: Sequence[str]) -> typer.Typer:
-    """Return the program that can answer ``arguments``: with the one command they name, or all of them for help."""
+    """Return the program for ``arguments``, with only the command that they name, or with all commands for help."""
     import typer
 
     from tacpipe.cli import commands
@@ -100,16 +101,16 @@ def app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line of this process, which exits within a second of Ctrl-C; exit with the documented codes."""
+    """Run this process's command line and exit with a documented code; Ctrl-C ends it within a second."""
     code = INTERRUPTED
     try:
         terminal.prepare()
         memory.guard()
         termination.install_handlers()
         code = _printed(answer(sys.argv[1:]))
-    except KeyboardInterrupt:  # Interrupted before the command began or after it ended
+    except KeyboardInterrupt:  # Interrupted before the command started or after it ended
         termination.report()
-    except (MemoryError, RuntimeError) as error:  # Raised before a command was chosen, or outside every command
+    except (MemoryError, RuntimeError) as error:  # Raised before a command was selected, or outside of all commands
         short = memory.shortage(error)
         if short is None:
             raise
@@ -119,7 +120,7 @@ def main() -> None:
 
 
 def _printed(code: int) -> int:
-    """Return the exit code of a command after its output is flushed; `FAILED` if its result could not be written."""
+    """Flush the output of a command and return its exit code, or `FAILED` if the output could not be written."""
     failure = terminal.unprinted()
     if failure is None or code != DONE:
         return code
@@ -131,9 +132,10 @@ def _printed(code: int) -> int:
 
 
 def answer(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit code, one of those that are documented.
+    """Run a command line and return its documented exit code.
 
-    With ``--json`` among the arguments an error is one object on stdout too: ``schema_version``, ``error``, ``exit_code``.
+    With ``--json`` in the arguments, also prints an error as an object on stdout with ``schema_version``, ``error`` and
+    ``exit_code``.
     """
     try:
         code, sentence = _call(arguments)
@@ -144,7 +146,7 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = INTERRUPTED, ""
     except BrokenPipeError:
         return DONE
-    except OSError as error:  # An error of a disk or of permissions that no inner code could explain better
+    except OSError as error:  # An error of a disk or of permissions for which inner code has no better message
         code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:
@@ -167,7 +169,7 @@ def _complain(sentence: str) -> None:
 
 
 def _call(arguments: Sequence[str]) -> tuple[int, str]:
-    """Return the exit code of a command line, and the message for a malformed one."""
+    """Run a command line and return its exit code, and a message if the command line is malformed."""
     import typer
 
     from tacpipe.cli import help as plain_help
@@ -190,14 +192,14 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _misuse() -> type[Any]:
-    """Return the exception that click raises for a malformed command line; typer may bundle its own click."""
+    """Return the exception type that click raises for a malformed command line; typer may bundle its own click."""
     import typer
 
     return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 def _add_summaries(program: typer.Typer) -> None:
-    """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
+    """Add every command with only its one-line help, for ``tacpipe --help`` and for unknown command names."""
     from tacpipe.cli import commands
     from tacpipe.plugins import registry
 

@@ -1,4 +1,4 @@
-"""Describe models and results from their JSON files and weight headers, without heavy imports."""
+"""Describe models and results from their JSON files and the headers of their weights, without heavy imports."""
 
 from __future__ import annotations
 
@@ -23,63 +23,63 @@ from tacpipe.training.following import Line
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
-FILES = 5  # Files of a result that are listed before the remaining ones are counted
-SHOWN = 8  # Longest list or nested mapping that is shown; longer ones are counted
+FILES = 5  # Maximum number of files of a result that are listed; further files are counted
+SHOWN = 8  # Maximum length of a displayed list or nested mapping; longer ones are counted
 _APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
 _ROLES = ("train", "val", "test")
 
 
 def is_model(opened: Dataset) -> bool:
-    """Return whether a dataset is a model: it has a configuration that names a task, and nothing was measured."""
+    """Return whether a dataset is a model, i.e. has a configuration with a task, and no metrics."""
     return CONFIG in opened.files and METRICS not in opened.files and "task" in _tree(opened, CONFIG)
 
 
 def is_result(opened: Dataset) -> bool:
-    """Return whether a dataset is the result of an evaluation."""
+    """Return whether a dataset is an evaluation result."""
     return METRICS in opened.files
 
 
 class ModelOrigin(TypedDict):
-    """The task and today's name of the architecture that a configuration names."""
+    """Task and current architecture name of a configuration."""
 
     task: str | None
     architecture: str | None
 
 
 class TrainingCounts(TypedDict):
-    """The recordings that a model was trained on."""
+    """Numbers of recordings that a model was trained on."""
 
-    recordings: int | None  # number for training and validation
-    roles: Values  # numbers by role, or by role and sensor
+    recordings: int | None  # number of recordings for training and validation
+    roles: Values  # number by role, or by role and sensor
 
 
 class ModelDescription(ModelOrigin):
-    """A configuration: what was trained on what, and other short entries as text."""
+    """Description of a configuration: task, architecture, training data, and other short entries as text."""
 
     trained_on: TrainingCounts
     about: dict[str, str]
 
 
 class BestEpoch(TypedDict):
-    """The epoch of least validation loss."""
+    """Epoch with the lowest validation loss."""
 
     epoch: int
     loss: float
 
 
 class ModelOverview(ModelDescription):
-    """A model: task, architecture, training data, params and validation."""
+    """Overview of a model: task, architecture, training data, params and validation."""
 
     parameters: int | None
     epochs: int | None
     validation: Values | BestEpoch | None
     params: StoredParams
-    inputs: dict[str, list[str]]  # paths and digests by name of the argument
+    inputs: dict[str, list[str]]  # paths and digests by argument name
     chain: list[str]
 
 
 class ResultOverview(ModelOrigin):
-    """A result: the model against its baselines, the evaluated data and their role."""
+    """Overview of a result: the model and its baselines, the evaluated data and their role."""
 
     headline: list[Values] | None
     baselines: list[str]
@@ -89,7 +89,7 @@ class ResultOverview(ModelOrigin):
     role: str | None
     trained_on: TrainingCounts
     params: StoredParams
-    inputs: dict[str, list[str]]  # paths and digests by name of the argument
+    inputs: dict[str, list[str]]  # paths and digests by argument name
 
 
 def of_model(opened: Dataset, store: Store) -> ModelOverview:
@@ -107,7 +107,7 @@ def of_model(opened: Dataset, store: Store) -> ModelOverview:
 
 
 def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
-    """Return the overview of a result: the model against its baselines, the evaluated data and their role."""
+    """Return the overview of a result: the model and its baselines, the evaluated data and their role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
     identity = identities_of_manifests(store).get(found.digest)
@@ -128,7 +128,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
 
 
 def model_text(value: ModelOverview) -> list[str]:
-    """Return the overview of `of_model` as lines: kind and validation, params, then inputs."""
+    """Return the overview of a model as lines: summary with validation, params, then inputs."""
     described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
@@ -155,7 +155,7 @@ def _summary(value: ModelOverview) -> str:
 
 
 def result_text(value: ResultOverview) -> list[str]:
-    """Return the overview of `of_result` as lines, the headline table first."""
+    """Return the overview of a result as lines, starting with the headline table."""
     if value["headline"] is None:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
     else:
@@ -178,7 +178,7 @@ def result_text(value: ResultOverview) -> list[str]:
 
 
 def flat(value: Any) -> str:
-    """Return a nested value on one line; long lists are counted.
+    """Return a nested value as one line; long lists are replaced by their length.
 
     >>> flat({"train": {"a": 35, "b": 33}, "val": 2, "names": []}), flat(list(range(20))), flat(None), flat(0.5)
     ('train a 35, train b 33, val 2', '20 values', '–', '0.5')
@@ -202,7 +202,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _architecture(config: Values) -> ModelOrigin:
-    """Return the task and today's name of the architecture that a configuration names, or None if it names none."""
+    """Return the task and current architecture name of a configuration; both are None if it has none."""
     task, stored = config.get("task"), config.get("architecture")
     return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
 
@@ -213,7 +213,7 @@ def _learned(config: Values) -> ModelDescription:
     return {
         **_architecture(config),
         "trained_on": {
-            # Recordings of all roles that training read
+            # Recordings of all roles that were used for training
             "recordings": len(trained) if isinstance(trained, Mapping) else None,
             "roles": {role: count for role, count in config.get("counts", {}).items() if role in _ROLES},
         },
@@ -226,7 +226,7 @@ def _learned(config: Values) -> ModelDescription:
 
 
 def _short(value: Any) -> str | None:
-    """Return an entry of a configuration as short text; None for an empty or large entry."""
+    """Return a configuration entry as short text, or None if it is empty or long."""
     if isinstance(value, Mapping):
         if all(not isinstance(item, Mapping | list) for item in value.values()) and len(value) <= SHOWN:
             return flat(value) if value else None
@@ -259,7 +259,7 @@ def _input_rows(inputs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
 
 
 def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:
-    """Return the path of each input, if the store knows it, and its digest."""
+    """Return each input's digest, and its path if it is in the store."""
     places = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
     return {
         name: [
@@ -285,14 +285,14 @@ def _history(opened: Dataset) -> list[Line]:
 
 
 def _best(history: list[Line]) -> BestEpoch | None:
-    """Return the epoch of least validation loss, or None if the history has none."""
+    """Return the epoch with the lowest validation loss, or None if the history contains no validation loss."""
     validated = [line for line in history if isinstance(line.get("val_loss"), int | float)]
     best = min(validated, key=lambda line: line["val_loss"], default=None)
     return {"epoch": best["epoch"], "loss": best["val_loss"]} if best else None
 
 
 def _parameters(opened: Dataset) -> int | None:
-    """Return how many numbers the weights hold, from the headers of the model's own safetensors files."""
+    """Return the number of weights, from the headers of the model's own safetensors files."""
     count = 0
     for name in opened.files:
         if name.endswith(WEIGHTS) and name.startswith("model"):
@@ -304,7 +304,7 @@ def _parameters(opened: Dataset) -> int | None:
 
 
 def _aligned(described: list[tuple[str, Any]]) -> list[str]:
-    """Return names and values in two columns, long values on several lines; values that are None are left out."""
+    """Return names and values in two aligned columns, with long values wrapped and values of None omitted."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0) + 2
     room = max(terminal.width_of(sys.stdout) - width, 20)
@@ -314,7 +314,7 @@ def _aligned(described: list[tuple[str, Any]]) -> list[str]:
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Return text as lines that end behind a comma.
+    """Return text wrapped after commas.
 
     >>> _wrapped("epochs 2, learning rate 0.002, seed 0", 20)
     ['epochs 2,', 'learning rate 0.002,', 'seed 0']
@@ -325,7 +325,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
-    """Return names and sizes of files; of many files the count and the first ones, unless ``full``.
+    """Return names and sizes of files; only the count and the first names if there are many and ``full`` is false.
 
     >>> files_text({"config.json": 15696, "history.jsonl": 188})
     ['files  config.json 15.7 kB, history.jsonl 188 bytes']

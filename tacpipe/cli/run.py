@@ -1,7 +1,7 @@
-"""`tacpipe run`: run the stages of a ``dvc.yaml``, each after those that it depends on.
+"""`tacpipe run`: run the stages of a ``dvc.yaml`` in the order of their dependencies.
 
-This process looks up stored results, stage after stage. A stage that has something to do runs in a separate process, as it
-would from a shell: it computes, warns and ends in the same way, and changes nothing in this process.
+This process looks up the stored results of each stage. A stage that is not up to date runs in a separate process, with
+the same computation, warnings and exit as from a shell, and without effects on this process.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from tacpipe.plugins import registry
 if TYPE_CHECKING:
     from tacpipe.cli.stage_processes import StageProcesses
 
-PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # Option -P keeps the folder of the chain off the module path.
+PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # Option -P keeps the chain's folder off the module path.
 _SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # Syntax that needs a shell
 _PATTERN = re.compile(r"[*?\[]")
 _QUOTES = re.compile(r"[\"']")
 
 
 class Became(Enum):
-    """Outcome of a stage."""
+    """Outcomes of a stage."""
 
     UNCHANGED = "unchanged"
     RAN = "ran"
@@ -77,7 +77,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
 
 def _run(chain: Chain, *, quiet: bool) -> int:
-    """Run the stages of a chain; return the exit code of the first that failed, or 0."""
+    """Run the stages of a chain. Returns the exit code of the first failed stage, or 0."""
     became: dict[str, Became] = {}
     first = DONE
     for stage in chain.stages:
@@ -98,7 +98,7 @@ def _run(chain: Chain, *, quiet: bool) -> int:
 
 
 def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
-    """Return the outcome of a stage that must not run: a dependency failed, or the stage is frozen; else None."""
+    """Return the outcome of a stage that must not run, because a dependency failed or it is frozen; otherwise None."""
     missing = sorted(name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED))
     if missing:
         terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
@@ -114,14 +114,14 @@ def _summary(became: Mapping[str, Became], *, quiet: bool) -> None:
 
 
 class _Together:
-    """Runs stages of a chain at the same time; each begins when all that it depends on are done."""
+    """Runs stages of a chain concurrently, each after all of its dependencies."""
 
     def __init__(self, chain: Chain, processes: StageProcesses, *, quiet: bool) -> None:
         self._chain, self._processes, self._quiet = chain, processes, quiet
         self._waiting = list(chain.stages)
         self._at_work: dict[str, tuple[ChainStage, list[str]]] = {}  # Running stages with their remaining commands
         self.became: dict[str, Became] = {}
-        self.first = DONE  # First exit code that is not 0
+        self.first = DONE  # First nonzero exit code
 
     def run(self) -> None:
         """Run all stages."""
@@ -146,7 +146,7 @@ class _Together:
         return (stage for stage in self._waiting if self._chain.after[stage.name] <= finished)
 
     def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
-        """Start the first remaining command of a stage that has something to do."""
+        """Start the first remaining command of a stage that is not up to date."""
         while commands:
             command = commands.pop(0)
             words = _words(command)
@@ -176,7 +176,7 @@ class _Together:
 
 
 def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
-    """Run the stages of a chain, ``jobs`` at a time; return the exit code of the first that failed, or 0."""
+    """Run up to ``jobs`` stages of a chain concurrently. Returns the exit code of the first failed stage, or 0."""
     from tacpipe.cli import stage_processes
 
     modules = stage_processes.modules(command for stage in chain.stages for command in stage.commands)
@@ -192,7 +192,7 @@ def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
 
 
 def _stage(stage: ChainStage) -> tuple[Became, int]:
-    """Run the commands of a stage until one fails; return the outcome of the stage and the exit code."""
+    """Run a stage's commands until one fails. Returns the stage's outcome and the exit code."""
     became = Became.UNCHANGED
     for command in stage.commands:
         words = _words(command)
@@ -206,12 +206,12 @@ def _stage(stage: ChainStage) -> tuple[Became, int]:
 
 
 def _words(command: str) -> list[str] | None:
-    """Return the words of a command of tacpipe, with patterns expanded as by a shell; None if it needs a shell."""
+    """Return the words of a tacpipe command, with patterns expanded as in a shell, or None if it needs a shell."""
     if _SHELL.search(command):
         return None
     try:
         words, raw = shlex.split(command), shlex.split(command, posix=False)
-    except ValueError:  # The command has an open quotation mark.
+    except ValueError:  # The command contains an unclosed quotation mark.
         return None
     if not words or words[0] != "tacpipe" or len(words) != len(raw):
         return None
@@ -219,15 +219,15 @@ def _words(command: str) -> list[str] | None:
     for word, raw_word in zip(words, raw, strict=True):
         quoted = _QUOTES.search(raw_word) is not None
         if quoted and _PATTERN.search(word):
-            return None  # A quoted pattern may be literal.
+            return None  # A quoted pattern may be meant literally.
         expanded += (sorted(glob.glob(word)) or [word]) if _PATTERN.search(word) else [word]  # noqa: PTH207  (as it is written)
     return expanded
 
 
 def _answered(arguments: Sequence[str]) -> bool:
-    """Return whether a command had nothing to do, in which case it has printed its report.
+    """Return whether a command was up to date, in which case its report was printed.
 
-    Every other outcome is reported by the process of the command.
+    The command's own process reports any other outcome.
     """
     groups = {name.partition(".")[0] for name in registry.stages()}
     if not arguments or arguments[0] not in groups:
@@ -245,7 +245,7 @@ def _answered(arguments: Sequence[str]) -> bool:
 
 
 def _process(command: str | list[str]) -> int:
-    """Run a command, by the shell where it is a text, and return its exit code; the command reports interrupts."""
+    """Run a command and return its exit code; a string is run by the shell. The command itself reports interrupts."""
     sys.stdout.flush()
     shell = isinstance(command, str)
     with termination.reporting(""):
@@ -254,7 +254,7 @@ def _process(command: str | list[str]) -> int:
             code = process.wait()
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGINT)  # A terminal has sent the signal already, a scheduler has not.
+                process.send_signal(signal.SIGINT)  # A terminal also signals the command, a scheduler does not.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(termination.GRACE_S)
             raise

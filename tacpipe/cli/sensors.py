@@ -1,4 +1,4 @@
-"""Add the commands of ``tacpipe sensors``, which list, probe and emulate sensors."""
+"""Add the commands of ``tacpipe sensors``, which list, identify and emulate sensors."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def probe(
 ) -> None:
     """Identify the sensor on each port, with the evidence.
 
-    Listens first, then sends the requests with which each driver begins a recording. A port that is not USB is only
+    Listens first, then sends the requests with which each driver starts a recording. A port that is not USB is only
     listened to, unless it is named. Exits with 5 if nothing was recognised.
 
     Example: tacpipe sensors probe serial:/dev/ttyACM0
@@ -87,7 +87,7 @@ def probe(
 
 
 class SensorRow(TypedDict):
-    """A sensor in the list of all."""
+    """A row in the list of sensors."""
 
     name: str
     links: list[str]
@@ -100,7 +100,7 @@ class SensorRow(TypedDict):
 def _sensor_row(name: str) -> SensorRow:
     try:
         kind = registry.load_sensor(name)
-    except TacpipeError as error:  # An error of one plug-in must not hide the other sensors.
+    except TacpipeError as error:  # An error in one plug-in must not hide the other sensors.
         return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error), "exclusive": ""}
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     described = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
@@ -161,7 +161,7 @@ def _text(report: Report) -> str:
 
 
 def _stanza(report: Report) -> list[str]:
-    """Return the lines of a rig file for the likeliest sensor, with comments on guessed options."""
+    """Return rig file lines for the most likely sensor, with comments on guessed options."""
     candidate = report.findings[0].candidate
     options = dict(candidate.options)
     if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):
@@ -177,7 +177,7 @@ def _stanza(report: Report) -> list[str]:
 
 
 def _described(options: Options, notes: Mapping[str, str]) -> list[str]:
-    """Return options as a TOML table, one per line, lists of tables over several lines, each with its note."""
+    """Return options with their notes as a TOML table, one per line; lists of tables span several lines."""
     lines = ["", "[stream.options]"]
     for name, value in options.items():
         note = f"  # {notes[name]}" if name in notes else ""
@@ -189,7 +189,7 @@ def _described(options: Options, notes: Mapping[str, str]) -> list[str]:
 
 
 class FindingJson(TypedDict):
-    """A sensor that may have sent the bytes, as ``--json`` prints it."""
+    """A sensor that may have sent the bytes, in the format of ``--json``."""
 
     sensor: str
     options: Options
@@ -200,7 +200,7 @@ class FindingJson(TypedDict):
 
 
 class PortJson(TypedDict):
-    """The bytes read at an address, as ``--json`` prints it."""
+    """Findings at an address, in the format of ``--json``."""
 
     address: str
     baud: int | None
@@ -240,7 +240,7 @@ EMULATE_EXAMPLE = (
     "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
 )
 EMULATION_MARK = b"\nsimulated = true\n"  # Line that marks the rig file of an emulated rig
-SWITCH_S = 0.0005  # Longest delay of the pacing thread by the planning thread; Python's 5 ms would show at 1 kHz
+SWITCH_S = 0.0005  # Maximum delay of the pacing thread by the planning thread; Python's 5 ms would be visible at 1 kHz
 
 
 def add_emulate(program: typer.Typer) -> None:

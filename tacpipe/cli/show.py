@@ -1,6 +1,6 @@
-"""Describe a dataset: the streams of recordings, the roles of a split, a model's training data, or a result's headline.
+"""Describe a dataset: streams of recordings, roles of a split, a model's training data, or a result's headline.
 
-The contents of the dataset decide what is shown, not the stage that made it.
+What is shown depends on the contents of the dataset, not on the stage that created it.
 """
 
 from __future__ import annotations
@@ -24,43 +24,45 @@ from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
-SHOWN = 20  # Recordings that are listed before the remaining ones are counted
-READ_BYTES = 1 << 28  # Largest number of stored bytes to read; only rows of further streams are listed
-_TRUTH = "gt_"  # Prefix of a simulator's ground-truth labels
+SHOWN = 20  # Maximum number of recordings that are listed; further ones are counted
+READ_BYTES = (
+    1 << 28
+)  # Maximum number of stored bytes to read; further streams are listed with only their number of rows
+_TRUTH = "gt_"  # Prefix of the simulator's ground-truth labels
 _SPLIT = ("recording", "fold", "role")  # Columns of a split
 
 
 class DatasetOverview(TypedDict):
-    """The entries that every dataset has: stage, files and sizes."""
+    """Entries for every dataset: stage, files and sizes."""
 
     stage: str
     digest: str
     skipped: dict[str, str]  # reasons by recording
-    files: dict[str, int]  # bytes
+    files: dict[str, int]  # sizes in bytes
     bytes: int
     rows: int
 
 
 class ShownModel(DatasetOverview, model_overview.ModelOverview):
-    """A model."""
+    """Overview of a model."""
 
     kind: Literal["model"]
 
 
 class ShownResult(DatasetOverview, model_overview.ResultOverview):
-    """The result of an evaluation."""
+    """Overview of an evaluation result."""
 
     kind: Literal["result"]
 
 
 class ShownExport(DatasetOverview):
-    """Files for other tools."""
+    """Overview of files for other tools."""
 
     kind: Literal["export"]
 
 
 class ShownSplit(DatasetOverview):
-    """A split of recordings."""
+    """Overview of a split."""
 
     kind: Literal["split"]
     params: StoredParams
@@ -68,23 +70,24 @@ class ShownSplit(DatasetOverview):
 
 
 class ShownRecordings(DatasetOverview):
-    """Recordings, their figures and labels."""
+    """Overview of recordings with figures and labels."""
 
     kind: Literal["recordings"]
     recordings: dict[str, dict[str, StreamFigures]]  # figures by recording and stream
     attributes: Mapping[str, Mapping[str, Attribute]]
-    excluded: dict[str, str]  # reasons
+    excluded: dict[str, str]  # reasons by recording
 
 
 Shown = ShownModel | ShownResult | ShownExport | ShownSplit | ShownRecordings
 
 
 def of(path: Path, *, most: int | None = None) -> Shown:
-    """Return the contents of the dataset at ``path``: its ``kind``, files, and further entries by kind.
+    """Return an overview of the dataset at ``path``: its ``kind``, files, and entries that depend on the kind.
 
-    The kind is recordings, split, model, result or export. Of recordings, labels, and numbers a stream of the first ``most``
-    by name (None: of all), whose shards alone are read; with ``most`` labels are read when they are asked for. Of a split,
-    recordings by fold and role; of a model and of a result, what `tacpipe.cli.model_overview` finds.
+    The kind is recordings, split, model, result or export. The overview of recordings contains labels and each stream's
+    figures, for the first ``most`` recordings by name (None: all); only their shards are read, and labels are read on
+    access if ``most`` is not None. The overview of a split contains the recordings by fold and role, and that of a
+    model or result the output of `tacpipe.cli.model_overview`.
     """
     stored = manifest_of.find(path)
     store = locate(stored.directory)
@@ -128,7 +131,7 @@ def _about(opened: Dataset) -> DatasetOverview:
 
 
 def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
-    """Return how many recordings have each role, by fold; an empty mapping if the dataset is no split."""
+    """Return the number of recordings with each role by fold, or an empty mapping if the dataset is not a split."""
     if len(opened) != 1 or (shard := next(iter(opened))).streams != ("",):
         return {}
     table = shard.table()
@@ -146,7 +149,7 @@ def _excluded(opened: Dataset) -> dict[str, str]:
 
 
 def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:
-    """Return the figures of each stream by recording; of streams beyond ``most_bytes`` in all, only the rows."""
+    """Return each stream's figures by recording, or only its rows once ``most_bytes`` bytes were read in total."""
     figures: dict[str, dict[str, StreamFigures]] = {}
     for name in names:
         recording = opened.recordings[name]
@@ -212,7 +215,7 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
 
 
 def _split_text(value: ShownSplit) -> list[str]:
-    """Return how many recordings have each role, one line per fold."""
+    """Return the number of recordings with each role, one line per fold."""
     roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
     widths = {role: max(8, len(role) + 2) for role in roles}
     lines = [f"{'fold':<6}" + "".join(f"{role:>{width}}" for role, width in widths.items())]
@@ -226,14 +229,14 @@ def _role_order(role: str) -> tuple[int, str]:
 
 
 class _Values:
-    """Summary of a label's values: the count of each, or the range of fractional numbers."""
+    """Summary of a label's values: the count of each value, or the range of fractional numbers."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] | None = Counter()  # None after a float was added
         self._least, self._most = float("inf"), float("-inf")
 
     def add(self, value: Any) -> None:
-        """Add the value of one more recording."""
+        """Add the value of another recording."""
         if isinstance(value, int | float):
             self._least, self._most = min(self._least, value), max(self._most, value)
         if isinstance(value, float):
@@ -242,7 +245,7 @@ class _Values:
             self._counts[str(value)] += 1
 
     def __str__(self) -> str:
-        """Return the range, or each value with its count, or the number of values where there are many."""
+        """Return the range, or each value with its count, or the number of values if there are many."""
         if self._counts is None:
             return f"{self._least:g} to {self._most:g}"
         if len(self._counts) > SHOWN:
@@ -251,7 +254,7 @@ class _Values:
 
 
 def _labels(attributes: Mapping[str, Mapping[str, Attribute]], full: bool) -> list[str]:
-    """Return one line per label with its values, and one line for all labels of a simulator's ground truth."""
+    """Return one line per label with its values, and a single line for all ground-truth labels."""
     lines = []
     values_by_label: dict[str, _Values] = {}
     for labels in attributes.values():

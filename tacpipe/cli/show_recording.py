@@ -1,4 +1,4 @@
-"""Describe or draw one recording for ``tacpipe show DATASET RECORDING``: streams, columns, gaps, events and labels."""
+"""Describe or plot one recording for ``tacpipe show DATASET RECORDING``: streams, columns, gaps, events and labels."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.traces.spans import Span
 
-SAMPLED_ROWS = 1 << 20  # First rows of a stream, in which repeated rows and saturated values are counted
-_LISTED = 6  # Gaps, spans and events before the remaining ones are counted
-_LABELS = 40  # Largest number of labels of the recording that are listed
-_NAMED = 5  # Largest number of recordings that an error names
+SAMPLED_ROWS = 1 << 20  # Number of leading rows of a stream in which repeated rows and saturated values are counted
+_LISTED = 6  # Maximum number of listed gaps, spans and events; further ones are counted
+_LABELS = 40  # Maximum number of listed labels of the recording
+_NAMED = 5  # Maximum number of recordings named in an error
 RATES = "Hz: by the device's counter `seq`, else by the median step, so lost samples do not lower it."
 _MEAN_RATES = (
     "mean Hz: rows per second of the recorded stamps; the labels STREAM_rate_hz are the same on the clock that "
@@ -38,7 +38,7 @@ _MEAN_RATES = (
 
 
 class StreamFigures(TypedDict, total=False):
-    """The figures of one stream; those after `rows` are absent where they are not read, or the stream has no clock."""
+    """Figures of one stream; those after `rows` are absent if they were not read or if the stream has no clock."""
 
     rows: int
     columns: int
@@ -49,7 +49,7 @@ class StreamFigures(TypedDict, total=False):
     gap_shares: dict[str, float]
     held_share: float
     saturated: int
-    codec: str  # of a stream of frames, as the five that follow
+    codec: str  # this and the next five: only for streams of frames
     width_px: int
     height_px: int
     pixel_format: str
@@ -59,7 +59,7 @@ class StreamFigures(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class StreamColumn:
-    """A column, and the stream that it belongs to."""
+    """A column and its stream."""
 
     stream: str
     name: str
@@ -70,9 +70,9 @@ class StreamColumn:
 
 @dataclass(frozen=True)
 class ShownInterval:
-    """A gap of a stream, or a time in which a label of rows has one value; in seconds since the start of the recording."""
+    """A gap of a stream, or an interval with a constant row label; in seconds since the start of the recording."""
 
-    name: str  # Name of the stream or of the label
+    name: str  # name of the stream or label
     text: str
     start_s: float
     stop_s: float
@@ -80,7 +80,7 @@ class ShownInterval:
 
 @dataclass(frozen=True)
 class RecordedEvent:
-    """An event that was recorded, in seconds since the start of the recording."""
+    """A recorded event, in seconds since the start of the recording."""
 
     time_s: float
     stream: str
@@ -89,7 +89,7 @@ class RecordedEvent:
 
 @dataclass(frozen=True)
 class RecordingOverview:
-    """The contents of one recording."""
+    """Contents of one recording."""
 
     name: str
     stage: str
@@ -110,9 +110,9 @@ class RecordingOverview:
 
 
 def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
-    """Draw a recording, the only one where none is named, and return the picture's path.
+    """Plot the named recording, or the only one, and return the path of the picture.
 
-    Raises `UsageError` if the dataset has several recordings and none is named.
+    Raises `UsageError` if no recording is named and the dataset contains several.
     """
     from tacpipe.viewer import contents, figure
 
@@ -127,7 +127,7 @@ def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
 
 
 def overview(dataset: Path, name: str) -> RecordingOverview:
-    """Return the contents of a recording. Raises `UsageError` if the dataset has none of this name."""
+    """Return the contents of a recording. Raises `UsageError` if the dataset has no recording of this name."""
     from tacpipe.traces import spans
 
     opened = _open(dataset)
@@ -195,7 +195,7 @@ def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
 
 
 def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
-    """Return the stamps and some columns of a stream, with field metadata; an empty table where none is named."""
+    """Return the time stamps and named columns of a stream with field metadata, or an empty table if none is named."""
     import pyarrow as pa
 
     names = ["t_ns", *names] if names else []
@@ -210,7 +210,7 @@ def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
 
 
 def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFigures:
-    """Return the figures of a stream with these clocks."""
+    """Return the figures of a stream whose clocks are ``clocks``."""
     import pyarrow as pa
 
     from tacpipe.video.stream import read_format
@@ -238,7 +238,7 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
 
 
 def _missing_frames(columns: Columns) -> int | None:
-    """Return how many frames are missing by the counter ``seq``, or None if the stream has none."""
+    """Return the number of frames missing according to the counter ``seq``, or None if there is no counter."""
     if "seq" not in columns.column_names or not columns.num_rows:
         return None
     seq = columns.column("seq").to_numpy()
@@ -246,16 +246,16 @@ def _missing_frames(columns: Columns) -> int | None:
 
 
 def gaps_text(figures: StreamFigures) -> str:
-    """Return the gaps of a stream: of synchronized rows the share that lies in a gap of the worst stream, else a count."""
+    """Describe a stream's gaps: for synchronized rows the percentage in gaps of the worst stream, otherwise a count."""
     if "gap_shares" in figures:
         return f"{max(figures['gap_shares'].values()):.1%}"
     return f"{figures['gaps']:,}" if "gaps" in figures else ""
 
 
 def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
-    """Return the fraction of rows that repeat the row before, and the count of values at a limit of their type.
+    """Return the fraction of rows that repeat the previous row, and the number of values at a limit of their type.
 
-    Both are of the first `SAMPLED_ROWS` rows. A missing value repeats nothing.
+    Only the first `SAMPLED_ROWS` rows are read. A missing value does not count as repeated.
     """
     import numpy as np
 
@@ -264,7 +264,7 @@ def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[flo
     for batch in columns.batches(names):
         repeated = np.ones(batch.num_rows, dtype=bool)  # (time,)
         for name in names:
-            values = batch[name].to_numpy()  # (time,), or NaN if there is none
+            values = batch[name].to_numpy()  # (time,), NaN if missing
             limits = np.iinfo(batch.schema.field(name).type.to_pandas_dtype())
             saturated += int(((values == limits.max) | (values == limits.min)).sum())
             repeated[1:] &= values[1:] == values[:-1]
@@ -278,7 +278,7 @@ def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[flo
 
 
 def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
-    """Return the overview as lines: streams, columns, gaps, labels of rows, events and labels of the recording."""
+    """Return the overview as lines: streams, columns, gaps, row labels, events and labels of the recording."""
     rows = sum(figures["rows"] for figures in recording.streams.values())
     head = [shown(recording.name)]
     if recording.duration_s is not None:
@@ -316,7 +316,7 @@ def _streams_text(recording: RecordingOverview) -> str:
 
 
 def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
-    """Return one line per stream of frames: codec, size, rate and the number of missing frames."""
+    """Return one line per stream of frames with codec, size, rate and the number of missing frames."""
     lines = []
     for stream, figures in streams_figures.items():
         if "codec" not in figures:
@@ -331,7 +331,7 @@ def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
 
 
 def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable:
-    """Return a table of the columns by stream; neighbours that differ only in their names share a row."""
+    """Return a table of columns by stream; adjacent columns that differ only in name share a row."""
     groups = []
     for stream, members in groupby(columns, lambda column: column.stream):
         rows = []
@@ -346,7 +346,7 @@ def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable
 
 
 def _gaps_text(recording: RecordingOverview, full: bool) -> str:
-    """Return one line per stream with gaps: their count, their sum, and the longest of them."""
+    """Return one line per stream with gaps: number of gaps, total duration, and the longest gaps."""
     lines = []
     for stream in sorted({gap.name for gap in recording.gaps}):
         longest = sorted(

@@ -1,4 +1,4 @@
-"""Build the arguments, options and help of a stage's command from its signature and params."""
+"""Build the arguments, options and help of a stage's command from the stage's signature and params."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ EXAMPLE = "Example: "  # Start of the last paragraph of a stage's docstring
 
 
 def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
-    """Return the parameters of a stage's command; ``fields`` are those of its params, by name."""
+    """Return the parameters of a stage's command; ``fields`` are the fields of its params by name."""
     return [*_arguments(stage), *_shared(stage), *_options(stage, fields), *_looks(stage)]
 
 
 def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
-    default = None if PRINT_PARAMS in sys.argv else ...  # Params are printed without any data.
+    default = None if PRINT_PARAMS in sys.argv else ...  # Printing params requires no data.
     arguments: list[tuple[str, Any, str]] = []
     if "Files" in kinds:
         arguments.append(("source", Path, "Folder of the recordings."))
@@ -99,7 +99,7 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
         is_sequence = get_origin(kind) is tuple
         flag = f"--{name.replace('_', '-')}"
         flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
-        # The text of an option is parsed like that of --set.
+        # Option values are parsed like those of --set.
         annotation = bool | None if kind is bool else list[str] | None if is_sequence else str | None
         text = _about(stage, name, helps.get(name, ""))
         metavar = None if kind is bool else _metavar(hint)
@@ -170,7 +170,7 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
 
 
 def _looks(stage: AnyStage) -> list[inspect.Parameter]:
-    """Return the options that print information and write nothing."""
+    """Return the options that only print information."""
     parameters = []
     if stage.guess is not None:
         text = "Print a first layout file for this folder, and stop."
@@ -197,7 +197,7 @@ def _shows(requirements: Requirements) -> Callable[[bool], None]:
 
 
 def _shown_choice(stage: AnyStage) -> str | None:
-    """Return the architecture, or other choice between kinds of params, whose options the help shows."""
+    """Return the architecture (or other kind of params) whose options are shown in the help."""
     tag = params_of.tag(stage)
     if tag is None:
         return None
@@ -210,7 +210,7 @@ def _shown_choice(stage: AnyStage) -> str | None:
 
 
 def _about(stage: AnyStage, name: str, comment: str) -> str:
-    """Return the help of an option: its comment, its range, which choices have it, and its default."""
+    """Return an option's help: its comment, its range, the choices that have it, and its default."""
     annotation = params_of.fields(stage)[name]
     parts = [comment] if comment else []
     if fields_of.constraints(annotation):
@@ -225,7 +225,7 @@ def _about(stage: AnyStage, name: str, comment: str) -> str:
 
 
 def _default(name: str, value: Any) -> str:
-    """Return a default as an option writes it."""
+    """Return a default in the syntax of the option."""
     if isinstance(value, bool):
         return ("" if value else "no-") + name.replace("_", "-")
     if isinstance(value, dict):
@@ -234,7 +234,7 @@ def _default(name: str, value: Any) -> str:
 
 
 def _metavar(hint: Any) -> str:
-    """Return the placeholder of an option's value in its help: the choices, or the type."""
+    """Return the placeholder of an option's value, which is its choices or its type."""
     kind = fields_of.bare(hint)
     if get_origin(kind) is tuple:
         return f"{_metavar(get_args(kind)[0])}..."
@@ -248,9 +248,9 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def summary(name: str, stage: AnyStage) -> str:
-    """Return the docstring of a stage: that of its module where that is named after the stage, else of its function.
+    """Return a stage's docstring, which is that of its module if the module is named after the stage, or of its function.
 
-    Its last paragraph is an example; one is made of the stage's arguments where it has none.
+    The last paragraph is an example, generated from the stage's arguments if the docstring has none.
     """
     module = stage.function.__module__
     texts = (sys.modules[module].__doc__, stage.function.__doc__)
@@ -260,7 +260,7 @@ def summary(name: str, stage: AnyStage) -> str:
 
 
 def example(name: str, stage: AnyStage) -> str:
-    """Return a command line that shows the stage at work, as its arguments allow."""
+    """Return a sample command line, generated from the stage's arguments."""
     kinds = set(stage.arguments.values())
     words = ["tacpipe", *name.split(".")]
     words += ["published/recordings"] if "Files" in kinds else []

@@ -1,8 +1,8 @@
-"""Run commands of a chain at the same time, each in a separate process.
+"""Run commands of a chain concurrently, each in a separate process.
 
-Importing torch takes longer than evaluating a small network. So commands are forked from one process that has imported torch
-and has done nothing else; commands of other programs are run by the shell there. The output of a command is printed when it
-ends, because interleaved outputs are unreadable.
+Importing torch takes longer than evaluating a small network. Commands are therefore forked from a process that only
+imports torch. That process runs commands of other programs in a shell. A command's output is printed when it ends,
+because interleaved outputs are unreadable.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext
     from multiprocessing.context import ForkServerProcess as Process
 
-Command = str | Sequence[str]  # Text for the shell, or the words of a command of tacpipe without its name
+Command = str | Sequence[str]  # Shell command line, or arguments of a tacpipe command without ``tacpipe``
 OWN = (
     "tacpipe.cli.main",
     "tacpipe.cli.commands",
@@ -42,7 +42,7 @@ _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) "
 
 
 def modules(commands: Iterable[str]) -> tuple[str, ...]:
-    """Return the modules that commands import.
+    """Return the modules that the commands import.
 
     >>> modules(["tacpipe split data -o split"]) == MODULES
     True
@@ -52,18 +52,18 @@ def modules(commands: Iterable[str]) -> tuple[str, ...]:
 
 
 class StageProcesses:
-    """Runs at most ``jobs`` commands at a time in the block of a ``with``, and interrupts running ones at its end.
+    """Context manager that runs at most ``jobs`` commands concurrently, and interrupts running ones on exit.
 
-    Each computes with as many threads as there are cores for each, unless the environment states another number, and on as
-    many recordings at a time as there are cores for those that begin together. Each sees one GPU where there are several.
+    Each command computes with cores / ``jobs`` threads, unless the environment sets another number, and processes cores
+    / ``together`` recordings at a time. If there are several GPUs, each command sees only one of them.
     """
 
     def __init__(self, jobs: int, folder: Path, modules: Sequence[str]) -> None:
-        """Take the number of jobs (0: one per usable core), a folder for their output, and the modules to import."""
+        """Set the number of jobs (0: one per usable core), the folder for output, and the modules to import."""
         self.jobs = jobs or provenance.jobs()
         self._folder, self._modules = folder, modules
-        self._running: dict[str, Process] = {}  # Processes by name of the stage
-        self._slots: dict[str, int] = {}  # Number from 0 of each running stage, which selects its GPU
+        self._running: dict[str, Process] = {}  # Processes by stage name
+        self._slots: dict[str, int] = {}  # Slot of each running stage, numbered from 0, which selects its GPU
         self._context: ForkServerContext | None = None
 
     def __enter__(self) -> StageProcesses:
@@ -81,18 +81,18 @@ class StageProcesses:
 
     @property
     def free(self) -> bool:
-        """True if another command may be started."""
+        """Whether another command can be started."""
         return len(self._running) < self.jobs
 
     @property
     def busy(self) -> bool:
-        """True if a command runs."""
+        """Whether a command is running."""
         return bool(self._running)
 
     def start(self, name: str, command: Command, together: int) -> None:
-        """Start a command of stage ``name``, which has none running; ``together`` commands share the cores."""
+        """Start a command of stage ``name``, which must not be running; ``together`` commands divide the cores."""
         if self._context is None:
-            with provenance.shared_by(self.jobs):  # The process that forks passes its environment on.
+            with provenance.shared_by(self.jobs):  # The forking process passes on its environment.
                 self._context = local.start_fork_server(self._modules)
         words = command if isinstance(command, str) else list(command)
         self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
@@ -105,7 +105,7 @@ class StageProcesses:
         self._running[name] = process
 
     def next(self, before: Callable[[str], None]) -> tuple[str, int]:
-        """Return the stage whose command ends next and its exit code; call ``before``, then print the command's output."""
+        """Wait for a command to end, call ``before``, print the output, and return the stage's name and exit code."""
         name = next(iter(self._wait_for_stages(None)))
         before(f"{name}:")
         return name, self._collect_stage(name)
@@ -120,7 +120,7 @@ class StageProcesses:
         process = self._running.pop(name)
         process.join()
         for path, stream in zip(self._output_paths(self._slots.pop(name)), (sys.stdout, sys.stderr), strict=True):
-            with contextlib.suppress(FileNotFoundError):  # A command that was killed at once has no output.
+            with contextlib.suppress(FileNotFoundError):  # A command that was killed immediately has no output.
                 stream.write(path.read_bytes().decode(errors="backslashreplace"))
                 stream.flush()
                 path.unlink()
@@ -128,7 +128,7 @@ class StageProcesses:
         return code if code >= 0 else 128 - code
 
     def _output_paths(self, slot: int) -> tuple[Path, Path]:
-        """Return the files for standard output and error of the stage in a slot."""
+        """Return the files for stdout and stderr of the stage in a slot."""
         return self._folder / f"{slot}.out", self._folder / f"{slot}.err"
 
 

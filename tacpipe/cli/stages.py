@@ -1,4 +1,4 @@
-"""Add stages as commands: arguments from the signature of a stage, options from its params."""
+"""Add stages as commands, with arguments from the stage's signature and options from its params."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _answering: ContextVar[bool] = ContextVar("answering", default=False)
 
 
 class UnansweredError(Exception):
-    """A command has something to compute or to write, or is one that always does something."""
+    """Raised if a command has something to compute or write, or always has an effect."""
 
 
 @contextlib.contextmanager
 def answering() -> Iterator[None]:
-    """Have commands of stages in the block report only stored results, and raise `UnansweredError` without them."""
+    """Make stage commands in the context report only stored results, and raise `UnansweredError` if there are none."""
     token = _answering.set(True)
     try:
         yield
@@ -45,7 +45,7 @@ def answering() -> Iterator[None]:
 
 
 def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> None:
-    """Add the command ``group`` to ``program``: a stage, or the stages of a group, of which ``arguments`` name one."""
+    """Add the command ``group`` to ``program``: a stage, or a group with the stages that ``arguments`` name."""
     names = [name for name in registry.stages() if name.partition(".")[0] == group]
     if names == [group]:
         add(program, group, group)
@@ -54,7 +54,7 @@ def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> Non
     methods = typer.Typer(help=group_help, no_args_is_help=True, rich_markup_mode=None)
     by_method = {name.partition(".")[2]: name for name in names}
     requested = [method for method in by_method if method in arguments]
-    for method in requested:  # A broken method does not affect the other methods.
+    for method in requested:  # A broken method must not affect the other methods.
         add(methods, by_method[method], method)
     for method in () if requested else by_method:
         methods.command(method, help=registry.summary(by_method[method]))(unrequested)
@@ -81,7 +81,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         raise UnansweredError
     terminal.set_quiet(options["quiet"])
     for flag, kind in OPTIONS.items():
-        if flag != "fold" and options.get(flag) is not None:  # Some stages lack some of these options.
+        if flag != "fold" and options.get(flag) is not None:  # Not all stages have all of these options.
             fields_of.check(options[flag], kind, f"--{flag}")
     if options.get("guess") and stage.guess is not None:
         terminal.result(stage.guess(options["source"]).rstrip("\n"))
@@ -103,7 +103,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         return
     if options["output"] is None:
         raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")
-    from tacpipe.engine import grid, pipeline  # Help needs neither module.
+    from tacpipe.engine import grid, pipeline  # These imports are not needed for help.
 
     requests = grid.requests(_request(name, stage, params, options), grid.folds(options.get("fold") or "0"))
     headline_file = (
@@ -121,7 +121,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
 
 
 def _request(name: str, stage: AnyStage, params: Any, options: Mapping[str, Any]) -> Request:
-    """Return what the options of a command request."""
+    """Return the request that a command's options describe."""
     return Request(
         name,
         params,
@@ -152,7 +152,7 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
 
 
 def _estimate(requests: Sequence[Request]) -> None:
-    """Print the estimated training time of the missing models, if it can be estimated."""
+    """Print the estimated training time of the missing models, if there is an estimate."""
     from tacpipe.engine import grid
 
     sentence = grid.estimate_duration(requests, requests[0].jobs)
@@ -161,7 +161,7 @@ def _estimate(requests: Sequence[Request]) -> None:
 
 
 def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end if folds failed."""
+    """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end if any fold failed."""
     from tacpipe.engine import by_recording, grid
 
     failed: list[TacpipeError] = []
@@ -189,7 +189,7 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
 
         headlines = headline_table.of_output(outcome.output, headline)
         headlines_json = [entry.to_json() for entry in headlines or ()]
-        if not quiet and headlines is not None:  # Tasks of other packages may have no headline.
+        if not quiet and headlines is not None:  # Tasks from other packages may have no headline.
             headline_table.show(headlines)
     if as_json:
         extra = {} if headlines_json is None else {"headline": headlines_json}
@@ -209,7 +209,7 @@ def _params_file(options: dict[str, Any]) -> Path | None:
 
 
 def _parsed(value: Any, annotation: Any) -> Any:
-    """Return the value of an option, converted to its annotation where that is possible."""
+    """Return an option's value, converted to its annotation if possible."""
     if isinstance(value, list):
         return [fields_of.parsed(text, get_args(fields_of.bare(annotation))[0]) for text in value]
     return fields_of.parsed(value, annotation) if isinstance(value, str) else value

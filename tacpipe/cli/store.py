@@ -61,9 +61,9 @@ def init() -> None:
 
 
 def status(as_json: AsJson = False) -> None:
-    """Show the place, size and roots of the store.
+    """Show the location, size and roots of the store.
 
-    Of a store in a bucket also the folder here that is in front of it.
+    For a store in a bucket, also shows its local cache folder.
 
     Example: tacpipe store status
     """
@@ -81,7 +81,7 @@ def status(as_json: AsJson = False) -> None:
 
 
 def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
-    """List the datasets in the store, replaced ones included.
+    """List the datasets in the store, including replaced ones.
 
     Each with stage, time, number of recordings and labels, and last path.
 
@@ -127,8 +127,8 @@ def checkout(
 def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
     """Check every stored object and record for damage.
 
-    Damaged ones are quarantined, but for those in a bucket. Exits with 4 if
-    one is damaged or missing, with 1 if the system failed to read one.
+    Damaged objects are quarantined, except in a bucket. Exits with 4 if an object
+    is damaged or missing, and with 1 if the system failed to read one.
 
     Example: tacpipe store verify --remote s3://lab/store
     """
@@ -149,7 +149,7 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
 def repair(as_json: AsJson = False) -> None:
     """Recompute stored objects that are damaged or missing.
 
-    Exits with 4 if one cannot be recomputed.
+    Exits with 4 if an object cannot be recomputed.
 
     Example: tacpipe store repair
     """
@@ -165,7 +165,7 @@ def repair(as_json: AsJson = False) -> None:
 
 
 def _end_unread(soundness: Soundness) -> None:
-    """Exit with 1 if the system failed to read objects, whose state stays unknown."""
+    """Exit with 1 if the system failed to read objects, whose state is therefore unknown."""
     if soundness.unread:
         terminal.report_progress(
             f"{len(soundness.unread)} objects or records could not be read: {next(iter(soundness.unread.values()))}"
@@ -188,15 +188,15 @@ def gc(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove stored objects that nothing needs.
+    """Remove stored objects that are not needed.
 
-    Needed are those of datasets, of their ancestors and of running processes.
+    Objects of datasets, of their ancestors and of running processes are needed.
 
     Example: tacpipe store gc --dry-run
     """
     from tacpipe.maintenance import remote_upkeep, transfer
 
-    if not 0 <= grace_days < math.inf:  # NaN fails this check too.
+    if not 0 <= grace_days < math.inf:  # NaN also fails this check.
         raise UsageError(f"--grace-days is {grace_days:g}; it must be a number of days of 0 or more.")
     store = locate() if remote is None else transfer.remote_store(remote)
     if isinstance(store, Store) and store.distant:
@@ -297,7 +297,8 @@ def pull(
 ) -> None:
     """Copy datasets from another store.
 
-    A dataset whose manifest is here is completed; of any other, what was pushed from that path is written.
+    If the manifest of a dataset is in this project, its missing objects are copied. Otherwise the dataset that was
+    pushed from that path is written.
 
     Example: tacpipe store pull /mnt/lab/store models/forward data/latents data/split
     """

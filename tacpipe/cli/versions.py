@@ -1,4 +1,4 @@
-"""List the versions of tacpipe, of Python and of the installed libraries that results depend on."""
+"""List the versions of tacpipe, Python and the installed libraries that affect results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SCHEMA_VERSION = 1
 
 
 class Versions(TypedDict):
-    """Versions of tacpipe, of Python and of the dependencies by extra; None for one that is not installed."""
+    """Versions of tacpipe, Python and the dependencies by extra; None for a dependency that is not installed."""
 
     schema_version: int
     tacpipe: str
@@ -21,9 +21,10 @@ class Versions(TypedDict):
 
 
 def of_parts() -> Versions:
-    """Return the version of tacpipe and of Python, and that of each dependency; None for one that is not installed.
+    """Return the versions of tacpipe, Python and each dependency; None for a dependency that is not installed.
 
-    The dependencies are listed by extra; ``core`` is what every installation needs. ``all`` and ``dev`` are left out.
+    Dependencies are listed by extra, and those of every installation under ``core``. Omits the extras ``all`` and
+    ``dev``.
     """
     parts: dict[str, dict[str, str | None]] = {"core": {}}
     for requirement in metadata.requires("tacpipe") or ():

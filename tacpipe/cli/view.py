@@ -1,4 +1,4 @@
-"""Add the command ``tacpipe view``: show recordings in Rerun's viewer or a browser, or save them as a file."""
+"""Add the command ``tacpipe view``, which shows recordings in Rerun's viewer or a browser, or saves them as a file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXAMPLE = (
     "recordings are in the viewer's own list. Nothing is sent over the network."
     "\n\nExample: tacpipe view data/recordings trial-003 --predictions data/predictions"
 )
-MAGIC, ENDING = b"RRF", ".rrd"  # First bytes and suffix of a file of Rerun
+MAGIC, ENDING = b"RRF", ".rrd"  # First bytes and suffix of a Rerun file
 LIMIT = 8
 
 
@@ -86,7 +86,7 @@ def view(
 
 
 def _require(save: Path | None, *, web: bool, port: int | None) -> None:
-    """Raise `UsageError` before anything is read for contradictory options or a file of another program."""
+    """Raise `UsageError` before reading data if options conflict or a file belongs to another program."""
     from tacpipe.datasets import replacing
 
     if save is not None and web:
@@ -100,9 +100,9 @@ def _require(save: Path | None, *, web: bool, port: int | None) -> None:
 
 
 def conditions(where: Sequence[str]) -> dict[str, Attribute]:
-    """Return the labels of texts ``name=value``; numbers and true, false, null are read as YAML does.
+    """Parse labels of the form ``name=value``; numbers and true, false, null are read as in YAML.
 
-    Raises `UsageError` for another form.
+    Raises `UsageError` for any other form.
 
     >>> conditions(["object=cup", "trial=3"])
     {'object': 'cup', 'trial': 3}
@@ -156,7 +156,7 @@ def _predictions(path: Path | None) -> Dataset | None:
 
 
 def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
-    """Return the predictions of one recording: its table, or its one-row slice of a table of all recordings."""
+    """Return the predictions for a recording: its own table, or its one-row slice of a table of all recordings."""
     if name in predictions:
         return predictions[name].table(), None
     for recording in predictions:
@@ -171,7 +171,7 @@ def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
 
 
 def _save(files: Sequence[Path], save: Path) -> None:
-    """Write the only file to ``save``, or files into the folder ``save``; files of other programs are left alone."""
+    """Write a single file to ``save``, or several into the folder ``save``, without overwriting files of other programs."""
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
 
