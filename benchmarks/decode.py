@@ -113,11 +113,11 @@ class Contest:
         """Yield what a link delivers of so many frames at a time."""
         if self.packets:
             for start in range(0, FRAMES, count):
-                yield Chunks.of(enumerate(self.frames[start : start + count]))
+                yield Chunks.from_pairs(enumerate(self.frames[start : start + count]))
             return
         size = int(len(self.data) / FRAMES * count)
         for place in range(0, len(self.data), size):
-            yield Chunks.of([(place, self.data[place : place + size])])
+            yield Chunks.from_pairs([(place, self.data[place : place + size])])
 
     def read(self, count: int) -> AnyArray:
         """Return what our driver makes of the bytes of so many frames at a time."""

@@ -25,7 +25,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.byte_faults import Faults, SentItem
-from tacpipe.simulation.emulation.emulator import PACKETS, UNPACED_HZ, Emulator, pace
+from tacpipe.simulation.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator, frame_pace
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.transmission import TransmissionPlan
 from tacpipe.testing import matching
@@ -65,7 +65,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     """Return what became of ``seconds`` of a stream of the rig of all sensors."""
     emulator = Emulator(rig_of.read(RIG), seed=1, faults=faults)
     stream = emulator.rig_file.streams[name]
-    its_pace, rate_hz = pace(emulator.rig_file, name), stream.sensor.rate_hz or UNPACED_HZ
+    its_pace, rate_hz = frame_pace(emulator.rig_file, name), stream.sensor.rate_hz or DEFAULT_HZ
     source = emulator.source(name, its_pace, rate_hz)
     packets = stream.address.scheme in PACKETS
     plan = TransmissionPlan(source, its_pace, faults, [1], packets=packets)
@@ -74,13 +74,13 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     batches: list[Batch] = []
     harmed: Counter[str] = Counter()
     away = False
-    while plan.until_ns < seconds * 1e9:
+    while plan.planned_ns < seconds * 1e9:
         for item in plan.next_items():
             if item.number < 0 and item.cause in (byte_faults.UNPLUG, byte_faults.REPLUG):
                 away = item.cause == byte_faults.UNPLUG
                 harmed[item.cause] += 1
                 if away:
-                    batches.append(reading.broken())
+                    batches.append(reading.end_link())
                 continue
             size = 0 if away else len(item.data)
             cause = byte_faults.GONE if away and item.data else item.cause
@@ -96,7 +96,7 @@ def _chunks(item: SentItem, *, packets: bool) -> Chunks:
     """Return an item as a link would give it; a link of bytes in two pieces."""
     half = len(item.data) // 2
     pieces = [item.data] if packets or not half else [item.data[:half], item.data[half:]]
-    return Chunks.of([(item.due_ns, piece) for piece in pieces])
+    return Chunks.from_pairs([(item.due_ns, piece) for piece in pieces])
 
 
 def _compare_with_sent(
@@ -105,7 +105,7 @@ def _compare_with_sent(
     """Hold samples against what was sent: in the order of their sending, by all that they say."""
     sent = ledger.samples()
     assert sent.rows is not None
-    unharmed = ledger.whole
+    unharmed = ledger.intact_rows
     sent_keys = _keys(sent, reading)
     places: dict[bytes, list[int]] = {}
     for place, key in enumerate(sent_keys):
@@ -152,7 +152,7 @@ def _longest(ledger: Ledger, delivered_rows: np.ndarray) -> int:
     delivered = np.zeros(len(ledger), dtype=bool)
     delivered[delivered_rows] = True
     unharmed = np.zeros(len(ledger), dtype=bool)
-    unharmed[ledger.whole] = True
+    unharmed[ledger.intact_rows] = True
     longest = run = 0
     counting = False
     for good, was_delivered in zip(unharmed.tolist(), delivered.tolist(), strict=True):

@@ -41,7 +41,7 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
         raise UsageError("--trials needs --duration-s or --stop, because otherwise the first trial never ends.")
     store.prepare()
     directory.check_output(store, plan.output)
-    appending.refuse_taken(plan.output, plan.names)
+    appending.refuse_existing_names(plan.output, plan.names)
     recorder = Recorder(complete_rig(rig))
     with EndRequest() as is_over, recorder.open(), RigView(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(is_over)

@@ -143,7 +143,7 @@ def _run(
         plan = trials.RecordingPlan(output, trials.recording_name(name), duration_s, attributes=attributes)
         store.prepare()
         directory.check_output(store, output)
-        appending.refuse_taken(output, plan.names)
+        appending.refuse_existing_names(output, plan.names)
     recorder = Recorder(prepared.rig)
     recorded: list[Any] = []
     lost: list[str] = []

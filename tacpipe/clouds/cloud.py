@@ -200,7 +200,7 @@ class DepthFrame:
         return head + self.depth.astype("<u2").tobytes() + (self.colours.tobytes() if self.colours is not None else b"")
 
     @classmethod
-    def of_bytes(cls, content: bytes) -> DepthFrame:
+    def from_bytes(cls, content: bytes) -> DepthFrame:
         """Return the frame that `to_bytes` gave. Raises `TacpipeError` if it is none or was cut off."""
         if len(content) < HEADER.size or not content.startswith(MAGIC):
             raise TacpipeError(f"{len(content)} bytes are not a depth frame; it must begin with {MAGIC.decode()}.")

@@ -1,4 +1,4 @@
-"""Depth cameras: Intel RealSense, through Open3D. Each entry is one image of depth and colour."""
+"""Read Intel RealSense depth cameras through Open3D. Each entry is one image of depth and colour."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from tacpipe.clouds.cloud import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.link import Arrived, OpenLink
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 PAUSE_S = 0.002  # pause between polls; frames are at least 11 ms apart
 
 
-def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
-    """Return the open camera of this number, or of this serial number.
+def open_camera(target: str, sensor: Sensor, name: str) -> CameraLink:
+    """Open the camera with this index or serial number.
 
-    Raises `DeviceError` where it is not connected, or held by another program, `MissingModuleError` without Open3D.
+    Raises `DeviceError` if it is not connected or used by another program, and `MissingModuleError` without Open3D.
     """
     with extras.explain_missing(name):
         import open3d
-    kind = getattr(open3d.t.io, "RealSenseSensor", None)
-    if kind is None:
+    sensor_class = getattr(open3d.t.io, "RealSenseSensor", None)
+    if sensor_class is None:
         raise DeviceError(f"{name}: this Open3D was built without RealSense; record clouds by folder:PATH instead.")
-    serials = [str(device.serial) for device in kind.enumerate_devices()]
-    serial = _serial(place, serials, name)
-    camera = kind()
+    serials = [str(device.serial) for device in sensor_class.enumerate_devices()]
+    serial = _serial(target, serials, name)
+    camera = sensor_class()
     try:
         camera.init_sensor(open3d.t.io.RealSenseSensorConfig({"serial": serial}), 0)
         camera.start_capture()
@@ -41,19 +41,21 @@ def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
     return CameraLink(name, camera)
 
 
-def _serial(place: str, serials: list[str], name: str) -> str:
-    """Return the serial number of the camera that ``place``, a number or a serial number, names."""
-    if place in serials:
-        return place
-    if not place.isdigit():
-        raise UsageError(f"camera:{place} names no camera; it should read camera:0, or hold a serial number.")
-    if len(place) < 4 and int(place) < len(serials):
-        return serials[int(place)]
-    described = f"there are {', '.join(serials)}" if serials else "there is none at all"
-    raise DeviceError(f"{name}: no RealSense camera {place} is connected; {described}. Plug it in to a USB 3 port.")
+def _serial(target: str, serials: list[str], name: str) -> str:
+    """Return the serial number of the camera at ``target``, which is an index or a serial number."""
+    if target in serials:
+        return target
+    if not target.isdigit():
+        raise UsageError(
+            f"camera:{target} is not a camera; write camera:INDEX, such as camera:0, or camera:SERIAL_NUMBER."
+        )
+    if len(target) < 4 and int(target) < len(serials):
+        return serials[int(target)]
+    connected = f"there are {', '.join(serials)}" if serials else "there is none at all"
+    raise DeviceError(f"{name}: no RealSense camera {target} is connected; {connected}. Connect it to a USB 3 port.")
 
 
-class CameraLink(Opened):
+class CameraLink(OpenLink):
     """An open RealSense camera."""
 
     packets = True
@@ -65,10 +67,10 @@ class CameraLink(Opened):
         matrix = np.asarray(metadata.intrinsics.intrinsic_matrix)
         self._focal = float(matrix[0, 0]), float(matrix[1, 1])
         self._centre = float(matrix[0, 2]), float(matrix[1, 2])
-        self._unit_m = 1 / float(metadata.depth_scale)  # RealSense states counts per metre
+        self._unit_m = 1 / float(metadata.depth_scale)  # RealSense reports counts per metre
 
     def _receive(self, timeout_s: float) -> Arrived:
-        until = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         while True:
             try:
                 image = self.camera.capture_frame(wait=False, align_depth_to_color=True)
@@ -82,7 +84,7 @@ class CameraLink(Opened):
                 )
                 frame = DepthFrame(depth[..., 0], self._focal, self._centre, self._unit_m, colours)
                 return [(t_ns, frame.to_bytes())]
-            if self._closed or time.monotonic() >= until:
+            if self._closed or time.monotonic() >= deadline:
                 return []
             time.sleep(PAUSE_S)
 

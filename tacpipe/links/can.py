@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io.files import listed
 from tacpipe.links import ports
-from tacpipe.links.link import Arrivals, Arrived, Opened
+from tacpipe.links.link import Arrivals, Arrived, OpenLink
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
@@ -25,7 +25,7 @@ FRAME = struct.Struct("<IB8s")  # identifier, number of data bytes, data bytes p
 EXTENDED = 1 << 31  # flag of an identifier with 29 bits
 SEND_S = 1.0
 INTERFACES = Path("/sys/class/net")
-IS_CAN = "280"  # ARPHRD_CAN of <linux/if_arp.h>
+CAN_TYPE = "280"  # ARPHRD_CAN of <linux/if_arp.h>
 DIGIT = "[0-9A-Fa-f]"
 SLCAN_FRAME = re.compile(
     rf"(?P<kind>[tdb][0-7]{DIGIT}{{2}}|[TxDB][01]{DIGIT}{{7}})(?P<length>{DIGIT})(?P<data>(?:{DIGIT}{{2}})*)"
@@ -35,12 +35,12 @@ SLCAN_REPLY = re.compile(
 )
 
 
-def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
-    """Return an open bus of ``KIND:CHANNEL`` or ``KIND:CHANNEL@BITRATE``.
+def open_can(target: str, sensor: Sensor, name: str) -> CanLink:
+    """Open the bus ``KIND:CHANNEL`` or ``KIND:CHANNEL@BITRATE``.
 
-    Raises `UsageError` for an address that is none, `DeviceError` for an interface that is missing, down, or not permitted.
+    Raises `UsageError` for an invalid address, and `DeviceError` if the interface is missing, down, or not permitted.
     """
-    kind, channel, bitrate = parse_place(place)
+    kind, channel, bitrate = parse_bus(target)
     with extras.explain_missing(name):
         import can
     if kind == "slcan":
@@ -57,9 +57,9 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
 
 
 def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusABC:
-    """Return an open slcan adapter that puts damaged lines into ``damaged`` as (UTC in ns, bytes).
+    """Open an slcan adapter that adds damaged lines to ``damaged`` as (UTC in ns, bytes).
 
-    python-can itself raises an error for some of them, leaves some out, and takes some for shorter frames.
+    For some damaged lines python-can raises an error; others it drops, or reads as shorter frames.
     """
     from can import CanOperationError
     from can.interfaces.slcan import slcanBus
@@ -71,11 +71,11 @@ def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusA
             except CanOperationError as error:
                 if not isinstance(error.__cause__, UnicodeDecodeError):
                     raise
-                damaged.append((time.time_ns(), _odd_sized(error.__cause__.object)))
+                damaged.append((time.time_ns(), _with_invalid_size(error.__cause__.object)))
                 self._buffer.clear()
                 return None
             if line and not is_slcan_line(line[:-1]):
-                damaged.append((time.time_ns(), _odd_sized(line.encode())))
+                damaged.append((time.time_ns(), _with_invalid_size(line.encode())))
                 return None
             return line
 
@@ -83,7 +83,7 @@ def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusA
 
 
 def is_slcan_line(line: str) -> bool:
-    """Return whether an adapter may send this line, given without its end.
+    """Return whether an adapter may send this line. ``line`` has no line end.
 
     >>> [is_slcan_line(line) for line in ("t1232AABB", "t1232AAB", "t1232AA", "z")]
     [True, False, False, True]
@@ -95,23 +95,23 @@ def is_slcan_line(line: str) -> bool:
     return (length <= 8 or frame["kind"][0] in "dDbB") and len(frame["data"]) >= 2 * min(length, 8)
 
 
-def _odd_sized(line: bytes) -> bytes:
-    """Return a damaged line with a size that is not one of CAN frames."""
+def _with_invalid_size(line: bytes) -> bytes:
+    """Return a damaged line, shortened if necessary so that its size is not a multiple of the frame size."""
     return line if len(line) % FRAME.size else line[:-1]
 
 
-def parse_place(place: str) -> tuple[str, str, int | None]:
-    """Return kind, channel and bit rate of an address. The bit rate is None where the address states none.
+def parse_bus(target: str) -> tuple[str, str, int | None]:
+    """Return kind, channel and bit rate of an address. The bit rate is None if the address has none.
 
-    >>> parse_place("slcan:/dev/ttyACM0@1000000"), parse_place("socketcan:can0")
+    >>> parse_bus("slcan:/dev/ttyACM0@1000000"), parse_bus("socketcan:can0")
     (('slcan', '/dev/ttyACM0', 1000000), ('socketcan', 'can0', None))
     """
-    kind, _, channel_text = place.partition(":")
+    kind, _, channel_text = target.partition(":")
     channel, at, bitrate = channel_text.partition("@")
     if kind not in KINDS or not channel or (at and not bitrate.isdigit()):
         raise UsageError(
-            f"can:{place} is not a CAN bus; it should read can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of "
-            f"the kinds {', '.join(KINDS)}."
+            f"can:{target} is not a CAN bus; write can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of the "
+            f"kinds {', '.join(KINDS)}."
         )
     return kind, channel, int(bitrate) if at else None
 
@@ -119,8 +119,8 @@ def parse_place(place: str) -> tuple[str, str, int | None]:
 def _open_error(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
     if kind == "slcan":
         cause = error if isinstance(error, OSError) else error.__cause__ or error.__context__
-        return ports.refused(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
-    interfaces = [path.name for path in listed(INTERFACES) if _hardware_type(path) == IS_CAN]
+        return ports.open_error(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
+    interfaces = [path.name for path in listed(INTERFACES) if _hardware_type(path) == CAN_TYPE]
     if kind == "socketcan" and channel not in interfaces:
         return DeviceError(
             f"{name}: there is no CAN interface {channel}; there {'are' if len(interfaces) > 1 else 'is'} "
@@ -140,7 +140,7 @@ def _bring_up(channel: str, bitrate: int | None) -> str:
     return f"Run `sudo ip link set {channel} up type can bitrate {bitrate or 1_000_000}`."
 
 
-class CanLink(Opened):
+class CanLink(OpenLink):
     """An open CAN bus."""
 
     packets = True
@@ -148,7 +148,7 @@ class CanLink(Opened):
     def __init__(self, name: str, bus: can.BusABC, damaged: Arrived) -> None:
         super().__init__(name)
         self.bus = bus
-        self._damaged = damaged  # lines of the bus that are no frame; a framer counts them as lost bytes
+        self._damaged = damaged  # damaged lines; the framer counts them as lost bytes
         self._arrivals = Arrivals()
 
     def _receive(self, timeout_s: float) -> Arrived:
@@ -160,7 +160,7 @@ class CanLink(Opened):
             while message is not None:
                 entries += self._damaged_lines()
                 if not message.is_error_frame and not message.is_remote_frame and len(message.data) <= 8:
-                    self._arrivals.look()
+                    self._arrivals.read_clocks()
                     entries.append((self._arrivals.to_monotonic(int(message.timestamp * 1e9)), pack_frame(message)))
                 message = self.bus.recv(0)
             entries += self._damaged_lines()
@@ -173,7 +173,7 @@ class CanLink(Opened):
         """Return the damaged lines since the last call."""
         lines, self._damaged[:] = list(self._damaged), []
         if lines:
-            self._arrivals.look()
+            self._arrivals.read_clocks()
         return [(self._arrivals.to_monotonic(utc_ns), line) for utc_ns, line in lines]
 
     def _send(self, data: bytes) -> None:
@@ -190,21 +190,21 @@ class CanLink(Opened):
 
         try:
             self.bus.shutdown()
-        except (can.CanError, OSError, ValueError, termios.error):  # an unplugged adapter does not answer
-            port = getattr(self.bus, "serialPortOrig", None)  # slcan leaves its serial port open then
+        except (can.CanError, OSError, ValueError, termios.error):  # an unplugged adapter does not reply
+            port = getattr(self.bus, "serialPortOrig", None)  # slcan leaves its serial port open in this case
             if port is not None:
                 with contextlib.suppress(OSError):
                     port.close()
 
 
 def pack_frame(message: can.Message) -> bytes:
-    """Return the 13 bytes of a CAN frame."""
+    """Encode a CAN frame as 13 bytes."""
     identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
     return FRAME.pack(identifier, len(message.data), bytes(message.data))
 
 
 def unpack_frames(data: bytes) -> list[can.Message]:
-    """Return the CAN frames that ``data``, 13 bytes per frame, encodes."""
+    """Decode CAN frames from ``data``, 13 bytes per frame."""
     import can
 
     return [

@@ -11,11 +11,11 @@ import time
 from pathlib import Path
 
 from tacpipe.errors import DeviceError
-from tacpipe.links.link import Arrivals, Arrived, Opened
+from tacpipe.links.link import Arrivals, Arrived, OpenLink
 from tacpipe.sensors.sensor import Sensor
 
-LOOK_S = 0.02  # pause between scans of the folder
-SETTLED_S = 0.1  # a file counts as written when it did not change for so long
+SCAN_S = 0.02  # pause between scans of the folder
+SETTLED_S = 0.1  # a file counts as complete if it did not change for this time
 UNFINISHED = (
     ".tmp",
     ".part",
@@ -23,58 +23,58 @@ UNFINISHED = (
     ".crdownload",
     ".swp",
     "~",
-)  # endings of names that writers rename at the end
-Face = tuple[int, int, int]  # inode, size in bytes, time of the last change in ns
+)  # suffixes of temporary names
+FileState = tuple[int, int, int]  # inode, size in bytes, time of the last change in ns
 
 
-def open_folder(place: str, sensor: Sensor, name: str) -> FolderLink:
-    """Return a watch on a folder, which ignores the files that exist already.
+def open_folder(target: str, sensor: Sensor, name: str) -> FolderLink:
+    """Watch a folder for new files. Files that already exist are ignored.
 
-    Raises `DeviceError` for a folder that is missing or may not be read.
+    Raises `DeviceError` if the folder does not exist or is not readable.
     """
-    folder = Path(place).expanduser()
+    folder = Path(target).expanduser()
     try:
-        faces = _faces(folder)
+        states = _file_states(folder)
     except FileNotFoundError:
-        raise DeviceError(f"{name}: there is no folder {folder}; make it, or correct the transport.") from None
+        raise DeviceError(f"{name}: the folder {folder} does not exist; create it, or correct the transport.") from None
     except OSError as error:
         raise DeviceError(f"{name}: the folder {folder} cannot be read: {error.strerror}.") from error
-    return FolderLink(name, folder, faces)
+    return FolderLink(name, folder, states)
 
 
-class FolderLink(Opened):
-    """A watch on a folder. A file is complete when no process has it open for writing and it stopped changing."""
+class FolderLink(OpenLink):
+    """A watch on a folder. A file is complete if no process has it open for writing and it has stopped changing."""
 
     packets = True
 
-    def __init__(self, name: str, folder: Path, existing: dict[str, Face]) -> None:
+    def __init__(self, name: str, folder: Path, existing: dict[str, FileState]) -> None:
         super().__init__(name)
         self.folder = folder
-        self._delivered = existing  # files as they were when they were delivered, or when the watch began
-        self._growing: dict[str, tuple[Face, float]] = {}  # changed files, and since when they have not changed again
+        self._delivered = existing  # states of files when they were delivered, or when the watch started
+        self._growing: dict[str, tuple[FileState, float]] = {}  # changed files, and the time of their last change
         self._arrivals = Arrivals()
-        self._woken = threading.Event()
+        self._wake_event = threading.Event()
 
     def _receive(self, timeout_s: float) -> Arrived:
-        until = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         while True:
-            entries = self._look()
-            left_s = until - time.monotonic()
-            if entries or left_s <= 0 or self._woken.wait(min(LOOK_S, left_s)):
+            entries = self._complete_files()
+            left_s = deadline - time.monotonic()
+            if entries or left_s <= 0 or self._wake_event.wait(min(SCAN_S, left_s)):
                 return entries
 
-    def _look(self) -> Arrived:
-        """Return the content of the files that became complete, in the order of their last change."""
+    def _complete_files(self) -> Arrived:
+        """Return the content of the files that became complete, in order of their last change."""
         try:
-            faces = _faces(self.folder)
+            states = _file_states(self.folder)
         except OSError as error:
             raise self.lost(f"the folder cannot be read any more ({error.strerror})") from error
         now = time.monotonic()
-        self._delivered = {name: face for name, face in self._delivered.items() if name in faces}
-        new = {name: face for name, face in faces.items() if self._delivered.get(name) != face}
-        self._growing = {name: _since(self._growing.get(name), face, now) for name, face in new.items()}
-        settled = [name for name, (_, since) in self._growing.items() if now - since >= SETTLED_S]
-        self._arrivals.look()
+        self._delivered = {name: state for name, state in self._delivered.items() if name in states}
+        new = {name: state for name, state in states.items() if self._delivered.get(name) != state}
+        self._growing = {name: _state_and_time(self._growing.get(name), state, now) for name, state in new.items()}
+        settled = [name for name, (_, changed_s) in self._growing.items() if now - changed_s >= SETTLED_S]
+        self._arrivals.read_clocks()
         entries: Arrived = []
         for name in sorted(settled, key=lambda name: (new[name][2], name)):
             data = _read_complete(self.folder / name, new[name])
@@ -85,16 +85,16 @@ class FolderLink(Opened):
         return entries
 
     def _wake(self) -> None:
-        self._woken.set()
+        self._wake_event.set()
 
 
-def _since(before: tuple[Face, float] | None, face: Face, now: float) -> tuple[Face, float]:
-    return before if before is not None and before[0] == face else (face, now)
+def _state_and_time(previous: tuple[FileState, float] | None, state: FileState, now: float) -> tuple[FileState, float]:
+    return previous if previous is not None and previous[0] == state else (state, now)
 
 
-def _faces(folder: Path) -> dict[str, Face]:
-    """Return the face of each file in a folder, without empty files and files that will be renamed."""
-    faces = {}
+def _file_states(folder: Path) -> dict[str, FileState]:
+    """Return the state of each file in a folder. Empty files and temporary names are skipped."""
+    states = {}
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.name.startswith(".") or entry.name.endswith(UNFINISHED):
@@ -102,33 +102,35 @@ def _faces(folder: Path) -> dict[str, Face]:
             with contextlib.suppress(FileNotFoundError):
                 status = entry.stat()
                 if entry.is_file() and status.st_size:
-                    faces[entry.name] = (status.st_ino, status.st_size, status.st_mtime_ns)
-    return faces
+                    states[entry.name] = (status.st_ino, status.st_size, status.st_mtime_ns)
+    return states
 
 
-def _read_complete(path: Path, face: Face) -> bytes | None:
-    """Return the content of a file, or None while it is written, or where it is gone or no longer has this face."""
+def _read_complete(path: Path, state: FileState) -> bytes | None:
+    """Return the content of a file, or None if it is being written, was removed, or its state differs from ``state``."""
     try:
         with path.open("rb") as file:
-            if _is_written(file.fileno()):
+            if _is_open_for_writing(file.fileno()):
                 return None
             data = file.read()
             status = os.fstat(file.fileno())
     except OSError:
         return None
-    return data if (status.st_ino, status.st_size, status.st_mtime_ns) == face and len(data) == status.st_size else None
+    return (
+        data if (status.st_ino, status.st_size, status.st_mtime_ns) == state and len(data) == status.st_size else None
+    )
 
 
-def _is_written(fileno: int) -> bool:
-    """Return whether a process has the file open for writing: only then Linux refuses a read lease with EAGAIN."""
+def _is_open_for_writing(fileno: int) -> bool:
+    """Return whether a process has the file open for writing. Only then does Linux refuse a read lease with EAGAIN."""
     try:
         fcntl.fcntl(
             fileno, fcntl.F_SETSIG, signal.SIGURG
-        )  # ignored by default; a broken lease would otherwise send SIGIO
+        )  # SIGURG is ignored by default; a broken lease would otherwise send SIGIO
         fcntl.fcntl(fileno, fcntl.F_SETLEASE, fcntl.F_RDLCK)
     except BlockingIOError:
         return True
-    except (OSError, AttributeError):  # another user's file, or a file system or an operating system without leases
+    except (OSError, AttributeError):  # another user's file, or a file system or operating system without leases
         return False
     fcntl.fcntl(fileno, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     return False

@@ -10,24 +10,24 @@ from urllib.parse import parse_qsl
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import ports
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.link import Arrived, OpenLink
 from tacpipe.links.ports import HidInterface
 from tacpipe.sensors.sensor import Sensor
 
-LONGEST_WAIT_S = 0.03  # the kernel keeps 63 reports, 63 ms of the fastest device, and then drops the newest
-CHOICES = ("interface", "usage_page", "serial")  # keys that an address may state after its ?
+MAX_WAIT_S = 0.03  # the kernel queues 63 reports, 63 ms of the fastest device, and then drops the newest
+KEYS = ("interface", "usage_page", "serial")  # keys after the ? of an address
 LONG = 0xFE  # prefix of a long item; the next byte is its size
 INPUT, USAGE_PAGE, REPORT_SIZE, REPORT_ID, REPORT_COUNT, PUSH, POP = 0x80, 0x04, 0x74, 0x84, 0x94, 0xA4, 0xB4
 
 
-def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
-    """Return the open device of ``VENDOR:PRODUCT``, ``VENDOR:PRODUCT?interface=0&serial=1234``, or a path.
+def open_hid(target: str, sensor: Sensor, name: str) -> HidLink:
+    """Open the device ``VENDOR:PRODUCT``, ``VENDOR:PRODUCT?interface=0&serial=1234``, or a path.
 
-    A device with several interfaces is opened at the interface that the address names, otherwise at the one of the sensor's
-    ``usage_page``, otherwise at the first. Raises `DeviceError` for a device that is missing, ambiguous, or not permitted.
+    If a device has several interfaces, the one in the address is opened; without it, the one with the sensor's
+    ``usage_page``, or else the first. Raises `DeviceError` if the device is missing, ambiguous, or not permitted.
     """
     module = ports.hid_module()
-    info = choose_interface(place, module.enumerate(), sensor.usage_page, name)
+    info = choose_interface(target, module.enumerate(), sensor.usage_page, name)
     path: bytes = info["path"]
     device = module.device()
     try:
@@ -38,31 +38,31 @@ def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
     return HidLink(name, device)
 
 
-def choose_interface(place: str, interfaces: list[HidInterface], usage_page: int | None, name: str) -> HidInterface:
-    """Return the one of hidapi's ``interfaces`` that an address names.
+def choose_interface(target: str, interfaces: list[HidInterface], usage_page: int | None, name: str) -> HidInterface:
+    """Return the entry of hidapi's ``interfaces`` that matches an address.
 
-    Raises `UsageError` for an invalid address, and `DeviceError` where no device or more than one matches.
+    Raises `UsageError` for an invalid address, and `DeviceError` if no device or more than one matches.
     """
-    device, _, query = place.partition("?")
+    device, _, query = target.partition("?")
     options = dict(parse_qsl(query))
-    if unknown := set(options) - set(CHOICES):
-        raise UsageError(f"hid:{place}: there is no {', '.join(sorted(unknown))}; there are {', '.join(CHOICES)}.")
-    fitting = [info for info in interfaces if _matches(info, device, options)]
-    if not fitting:
+    if unknown := set(options) - set(KEYS):
+        raise UsageError(f"hid:{target}: there is no key {', '.join(sorted(unknown))}; the keys are {', '.join(KEYS)}.")
+    matching = [info for info in interfaces if _matches(info, device, options)]
+    if not matching:
         raise DeviceError(
-            f"{name}: there is no HID device {place}; {ports.listed(ports.hid_ports())}. Plug it in, or correct the "
-            f"transport."
+            f"{name}: there is no HID device {target}; {ports.describe_ports(ports.hid_ports())}. Plug it in, or "
+            f"correct the transport."
         )
-    ours = [info for info in fitting if info["usage_page"] == usage_page] or fitting
-    lowest = min(info["interface_number"] for info in ours)
-    ours = [info for info in ours if info["interface_number"] == lowest]
-    if len({info["path"] for info in ours}) > 1:
-        serials = ", ".join(f"hid:{device}?serial={info['serial_number'] or '...'}" for info in ours)
-        paths = ", ".join(f"hid:{info['path'].decode()}" for info in ours)
+    preferred = [info for info in matching if info["usage_page"] == usage_page] or matching
+    lowest = min(info["interface_number"] for info in preferred)
+    preferred = [info for info in preferred if info["interface_number"] == lowest]
+    if len({info["path"] for info in preferred}) > 1:
+        serials = ", ".join(f"hid:{device}?serial={info['serial_number'] or '...'}" for info in preferred)
+        paths = ", ".join(f"hid:{info['path'].decode()}" for info in preferred)
         raise DeviceError(
-            f"{name}: {len(ours)} devices are {place}; name one by its serial, {serials}, or its path, {paths}."
+            f"{name}: {len(preferred)} devices match {target}; give a serial number, {serials}, or a path, {paths}."
         )
-    return ours[0]
+    return preferred[0]
 
 
 def _matches(info: HidInterface, device: str, options: dict[str, str]) -> bool:
@@ -88,7 +88,7 @@ def _open_error(path: str, info: HidInterface, name: str) -> DeviceError:
     )
 
 
-class HidLink(Opened):
+class HidLink(OpenLink):
     """An open HID device."""
 
     packets = True
@@ -99,16 +99,16 @@ class HidLink(Opened):
         self.reports = parse_report_descriptor(_descriptor(device))
 
     def _receive(self, timeout_s: float) -> Arrived:
-        until = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         entries: Arrived = []
         try:
             while not entries and not self._closed:
-                left_s = min(until - time.monotonic(), LONGEST_WAIT_S)
-                report = self.device.read(self.reports.longest, max(1, int(left_s * 1000)))
+                left_s = min(deadline - time.monotonic(), MAX_WAIT_S)
+                report = self.device.read(self.reports.max_size, max(1, int(left_s * 1000)))
                 while report:
                     entries.append((time.monotonic_ns(), bytes(report)))
-                    report = self.device.read(self.reports.longest)
-                if left_s < LONGEST_WAIT_S:
+                    report = self.device.read(self.reports.max_size)
+                if left_s < MAX_WAIT_S:
                     break
         except (OSError, ValueError) as error:
             if not entries:
@@ -116,9 +116,9 @@ class HidLink(Opened):
         return entries
 
     def _send(self, data: bytes) -> None:
-        leading = b"" if self.reports.numbered else b"\0"  # hidapi requires a report number, 0 where there is none
+        prefix = b"" if self.reports.has_numbers else b"\0"  # hidapi requires a report number; 0 means none
         try:
-            sent = self.device.write(leading + data)
+            sent = self.device.write(prefix + data)
         except (OSError, ValueError) as error:
             raise self.lost(f"it was unplugged ({error})") from error
         if sent < 0:
@@ -129,7 +129,7 @@ class HidLink(Opened):
 
 
 def _descriptor(device: Any) -> bytes:
-    """Return the report descriptor, empty where hidapi is older than 0.14 or the system does not provide it."""
+    """Return the report descriptor. It is empty if hidapi is older than 0.14 or the system does not provide it."""
     try:
         return bytes(device.get_report_descriptor())
     except (AttributeError, OSError, ValueError):
@@ -143,17 +143,17 @@ class Reports:
     usage_page: int = 0  # the first usage page
     bits: dict[int, int] = field(
         default_factory=dict
-    )  # bits per report by report number, 0 where reports have no number
+    )  # bits per report, by report number; the number is 0 if reports are not numbered
 
     @property
-    def numbered(self) -> bool:
-        """True where the first byte of each report is its number."""
+    def has_numbers(self) -> bool:
+        """True if the first byte of each report is its number."""
         return any(self.bits)
 
     @property
-    def longest(self) -> int:
-        """Bytes of the longest report with its number, 64 where the device does not state its reports."""
-        return max((-(-bits // 8) for bits in self.bits.values()), default=64) + self.numbered
+    def max_size(self) -> int:
+        """Bytes of the max_size report including its number, or 64 if the device does not declare its reports."""
+        return max((-(-bits // 8) for bits in self.bits.values()), default=64) + self.has_numbers
 
 
 def parse_report_descriptor(descriptor: bytes) -> Reports:
@@ -166,16 +166,16 @@ def parse_report_descriptor(descriptor: bytes) -> Reports:
     """
     bits: dict[int, int] = {}
     state, stack = {USAGE_PAGE: 0, REPORT_SIZE: 0, REPORT_COUNT: 0, REPORT_ID: 0}, []
-    first_page, place = 0, 0
-    while place < len(descriptor):
-        prefix = descriptor[place]
+    first_page, offset = 0, 0
+    while offset < len(descriptor):
+        prefix = descriptor[offset]
         if prefix == LONG:
-            place += 3 + (descriptor[place + 1] if place + 1 < len(descriptor) else 0)
+            offset += 3 + (descriptor[offset + 1] if offset + 1 < len(descriptor) else 0)
             continue
         size = (0, 1, 2, 4)[prefix & 3]
-        value = int.from_bytes(descriptor[place + 1 : place + 1 + size], "little")
+        value = int.from_bytes(descriptor[offset + 1 : offset + 1 + size], "little")
         item = prefix & 0xFC
-        place += 1 + size
+        offset += 1 + size
         if item == INPUT:
             number = state[REPORT_ID]
             bits[number] = bits.get(number, 0) + state[REPORT_SIZE] * state[REPORT_COUNT]

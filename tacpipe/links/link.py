@@ -28,25 +28,25 @@ SCHEMES = {
     "mjpeg": "mjpeg:http://192.168.1.20:8080/stream",
     "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
-LONGEST = 4096  # characters of a place, the limit of a path
+MAX_LENGTH = 4096  # characters of a target, the limit of a path
 Arrived = list[tuple[int, bytes]]  # (arrival on the monotonic clock in ns, bytes)
 
-WRITE_S = 5.0  # a device that accepts no byte for so long is gone
+WRITE_S = 5.0  # a device that accepts no byte for this time is gone
 
 
 class LinkLostError(DeviceError):
-    """The device went away while it was read: unplugged, switched off, or the other end closed."""
+    """The link was lost: the device was unplugged or switched off, or the peer closed the connection."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """The address of a device: the kind of link, and the text after the colon."""
+    """The address of a device: the kind of link, and the target, which is the text after the colon."""
 
     scheme: str
-    place: str
+    target: str
 
     def __str__(self) -> str:
-        return f"{self.scheme}:{self.place}"
+        return f"{self.scheme}:{self.target}"
 
 
 class Link(Protocol):
@@ -55,12 +55,12 @@ class Link(Protocol):
     def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
         """Wait for bytes and return them as (arrival on the monotonic clock in ns, bytes).
 
-        The list is empty after ``timeout_s`` without any. Each entry of a link of packets is one packet.
-        Raises `LinkLostError` when the device is gone.
+        Returns an empty list if nothing arrives within ``timeout_s``. If the link is packet-based, each entry is one packet.
+        Raises `LinkLostError` if the device is gone.
         """
 
     def write(self, data: bytes) -> None:
-        """Send ``data``. Raises `LinkLostError` when the device is gone."""
+        """Send ``data``. Raises `LinkLostError` if the device is gone."""
 
     def close(self) -> None:
         """Close the link. A second call does nothing."""
@@ -71,65 +71,64 @@ class Link(Protocol):
 
     @property
     def overruns(self) -> int:
-        """The number of packets that this computer dropped because they were not fetched in time, where it is stated."""
+        """The number of packets that this computer dropped because they were not fetched in time; 0 if unknown."""
 
     @property
     def foreign(self) -> int:
-        """The number of packets of other senders that were left out, where the address names one sender."""
+        """The number of packets that were ignored because they are not from the sender in the address."""
 
     @property
     def kernel_stamped(self) -> bool:
-        """True where the kernel stamps packets as they arrive, so that a late read does not change their stamps."""
+        """True if the kernel stamps packets when they arrive, so that a late read does not change their timestamps."""
 
 
 def parse(text: str) -> Address:
-    """Return the address that a rig file or a command line names.
+    """Parse the address of a device, as in a rig file or on a command line.
 
-    Raises `UsageError` for an unknown kind of link, or one without a place that can be printed.
+    Raises `UsageError` for an unknown kind of link, or an empty or unprintable target.
 
     >>> parse("serial:/dev/ttyACM0")
-    Address(scheme='serial', place='/dev/ttyACM0')
+    Address(scheme='serial', target='/dev/ttyACM0')
     """
-    scheme, colon, place = text.partition(":")
-    if scheme not in SCHEMES or not colon or not place.isprintable() or not 0 < len(place) <= LONGEST:
+    scheme, colon, target = text.partition(":")
+    if scheme not in SCHEMES or not colon or not target.isprintable() or not 0 < len(target) <= MAX_LENGTH:
         examples = "; ".join(SCHEMES.values())
-        raise UsageError(
-            f"{excerpt(text)} is not an address of a device; it should read like one of these: {examples}."
-        )
-    return Address(scheme, place)
+        raise UsageError(f"{excerpt(text)} is not an address of a device; write it like one of these: {examples}.")
+    return Address(scheme, target)
 
 
-class Opened:
-    """The base class of open links. Subclasses receive, send, wake a waiting reader and release their resources."""
+class OpenLink:
+    """The base class of open links. Subclasses receive, send, wake a waiting reader, and release their resources."""
 
-    packets = False  # True where each entry of `read` is one packet
+    packets = False  # True if each entry of `read` is one packet
 
     def __init__(self, name: str) -> None:
-        self.name = name  # stream and address, for sentences
+        self.name = name  # stream and address, for errors
         self._closed = False
-        self._ending, self._reading, self._writing = threading.Lock(), threading.Lock(), threading.Lock()
+        self._closing, self._reading, self._writing = threading.Lock(), threading.Lock(), threading.Lock()
 
     def read(self, timeout_s: float) -> Arrived:
-        """Return entries of (arrival in ns, bytes), none after ``timeout_s`` or when the link is closed meanwhile.
+        """Return entries (arrival in ns, bytes).
 
-        Raises `LinkLostError` when the device is gone or the link was closed before.
+        Returns an empty list after ``timeout_s``, or if the link is closed during the call. Raises `LinkLostError` if the
+        device is gone or the link is already closed.
         """
         with self._reading:
             self._refuse_closed()
             return self._receive(timeout_s)
 
     def write(self, data: bytes) -> None:
-        """Send ``data``. Raises `LinkLostError` when the device is gone."""
+        """Send ``data``. Raises `LinkLostError` if the device is gone."""
         with self._writing:
             self._refuse_closed()
             self._send(data)
 
-    def hasten(self) -> None:
-        """Deliver bytes with less delay, where the link delays them."""
+    def reduce_latency(self) -> None:
+        """Deliver bytes with less delay, if the link delays them."""
 
     def close(self) -> None:
         """Close the link after the reader has returned. A second call does nothing."""
-        with self._ending:
+        with self._closing:
             if self._closed:
                 return
             self._closed = True
@@ -144,17 +143,17 @@ class Opened:
 
     @property
     def overruns(self) -> int:
-        """The number of packets that this computer dropped, 0 where it is not stated."""
+        """The number of packets that this computer dropped; 0 if unknown."""
         return 0
 
     @property
     def foreign(self) -> int:
-        """The number of packets of other senders that were left out, 0 where any sender counts."""
+        """The number of ignored packets of other senders; 0 if any sender is accepted."""
         return 0
 
     @property
     def kernel_stamped(self) -> bool:
-        """False: arrivals are stamped when they are read."""
+        """False: packets are stamped when they are read."""
         return False
 
     def lost(self, reason: str, check: str = "its cable and its power") -> LinkLostError:
@@ -169,32 +168,32 @@ class Opened:
         raise NotImplementedError
 
     def _send(self, data: bytes) -> None:
-        raise DeviceError(f"{self.name} cannot be written to. Use a sensor that needs no commands.")
+        raise DeviceError(f"{self.name} cannot be written to. Use a sensor that needs no requests.")
 
     def _wake(self) -> None:
-        """Make a waiting reader return, where that is possible."""
+        """Make a waiting reader return, if that is possible."""
 
     def _release(self) -> None:
         """Release the resources of the link."""
 
 
-class Descriptor(Opened):
-    """A link over a non-blocking file descriptor, with one ``poll`` and one read per wake-up."""
+class DescriptorLink(OpenLink):
+    """A link over a non-blocking file descriptor. Each wake-up of ``poll`` is followed by one read."""
 
     def __init__(self, name: str, fileno: int, *extra_filenos: int) -> None:
         super().__init__(name)
         self._fileno = fileno
-        self._alarm, self._bell = os.pipe()
+        self._wake_reader, self._wake_writer = os.pipe()
         self._poll = select.poll()
-        for watched in (fileno, *extra_filenos, self._alarm):
-            self._poll.register(watched, select.POLLIN)
+        for descriptor in (fileno, *extra_filenos, self._wake_reader):
+            self._poll.register(descriptor, select.POLLIN)
 
     def _receive(self, timeout_s: float) -> Arrived:
         ready = self._poll.poll(timeout_s * 1000)
         return self._fetch(ready) if ready and not self._closed else []
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
-        """Return the waiting entries. ``ready`` has the descriptors and their events."""
+        """Return the queued entries. ``ready`` has (descriptor, event) pairs of ``poll``."""
         raise NotImplementedError
 
     def _send(self, data: bytes) -> None:
@@ -210,47 +209,47 @@ class Descriptor(Opened):
                 raise self.lost(error.strerror or str(error)) from error
 
     def _wake(self) -> None:
-        os.write(self._bell, b"!")
+        os.write(self._wake_writer, b"!")
 
     def _release(self) -> None:
-        for fileno in (self._alarm, self._bell):
+        for fileno in (self._wake_reader, self._wake_writer):
             with contextlib.suppress(OSError):
                 os.close(fileno)
 
 
-OLDEST_NS = 60_000_000_000  # an older stamp was made before the wall clock was set
-READINGS = 3  # both clocks are read so often and the quickest reading counts: another program may run in between
+MAX_AGE_NS = 60_000_000_000  # older timestamps were taken before the wall clock was set
+READINGS = 3  # number of readings of both clocks; the quickest is used, because the program may be interrupted
 
 
 class Arrivals:
-    """Convert wall-clock stamps of arrivals to the monotonic clock, in times that never decrease.
+    """Convert wall-clock timestamps of arrivals to non-decreasing times on the monotonic clock.
 
-    Distances between stamps stay as they are: the offset of the clocks changes only when a reading contradicts it.
+    Differences between timestamps are preserved: the offset between the clocks changes only if a reading contradicts it.
     """
 
     def __init__(self) -> None:
-        self._ahead_ns: int | None = None  # the monotonic clock's lead on the wall clock
+        self._offset_ns: int | None = None  # monotonic clock − wall clock
         self._now_ns = self._wall_ns = 0
         self._last_ns = self._last_wall_ns = 0
 
-    def look(self) -> None:
-        """Read both clocks. Call it once per batch, after the fetch, so that no stamp lies ahead of the reading.
+    def read_clocks(self) -> None:
+        """Read both clocks. Call this once per batch after the fetch, so that no timestamp is later than the reading.
 
-        The wall clock may be set at any time: the offset moves only as far as the readings require.
+        The wall clock may be set at any time; the offset changes only as far as the readings require.
         """
         before_ns, self._wall_ns, self._now_ns = min((_readings() for _ in range(READINGS)), key=lambda r: r[2] - r[0])
-        least_ns, most_ns = before_ns - self._wall_ns, self._now_ns - self._wall_ns
-        offset_ns = (least_ns + most_ns) // 2 if self._ahead_ns is None else self._ahead_ns
-        self._ahead_ns = min(max(offset_ns, least_ns), most_ns)
+        min_ns, max_ns = before_ns - self._wall_ns, self._now_ns - self._wall_ns
+        offset_ns = (min_ns + max_ns) // 2 if self._offset_ns is None else self._offset_ns
+        self._offset_ns = min(max(offset_ns, min_ns), max_ns)
 
     def to_monotonic(self, wall_ns: int) -> int:
-        """Return the monotonic time in ns of a stamp. A stamp of the future or the far past counts as arrived now.
+        """Return the monotonic time in ns of a timestamp. Timestamps in the future or the far past count as now.
 
-        A later stamp gives a later time, by at least 1 ns even where the offset of the clocks shrank.
+        A later timestamp gives a later time, by at least 1 ns, even if the offset between the clocks has decreased.
         """
-        assert self._ahead_ns is not None, "look first"
-        is_plausible = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
-        t_ns = wall_ns + self._ahead_ns if is_plausible else self._now_ns
+        assert self._offset_ns is not None, "call read_clocks first"
+        is_plausible = 0 <= self._wall_ns - wall_ns <= MAX_AGE_NS
+        t_ns = wall_ns + self._offset_ns if is_plausible else self._now_ns
         self._last_ns = max(t_ns, self._last_ns + (wall_ns > self._last_wall_ns))
         self._last_wall_ns = wall_ns
         return self._last_ns

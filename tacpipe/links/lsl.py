@@ -1,7 +1,7 @@
-"""Read streams of Lab Streaming Layer (LSL). Each entry is a packet of samples as `tacpipe.sensors.lsl` decodes it.
+"""Read streams of Lab Streaming Layer (LSL). Each entry is a packet of samples for `tacpipe.sensors.lsl`.
 
-Samples keep the stamps of the sender's clock. Each packet also has LSL's own measurement of that clock. When an outlet ends,
-the link is lost and opened again, like a cable that is unplugged.
+Samples have timestamps of the sender's clock. Each packet also contains LSL's measurement of that clock's offset. If an
+outlet ends, the link is lost and reopened, as if a cable was unplugged.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ import numpy as np
 
 from tacpipe.channels import lsl as descriptions
 from tacpipe.errors import DeviceError, TacpipeError, UsageError
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.link import Arrived, OpenLink
 from tacpipe.plugins import extras
 from tacpipe.sensors import lsl
 from tacpipe.sensors.sensor import Sensor
 
-KEYS = ("name", "type", "source_id", "hostname", "uid")  # properties of a stream that an address may state
-RESOLVE_S = 3.0  # time that outlets have to answer
-OTHERS_S = 1.0  # time that a second outlet of the same name has
-OPEN_S = 5.0  # time that an outlet has to describe and open its stream
-CORRECTION_S, CORRECTED_S = 2.0, 5.0  # limit of one measurement of the clock, and pause between two
-CONFIGURED = (Path("lsl_api.cfg"), Path("~/lsl_api/lsl_api.cfg"), Path("/etc/lsl_api/lsl_api.cfg"))
-SILENT = "[log]\nlevel = -3\n"
-BUFFERED_S = 360  # liblsl buffers so many seconds of a stream with a rate
-MOST = 4096  # samples per packet
+KEYS = ("name", "type", "source_id", "hostname", "uid")  # properties of a stream that an address may contain
+RESOLVE_S = 3.0  # timeout for the first outlet to respond
+OTHERS_S = 1.0  # timeout for a second matching outlet to respond
+OPEN_S = 5.0  # timeout for an outlet to describe and open its stream
+CORRECTION_S, CORRECTION_PAUSE_S = 2.0, 5.0  # timeout of a clock measurement, and pause between two
+CONFIG_FILES = (Path("lsl_api.cfg"), Path("~/lsl_api/lsl_api.cfg"), Path("/etc/lsl_api/lsl_api.cfg"))
+SILENT_CONFIG = "[log]\nlevel = -3\n"
+BUFFERED_S = 360  # seconds of a stream that liblsl buffers
+MAX_SAMPLES = 4096  # per packet
 
 
-def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
-    """Return the open stream of ``NAME``, or of ``?type=Force&source_id=ft-7`` with any of the keys of `KEYS`.
+def open_lsl(target: str, sensor: Sensor, name: str) -> LslLink:
+    """Open the stream ``NAME``, or the stream with the properties in ``?type=Force&source_id=ft-7`` (see `KEYS`).
 
-    Raises `DeviceError` where no outlet or several are as the address states, or the stream has other channels than the
-    rig file states; `MissingModuleError` without pylsl, `UsageError` for an address that is none.
+    Raises `DeviceError` if no outlet or several match, or if the channels differ from the rig file, `MissingModuleError`
+    without pylsl, and `UsageError` for an invalid address.
     """
-    properties = _properties(place)
+    properties = _parse_query(target)
     with extras.explain_missing(name):
         import pylsl
-    quiet(pylsl)
+    silence_logging(pylsl)
     outlets = _resolve(pylsl, properties)
     if len(outlets) != 1:
         raise DeviceError(f"{name}: {_no_single_outlet(pylsl, outlets)}")
@@ -55,59 +55,59 @@ def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
         inlet.open_stream(OPEN_S)
     except (pylsl.util.LostError, pylsl.util.TimeoutError, TimeoutError, RuntimeError) as error:
         raise DeviceError(
-            f"{name}: the outlet exists, but does not open within {OPEN_S:g} s; check that its program still runs, "
-            "and that no firewall blocks its ports (TCP and UDP 16572 to 16604)."
+            f"{name}: the outlet exists, but its stream did not open within {OPEN_S:g} s; check that its program still "
+            "runs, and that no firewall blocks its ports (TCP and UDP 16572 to 16604)."
         ) from error
-    return LslLink(name, inlet, _checked(text, sensor, name), pylsl)
+    return LslLink(name, inlet, _check_description(text, sensor, name), pylsl)
 
 
-def quiet(pylsl: Any) -> None:
-    """Keep liblsl's messages off the terminal, unless a file of the user's configures it."""
-    if not os.environ.get("LSLAPICFG") and not any(path.expanduser().is_file() for path in CONFIGURED):
-        pylsl.util.set_config_content(SILENT)  # does nothing where LSL was used before in this process
+def silence_logging(pylsl: Any) -> None:
+    """Turn off liblsl's messages on the terminal, unless a user's configuration file exists."""
+    if not os.environ.get("LSLAPICFG") and not any(path.expanduser().is_file() for path in CONFIG_FILES):
+        pylsl.util.set_config_content(SILENT_CONFIG)  # has no effect if LSL was already used in this process
 
 
-def _properties(place: str) -> Mapping[str, str]:
-    """Return the properties that a stream must have.
+def _parse_query(target: str) -> Mapping[str, str]:
+    """Return the properties that a matching stream must have.
 
-    >>> _properties("wrist"), _properties("?type=Force&source_id=ft-7")
+    >>> _parse_query("wrist"), _parse_query("?type=Force&source_id=ft-7")
     ({'name': 'wrist'}, {'type': 'Force', 'source_id': 'ft-7'})
     """
-    name, _, query = place.partition("?")
+    name, _, query = target.partition("?")
     pairs = parse_qsl(query, keep_blank_values=True)
     properties = {**({"name": name} if name else {}), **dict(pairs)}
     if not properties or any(
         key not in KEYS or not value or "'" in value or '"' in value for key, value in properties.items()
     ):
         raise UsageError(
-            f"lsl:{place} names no stream; it should read lsl:NAME or lsl:?type=Force&source_id=ft-7, with the keys "
-            f"{', '.join(KEYS)} and no quotes."
+            f"lsl:{target} is not a valid LSL address; use lsl:NAME or lsl:?type=Force&source_id=ft-7, with the "
+            f"keys {', '.join(KEYS)} and without quotes."
         )
     return properties
 
 
 def _resolve(pylsl: Any, properties: Mapping[str, str]) -> list[Any]:
-    """Return the streams with these properties. After a first answer, others have `OTHERS_S` to answer."""
+    """Return the streams with these properties. After the first response, others have `OTHERS_S` to respond."""
     predicate = " and ".join(f"{key}='{value}'" for key, value in properties.items())
     first: list[Any] = pylsl.resolve_bypred(predicate, 1, RESOLVE_S)
     return first if len(first) != 1 else pylsl.resolve_bypred(predicate, 2, OTHERS_S) or first
 
 
 def _no_single_outlet(pylsl: Any, outlets: list[Any]) -> str:
-    """Return why no single outlet can be chosen, as the end of an error."""
+    """Return the end of an error that explains why no single outlet matches."""
     if outlets:
         uids = ", ".join(sorted(f"source_id={outlet.source_id()} on {outlet.hostname()}" for outlet in outlets))
-        return f"{len(outlets)} outlets are as the address states: {uids}. Add source_id or hostname to it."
+        return f"{len(outlets)} outlets match the address: {uids}. Add source_id or hostname to it."
     names = sorted({f"{stream.name()} (type {stream.type()})" for stream in pylsl.resolve_streams(OTHERS_S)})
     listing = f"there are {', '.join(names)}" if names else "there is none at all"
     return (
-        f"no outlet answered within {RESOLVE_S:g} s; {listing}. Start the program that sends the stream, or name its "
-        "computer in KnownPeers of lsl_api.cfg where the network does not carry multicast."
+        f"no outlet responded within {RESOLVE_S:g} s; {listing}. Start the program that sends the stream. If the network "
+        "does not carry multicast, add its computer to KnownPeers in lsl_api.cfg."
     )
 
 
-def _checked(text: str, sensor: Sensor, name: str) -> str:
-    """Return the description of a stream. Raises `DeviceError` where it contradicts the rig file."""
+def _check_description(text: str, sensor: Sensor, name: str) -> str:
+    """Return the description of a stream. Raises `DeviceError` if it contradicts the rig file."""
     try:
         description = descriptions.parse(text)
     except TacpipeError as error:
@@ -116,37 +116,39 @@ def _checked(text: str, sensor: Sensor, name: str) -> str:
         return text
     if (description.format, len(description.channels)) != (sensor.format, len(sensor.channels)):
         raise DeviceError(
-            f"{name}: the stream has {len(description.channels)} channels of {description.format}, and the rig file states "
-            f"{len(sensor.channels)} of {sensor.format}; leave channels and format out, and they are as the outlet states."
+            f"{name}: the stream has {len(description.channels)} channels of {description.format}, but the rig file "
+            f"declares {len(sensor.channels)} of {sensor.format}; omit channels and format to use those of the outlet."
         )
     return text
 
 
-class LslLink(Opened):
-    """An open stream of LSL."""
+class LslLink(OpenLink):
+    """An open LSL stream."""
 
     packets = True
 
     def __init__(self, name: str, inlet: Any, description: str, pylsl: Any) -> None:
         super().__init__(name)
         self.inlet, self._pylsl = inlet, pylsl
-        self._first: bytes | None = lsl.DESCRIPTION + description.encode()
+        self._description: bytes | None = lsl.DESCRIPTION + description.encode()
         self._correction = math.nan
         self._stopping = threading.Event()
-        self._measuring = threading.Thread(target=self._measure, daemon=True)
-        self._measuring.start()
+        self._clock_thread = threading.Thread(target=self._measure_clock, daemon=True)
+        self._clock_thread.start()
 
     def _receive(self, timeout_s: float) -> Arrived:
-        if self._first is not None:
-            packet, self._first = self._first, None
+        if self._description is not None:
+            packet, self._description = self._description, None
             return [(time.monotonic_ns(), packet)]
         try:
             values, stamps = self.inlet.pull_chunk(timeout_s, 1, as_numpy=True)
         except self._pylsl.util.LostError as error:
             raise self.lost("its outlet ended", "that its program still runs") from error
         entries = [(time.monotonic_ns(), self._packet(values, stamps))] if len(stamps) else []
-        with contextlib.suppress(self._pylsl.util.LostError):  # the next read raises it; these samples go out first
-            values, stamps = self.inlet.pull_chunk(0.0, MOST, as_numpy=True) if entries else ((), ())
+        with contextlib.suppress(
+            self._pylsl.util.LostError
+        ):  # the next read raises it; these samples are returned first
+            values, stamps = self.inlet.pull_chunk(0.0, MAX_SAMPLES, as_numpy=True) if entries else ((), ())
             entries += [(time.monotonic_ns(), self._packet(values, stamps))] if len(stamps) else []
         return entries
 
@@ -158,17 +160,17 @@ class LslLink(Opened):
         rows = rows.reshape(len(stamps), -1)
         return lsl.packet(rows, np.asarray(stamps, dtype=np.float64), self._correction)
 
-    def _measure(self) -> None:
-        """Measure the sender's clock again and again, in a thread because each measurement takes a second."""
+    def _measure_clock(self) -> None:
+        """Measure the sender's clock repeatedly. This runs in a thread, because each measurement takes a second."""
         while not self._stopping.is_set():
-            with contextlib.suppress(Exception):  # no answer yet, or an outlet that is gone, which the reader states
+            with contextlib.suppress(Exception):  # no response yet, or the outlet is gone, which the reader reports
                 self._correction = float(self.inlet.time_correction(CORRECTION_S))
-            self._stopping.wait(CORRECTED_S)
+            self._stopping.wait(CORRECTION_PAUSE_S)
 
     def _wake(self) -> None:
         self._stopping.set()
 
     def _release(self) -> None:
-        self._measuring.join(2 * CORRECTION_S)
+        self._clock_thread.join(2 * CORRECTION_S)
         with contextlib.suppress(Exception):
             self.inlet.close_stream()

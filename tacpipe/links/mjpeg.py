@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
-from tacpipe.links.link import Arrived, Descriptor
+from tacpipe.links.link import Arrived, DescriptorLink
 from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.camera import Frame, pack_frame, pack_settings, read_shape
 from tacpipe.sensors.sensor import Sensor
@@ -57,7 +57,7 @@ def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
         parser.fault = f"it did not answer within {ANSWER_S:g} s"
     except OSError as error:
         connection.close()
-        raise network.failed(error, host, port, name) from error
+        raise network.connection_error(error, host, port, name) from error
     if parser.boundary is None:
         connection.close()
         reason = parser.fault or "it ended the connection"
@@ -133,7 +133,7 @@ class MultipartParser:
         return head, image if stated.isdigit() else image.rstrip(b"\r\n")
 
 
-class MjpegLink(Descriptor):
+class MjpegLink(DescriptorLink):
     """A connection to a server of images. Each entry is the settings or a frame, as `tacpipe.sensors.camera` packs them.
 
     The stamps of the first image state whether the server sends them.

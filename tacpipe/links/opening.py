@@ -1,4 +1,4 @@
-"""Open the link that an address names, send a sensor's requests to its device and wait for the replies."""
+"""Open the link at an address, send a sensor's requests to its device, and wait for the replies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
     "hid": hid.open_hid,
     "udp": network.open_udp,
     "tcp": network.open_tcp,
-    "tcp+udp": network.open_both,
+    "tcp+udp": network.open_tcp_udp,
     "ws": websocket.open_websocket,
     "can": can.open_can,
     "folder": folder.open_folder,
@@ -27,18 +27,21 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
 
 
 def open_link(address: Address, sensor: Sensor, stream: str) -> Link:
-    """Return an open link to a sensor. ``stream`` names it in errors. Nothing is sent to the device yet, see `dialogue`.
+    """Open a link to a sensor. ``stream`` is its name in errors. Nothing is sent to the device; see `run_dialogue`.
 
-    Raises `DeviceError` where the device is missing, busy, not permitted, or refuses.
+    Raises `DeviceError` if the device is missing, busy, not permitted, or refuses the connection.
     """
-    return OPENERS[address.scheme](address.place, sensor, f"Stream {stream} ({address})")
+    return OPENERS[address.scheme](address.target, sensor, f"Stream {stream} ({address})")
 
 
-SHOWN = 16  # bytes that an error quotes where they are no reply
+QUOTED = 16  # bytes that an error quotes
 
 
 class NoReplyError(DeviceError):
-    """No reply came in time. ``awaited`` states which and for how long; ``heard`` has the bytes that came instead."""
+    """No reply arrived in time.
+
+    ``awaited`` describes the reply and the timeout; ``heard`` has the bytes that were received instead.
+    """
 
     def __init__(self, ask: Ask, heard: Arrived, stream: str) -> None:
         super().__init__(_no_reply_text(ask, heard, stream))
@@ -47,87 +50,90 @@ class NoReplyError(DeviceError):
 
 
 def run_dialogue(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
-    """Run a dialogue and return all bytes that were no reply as (arrival in ns, bytes), so that no sample is lost.
+    """Run a dialogue and return all other bytes as (arrival in ns, bytes), so that no sample is lost.
 
-    Bytes after a reply count for the next question only if that question sends nothing. Raises `NoReplyError` where no
-    reply comes in time, and the error of a question whose reply is a refusal.
+    Bytes after a reply are searched for the next reply only if the next request sends nothing. Raises `NoReplyError` if a
+    reply does not arrive in time, and the dialogue's own error if a reply is a refusal.
     """
     skipped: Arrived = []
-    since: Arrived = []  # entries since the last request
+    received: Arrived = []  # entries since the last request
     control: Link = getattr(link, "control", link)
     try:
         ask = next(dialogue)
         while True:
             if ask.send:
-                skipped, since = skipped + since, []
+                skipped, received = skipped + received, []
                 control.write(ask.send)
             reply = b""
             if ask.until is not None:
-                reply, before = _reply(control, ask, since, stream)
+                reply, before = _wait_for_reply(control, ask, received, stream)
                 skipped += before
-            since += _pause(control, ask.pause_s)
+            received += _pause(control, ask.pause_s)
             ask = dialogue.send(reply)
     except StopIteration:
-        return sorted(skipped + since, key=lambda entry: entry[0])
+        return sorted(skipped + received, key=lambda entry: entry[0])
 
 
-def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Arrived]:
-    """Return the reply and the entries before it. Entries after the reply stay in ``since``."""
-    until = time.monotonic() + ask.timeout_s
-    searched, over = 0, False
+def _wait_for_reply(link: Link, ask: Ask, received: Arrived, stream: str) -> tuple[bytes, Arrived]:
+    """Return the reply and the entries before it. Later entries stay in ``received``. Raises `NoReplyError` on timeout."""
+    deadline = time.monotonic() + ask.timeout_s
+    searched, timed_out = 0, False
     while True:
-        match = _find_reply(ask, since, searched, packets=bool(getattr(link, "packets", False)))
+        match = _find_reply(ask, received, searched, packets=bool(getattr(link, "packets", False)))
         if match is not None:
             return match
-        if over:
-            raise NoReplyError(ask, since, stream)
-        searched = len(since)
-        left_s = until - time.monotonic()
-        over = left_s <= 0  # one more read: the reply may be waiting after this process was delayed
-        since += link.read(max(left_s, 0.0))
+        if timed_out:
+            raise NoReplyError(ask, received, stream)
+        searched = len(received)
+        left_s = deadline - time.monotonic()
+        timed_out = left_s <= 0  # read once more: if this process was delayed, the reply may be queued
+        received += link.read(max(left_s, 0.0))
 
 
-def _find_reply(ask: Ask, since: Arrived, searched: int, *, packets: bool) -> tuple[bytes, Arrived] | None:
-    """Cut the reply out of ``since``: out of one packet where a packet has it, otherwise out of all bytes."""
-    for row in range(searched, len(since)) if packets else ():
-        place = ask.found(since[row][1])
-        if place is not None:
-            return _cut_reply(since, sum(len(data) for _, data in since[:row]), *place)
-    place = ask.found(b"".join(data for _, data in since))
-    return None if place is None else _cut_reply(since, 0, *place)
+def _find_reply(ask: Ask, received: Arrived, searched: int, *, packets: bool) -> tuple[bytes, Arrived] | None:
+    """Remove the reply from ``received`` and return it, with the entries before it. Returns None if there is none.
+
+    If ``packets``, the packets from row ``searched`` on are searched individually first, then all bytes.
+    """
+    for row in range(searched, len(received)) if packets else ():
+        span = ask.find_reply(received[row][1])
+        if span is not None:
+            return _remove_reply(received, sum(len(data) for _, data in received[:row]), *span)
+    span = ask.find_reply(b"".join(data for _, data in received))
+    return None if span is None else _remove_reply(received, 0, *span)
 
 
-def _cut_reply(since: Arrived, base: int, start: int, stop: int) -> tuple[bytes, Arrived]:
-    """Cut bytes ``start`` to ``stop``, counted from ``base``, and all earlier bytes out of ``since``; return both."""
-    before = _cut(since, base + start)
-    return b"".join(data for _, data in _cut(since, stop - start)), before
+def _remove_reply(received: Arrived, base: int, start: int, stop: int) -> tuple[bytes, Arrived]:
+    """Remove bytes ``start`` to ``stop``, relative to ``base``, and all earlier bytes from ``received``; return both."""
+    before = _pop_bytes(received, base + start)
+    return b"".join(data for _, data in _pop_bytes(received, stop - start)), before
 
 
-def _cut(since: Arrived, count: int) -> Arrived:
-    """Cut the first ``count`` bytes off ``since`` and return them with their arrivals."""
-    front: Arrived = []
+def _pop_bytes(received: Arrived, count: int) -> Arrived:
+    """Remove the first ``count`` bytes from ``received`` and return them with their arrival times."""
+    removed: Arrived = []
     while count:
-        t_ns, data = since.pop(0)
-        front.append((t_ns, data[:count]))
+        t_ns, data = received.pop(0)
+        removed.append((t_ns, data[:count]))
         if len(data) > count:
-            since.insert(0, (t_ns, data[count:]))
-        count -= len(front[-1][1])
-    return front
+            received.insert(0, (t_ns, data[count:]))
+        count -= len(removed[-1][1])
+    return removed
 
 
 def _pause(link: Link, pause_s: float) -> Arrived:
     """Read during a pause, because queues are short, and return the entries."""
-    until, entries = time.monotonic() + pause_s, []
-    while (left_s := until - time.monotonic()) > 0:
+    deadline, entries = time.monotonic() + pause_s, []
+    while (left_s := deadline - time.monotonic()) > 0:
         entries += link.read(left_s)
     return entries
 
 
-def _no_reply_text(ask: Ask, since: Arrived, stream: str) -> str:
-    count = sum(len(data) for _, data in since)
-    first = b"".join(data for _, data in since)[:SHOWN]
-    instead = f"{count} bytes came that are none, the first {first.hex(' ')}" if count else "nothing came at all"
+def _no_reply_text(ask: Ask, received: Arrived, stream: str) -> str:
+    count = sum(len(data) for _, data in received)
+    first = b"".join(data for _, data in received)[:QUOTED]
+    instead = f"{count} other bytes were received, starting with {first.hex(' ')}" if count else "nothing was received"
     return (
         f"Stream {stream}: {ask.what} was awaited for {ask.timeout_s:g} s, but {instead}. Check that the device is switched "
-        f"on, and what it is with `tacpipe sensors probe`."
+        f"on, and identify it with `tacpipe sensors probe`."
     )

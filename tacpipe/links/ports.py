@@ -1,4 +1,4 @@
-"""List and open ports: serial ports, HID devices, and the processes that use a device or a port."""
+"""List serial ports and HID devices, open serial ports, and find the processes that use a device or port."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.errors import DeviceError, MissingModuleError, UsageError
 from tacpipe.io import files
-from tacpipe.links.link import Arrived, Descriptor
+from tacpipe.links.link import Arrived, DescriptorLink
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor, SerialLine
 
@@ -29,16 +29,16 @@ PROCESSES = Path("/proc")
 
 @dataclass(frozen=True)
 class Port:
-    """A port with a device."""
+    """A serial port or a HID device."""
 
     address: str  # the address for a rig file
-    usb_id: str = ""  # "16d0:14cc", empty for what is not a USB device
-    product: str = ""  # the name that the device reports
-    lasting: str = ""  # a name of the same port that does not change when cables are swapped
+    usb_id: str = ""  # such as "16d0:14cc"; empty if it is not a USB device
+    product: str = ""  # product name that the device reports
+    persistent_path: str = ""  # a path of the same port that does not change when cables are swapped
 
     def __str__(self) -> str:
-        described = ", ".join(part for part in (self.usb_id, self.product) if part)
-        return f"{self.address} ({described})" if described else self.address
+        details = ", ".join(part for part in (self.usb_id, self.product) if part)
+        return f"{self.address} ({details})" if details else self.address
 
 
 def serial_ports() -> list[Port]:
@@ -46,28 +46,28 @@ def serial_ports() -> list[Port]:
     with extras.explain_missing("A serial port"):
         from serial.tools import list_ports
 
-    lasting = {str(path.resolve()): str(path) for path in files.listed(BY_ID)}
+    persistent_paths = {str(path.resolve()): str(path) for path in files.listed(BY_ID)}
     serial = []
     for port in sorted(list_ports.comports()):
         usb_id = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""
         product = port.product or ("" if port.description in (None, "n/a") else port.description)
-        serial.append(Port(f"serial:{port.device}", usb_id, product, lasting.get(port.device, "")))
+        serial.append(Port(f"serial:{port.device}", usb_id, product, persistent_paths.get(port.device, "")))
     return serial
 
 
 def hid_ports() -> list[Port]:
-    """Return the interfaces of HID devices, none where hidapi is not installed."""
+    """Return the interfaces of HID devices, or an empty list if hidapi is not installed."""
     try:
         interfaces: list[HidInterface] = hid_module().enumerate()
     except (DeviceError, MissingModuleError):
         return []
     return [
         Port(
-            f"hid:{described['path'].decode()}",
-            f"{described['vendor_id']:04x}:{described['product_id']:04x}",
-            _described(described),
+            f"hid:{info['path'].decode()}",
+            f"{info['vendor_id']:04x}:{info['product_id']:04x}",
+            _describe_interface(info),
         )
-        for described in interfaces
+        for info in interfaces
     ]
 
 
@@ -83,17 +83,17 @@ class HidInterface(TypedDict):
     usage_page: int
 
 
-def _described(described: HidInterface) -> str:
-    place = f"interface {described['interface_number']} usage page {described['usage_page']:04x}"
-    return f"{described['product_string'] or ''} {place}".strip()
+def _describe_interface(info: HidInterface) -> str:
+    interface = f"interface {info['interface_number']} usage page {info['usage_page']:04x}"
+    return f"{info['product_string'] or ''} {interface}".strip()
 
 
-def listed(ports: list[Port]) -> str:
-    """Return the ports as the end of a sentence.
+def describe_ports(ports: list[Port]) -> str:
+    """Return a clause that lists the ports.
 
-    >>> listed([Port("serial:/dev/ttyACM0", "16d0:14cc", "TSF-85"), Port("serial:/dev/ttyS0")])
+    >>> describe_ports([Port("serial:/dev/ttyACM0", "16d0:14cc", "TSF-85"), Port("serial:/dev/ttyS0")])
     'there are serial:/dev/ttyACM0 (16d0:14cc, TSF-85) and serial:/dev/ttyS0'
-    >>> listed([])
+    >>> describe_ports([])
     'there is none at all'
     """
     if not ports:
@@ -102,9 +102,9 @@ def listed(ports: list[Port]) -> str:
 
 
 def hid_module() -> Any:
-    """Return hidapi's module: ``hidraw`` on Linux, which leaves the kernel's driver in place, otherwise ``hid``.
+    """Return hidapi's module: ``hidraw`` on Linux, which does not detach the kernel's driver, otherwise ``hid``.
 
-    Raises `MissingModuleError` where it is not installed, and `DeviceError` where another package has a module of that name.
+    Raises `MissingModuleError` if it is not installed, and `DeviceError` if another package has a module of that name.
     """
     name = "hidraw" if sys.platform == "linux" else "hid"
     module: Any = None
@@ -117,13 +117,13 @@ def hid_module() -> Any:
     if hasattr(module, "device"):
         return module
     raise DeviceError(
-        f"Another package has taken the place of hidapi's module {name}: `pip uninstall hid`, then "
+        f"Another package replaces hidapi's module {name}: run `pip uninstall hid`, then "
         f"`pip install --force-reinstall hidapi`."
     )
 
 
 def holders_of_file(path: str) -> list[str]:
-    """Return the other processes that have ``path`` open, as ``screen (process 4711)``. Unreadable ones are left out."""
+    """Return the other processes that have ``path`` open, as ``screen (process 4711)``. Unreadable ones are skipped."""
     return _processes_with({str(Path(path).resolve())})
 
 
@@ -143,7 +143,7 @@ def holders_of_port(kind: str, port: int) -> list[str]:
 
 
 def describe_holders(holders: list[str]) -> str:
-    """Return the processes as the end of a sentence.
+    """Return the processes as a noun phrase.
 
     >>> describe_holders(["screen (process 4711)"]), describe_holders([])
     ('screen (process 4711)', 'a process of another user')
@@ -167,7 +167,7 @@ def _open_files(process: Path) -> set[str]:
                 targets.add(str(file.readlink()))
             except OSError:  # closed meanwhile
                 continue
-    except OSError:  # another user's, or gone
+    except OSError:  # another user's process, or one that has ended
         return targets
     return targets
 
@@ -179,91 +179,94 @@ def _name(process: Path) -> str:
         return "a process"
 
 
-MOST = 1 << 16  # bytes per read; the kernel's own buffer has 4 KiB
-PSEUDO = "/dev/pts/"  # terminals whose other end is a program, which may have both ends open
+MAX_READ = 1 << 16  # bytes per read; the kernel's buffer has 4 KiB
+PSEUDO = "/dev/pts/"  # pseudo-terminals: one program may have both ends open
 
 
-def open_serial(place: str, sensor: Sensor, name: str) -> SerialLink:
-    """Return the open port with the sensor's settings. Bytes that came while it settled are discarded.
+def open_serial(target: str, sensor: Sensor, name: str) -> SerialLink:
+    """Open a serial port with the sensor's settings. Bytes that arrive while it settles are discarded.
 
-    Raises `DeviceError` for a port that is missing, busy, not permitted, or no serial port.
+    Raises `DeviceError` if the port is missing, busy, not permitted, or not a serial port.
     """
-    refuse_missing(place, name)
-    port = _open_port(place, sensor.baud, sensor.line, name)
-    users = [] if str(Path(place).resolve()).startswith(PSEUDO) else holders_of_file(place)
-    if users:  # another program has the port open without a lock, and would take some of the bytes
+    refuse_missing(target, name)
+    port = _open_port(target, sensor.baud, sensor.line, name)
+    users = [] if str(Path(target).resolve()).startswith(PSEUDO) else holders_of_file(target)
+    if users:  # another program has the port open without a lock, and would read some of the bytes
         port.close()
-        raise _busy(place, users, name)
+        raise _busy(target, users, name)
     if sensor.line.settle_s:
         time.sleep(sensor.line.settle_s)
         port.reset_input_buffer()
     return SerialLink(name, port)
 
 
-def refuse_missing(place: str, name: str) -> None:
-    """Raise `DeviceError` where there is no port at ``place``, with a list of the existing ports."""
-    if not Path(place).exists():
+def refuse_missing(target: str, name: str) -> None:
+    """Raise `DeviceError` with a list of the existing ports if there is no port at ``target``."""
+    if not Path(target).exists():
         raise DeviceError(
-            f"{name}: there is no port {place}; {listed(serial_ports())}. Plug the device in, or correct the transport."
+            f"{name}: there is no port {target}; {describe_ports(serial_ports())}. Plug the device in, or correct the "
+            f"transport."
         )
 
 
-def refused(error: OSError, place: str, name: str) -> DeviceError:
+def open_error(error: OSError, target: str, name: str) -> DeviceError:
     """Return the `DeviceError` for an existing port that cannot be opened."""
     if error.errno in (errno.EACCES, errno.EPERM):
-        return DeviceError(f"{name}: you may not open {place}; {_right(place)}.")
+        return DeviceError(f"{name}: you may not open {target}; {_access_advice(target)}.")
     if error.errno in (errno.EBUSY, errno.EAGAIN):
-        return _busy(place, holders_of_file(place), name)
+        return _busy(target, holders_of_file(target), name)
     if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
-        return DeviceError(f"{name}: {place} is not a serial port; {listed(serial_ports())}.")
-    return DeviceError(f"{name}: {place} cannot be opened: {error.strerror or error}. Unplug it and plug it in again.")
+        return DeviceError(f"{name}: {target} is not a serial port; {describe_ports(serial_ports())}.")
+    return DeviceError(f"{name}: {target} cannot be opened: {error.strerror or error}. Unplug it and plug it in again.")
 
 
-def _open_port(place: str, baud: int, line: SerialLine, name: str) -> serial.Serial:
+def _open_port(target: str, baud: int, line: SerialLine, name: str) -> serial.Serial:
     with extras.explain_missing(name):
         import serial
 
     port = serial.Serial(timeout=0, exclusive=True)
-    port.port, port.baudrate = place, baud
-    if line.dtr is not None:  # set before it opens, so that the line does not toggle
+    port.port, port.baudrate = target, baud
+    if line.dtr is not None:  # set before the port opens, so that the line does not toggle
         port.dtr = line.dtr
     if line.rts is not None:
         port.rts = line.rts
     try:
         port.open()
     except ValueError as error:
-        raise UsageError(f"{name}: {place} cannot be set to {baud} baud ({error}); correct the option baud.") from error
-    except OSError as error:  # a SerialException is an OSError with its error number in the text only
-        raise refused(_cause(error), place, name) from error
+        raise UsageError(
+            f"{name}: {target} cannot be set to {baud} baud ({error}); correct the option baud."
+        ) from error
+    except OSError as error:  # a SerialException is an OSError whose error number is only in its text
+        raise open_error(_cause(error), target, name) from error
     with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):  # adapters without the mode
         port.set_low_latency_mode(True)  # FTDI adapters otherwise delay bytes by up to 16 ms
     return port
 
 
 def _cause(error: OSError) -> OSError:
-    """Return the system's error that caused one of pyserial's, where there is one."""
+    """Return the system error that caused an error of pyserial, or the error itself if there is none."""
     cause = error.__context__  # an OSError or a termios.error, which is not an OSError
     number = cause.args[0] if cause is not None and cause.args else None
     return OSError(number, os.strerror(number)) if isinstance(number, int) else error
 
 
-def _busy(place: str, users: list[str], name: str) -> DeviceError:
+def _busy(target: str, users: list[str], name: str) -> DeviceError:
     return DeviceError(
-        f"{name}: {place} is in use by {describe_holders(users)}; end it, because two readers share no bytes."
+        f"{name}: {target} is used by {describe_holders(users)}; stop it, because two programs cannot read the same port."
     )
 
 
-def _right(place: str) -> str:
-    """Return how to get access to a port, usually through its group."""
+def _access_advice(target: str) -> str:
+    """Return advice on how to get access to a port, usually through its group."""
     try:
-        group = grp.getgrgid(Path(place).stat().st_gid).gr_name
+        group = grp.getgrgid(Path(target).stat().st_gid).gr_name
     except (KeyError, OSError):
         group = "dialout"
     group = "dialout" if group == "root" else group
     return f"it belongs to the group {group}: run `sudo usermod -aG {group} $USER`, then log in again"
 
 
-class SerialLink(Descriptor):
+class SerialLink(DescriptorLink):
     """An open serial port."""
 
     def __init__(self, name: str, port: serial.Serial) -> None:
@@ -272,12 +275,12 @@ class SerialLink(Descriptor):
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         try:
-            data = os.read(self._fileno, MOST)
+            data = os.read(self._fileno, MAX_READ)
         except BlockingIOError:
             return []
         except OSError as error:
             raise self.lost("it was unplugged" if error.errno == errno.EIO else str(error.strerror)) from error
-        if not data:  # readable without data is the end of the stream
+        if not data:  # a readable port without data is at its end
             raise self.lost("it was unplugged")
         return [(time.monotonic_ns(), data)]
 

@@ -19,12 +19,12 @@ from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Dialogue, Options, Sensor, SerialLine
 
-# Kinds of links whose entries are packets, whose size is evidence too
+# Kinds of links with packets, whose sizes are also evidence
 PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl", "v4l2", "mjpeg")
-MOST = 1 << 18  # number of bytes that are examined
-CERTAIN = 0.8  # fraction of the bytes beyond chance above which there is no doubt
-POSSIBLE = 0.2  # smallest fraction that is evidence for a driver
-FEWEST = 3  # smallest number of frames
+MAX_EXAMINED = 1 << 18  # bytes
+CERTAIN = 0.8  # evidence at which a sensor counts as identified
+POSSIBLE = 0.2  # smallest fraction of bytes in frames that is evidence for a sensor
+MIN_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class SensorCandidate:
     options: Options = field(default_factory=dict)
 
     def __str__(self) -> str:
-        described = ", ".join(
+        options = ", ".join(
             f"{len(value)} {name}" if isinstance(value, list) else f"{name} = {value}"
             for name, value in self.options.items()
             if not isinstance(value, dict)
         )
-        return f"{self.kind} ({described})" if described else self.kind
+        return f"{self.kind} ({options})" if options else self.kind
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Finding:
 
     candidate: SensorCandidate
     frames: int
-    rate_hz: float  # rate of frames, 0 with fewer than two arrivals
+    rate_hz: float  # rate of frames; 0 with fewer than two arrival times
     bytes: int  # number of bytes that were examined
-    explained: float  # fraction of the bytes that is in frames
-    chance: float  # fraction of the same bytes in random order that would be
+    explained: float  # fraction of the bytes that are in frames
+    chance: float  # fraction of bytes that would be in frames by chance
 
     @property
     def name(self) -> str:
@@ -62,19 +62,19 @@ class Finding:
 
     @property
     def evidence(self) -> float:
-        """The fraction of the bytes that it explains beyond chance, 0 to 1."""
+        """The fraction of the bytes explained beyond chance, 0 to 1."""
         return max(0.0, self.explained - self.chance)
 
     def __str__(self) -> str:
         rate = f" at {self.rate_hz:.4g} Hz" if self.rate_hz else ""
-        by_size = "by the size of the packets alone"
+        by_size = "only by the size of the packets"
         chance = by_size if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
         part = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
         return f"{self.candidate}: {self.frames:,} frames{rate}, {part} ({chance})"
 
 
 def candidates(data: Chunks, scheme: str) -> list[SensorCandidate]:
-    """Return the sensors that use links of this kind, with the options that the bytes suggest."""
+    """Return the sensors that use links of this kind, with options guessed from the bytes."""
     sensors = []
     for kind in registry.sensors():
         try:
@@ -83,29 +83,29 @@ def candidates(data: Chunks, scheme: str) -> list[SensorCandidate]:
             continue
         if scheme not in loaded.links:
             continue
-        for options in variants.of(kind, data):
+        for options in variants.guess_options(kind, data):
             try:
                 sensors.append(SensorCandidate(kind, params.filled(loaded, options, kind, "option"), options))
-            except TacpipeError:  # its options cannot be guessed, such as the columns of a generic driver
+            except TacpipeError:  # options that cannot be guessed, such as the columns of a generic driver
                 continue
     return sensors
 
 
 def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | None = None) -> list[Finding]:
-    """Return the findings for ``sensors``, the likeliest first. Sensors without evidence are left out.
+    """Return the findings for ``sensors``, most likely first. Sensors without evidence are skipped.
 
-    ``data`` came over a link of the kind ``scheme``. By default all sensors of such links are tried.
+    ``data`` was received over a link of the kind ``scheme``. By default all sensors for such links are tried.
     """
     if not data.data:
         return []
-    data = _first(data)
+    data = _truncate(data)
     shuffled, noise = _shuffled(data), _noise(data)
     findings = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
         frames, part, rate_hz = _count_frames(candidate.sensor, data)
-        if frames < FEWEST or part < POSSIBLE:
+        if frames < MIN_FRAMES or part < POSSIBLE:
             continue
-        # Shuffled digits are still lines of one number, so a sensor that the bytes describe is compared with random bytes.
+        # Shuffled digits are still lines of numbers, so sensors that are described by the bytes use random bytes.
         _, chance, _ = _count_frames(candidate.sensor, noise if candidate.sensor.described else shuffled)
         finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
@@ -114,23 +114,23 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | No
 
 
 def _rank(finding: Finding) -> tuple[float, bool, float, float, int]:
-    """Return the sort key of a finding: evidence rounded, because one cut frame decides nothing, then the rate.
+    """Return the sort key of a finding: rounded evidence, because one incomplete frame is not significant, then rate.
 
-    A product comes before a board that the bytes themselves describe.
+    Products come before boards that are described by the bytes themselves.
     """
     expected_hz = finding.candidate.sensor.rate_hz
-    off = abs(np.log(finding.rate_hz / expected_hz)) if finding.rate_hz > 0 and expected_hz > 0 else np.inf
+    rate_ratio = abs(np.log(finding.rate_hz / expected_hz)) if finding.rate_hz > 0 and expected_hz > 0 else np.inf
     return (
         -round(finding.evidence, 1),
         finding.candidate.sensor.described,
         -round(finding.explained, 1),
-        round(float(off), 1),
+        round(float(rate_ratio), 1),
         len(finding.candidate.options),
     )
 
 
 def _count_frames(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
-    """Return how many frames a sensor finds, the fraction of the bytes in them, and their rate in hertz."""
+    """Return the number of a sensor's frames in ``data``, the fraction of the bytes in them, and their rate in Hz."""
     framer = sensor.framer()
     runs = [*framer.feed(data)[0], *framer.flush()[0]]
     stamps = [run.t_ns for run in runs if len(run.t_ns)]
@@ -140,10 +140,10 @@ def _count_frames(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
     return frames, framer.account.framed / max(1, framer.account.received), rate_hz
 
 
-def _first(data: Chunks) -> Chunks:
-    if len(data.data) <= MOST:
+def _truncate(data: Chunks) -> Chunks:
+    if len(data.data) <= MAX_EXAMINED:
         return data
-    count = max(FEWEST + 1, int(np.searchsorted(np.cumsum(data.size), MOST, side="right")))
+    count = max(MIN_FRAMES + 1, int(np.searchsorted(np.cumsum(data.size), MAX_EXAMINED, side="right")))
     return Chunks(data.t_ns[:count], data.size[:count], data.data[: int(data.size[:count].sum())])
 
 
@@ -156,10 +156,10 @@ def _shuffled(data: Chunks) -> Chunks:
     return Chunks(data.t_ns, data.size, text)
 
 
-BOOT_S = 2.5  # an Arduino may be silent for so long after its port is opened
-FIRST_S = 0.5  # limit for the first byte of a device that has started
+BOOT_S = 2.5  # an Arduino may be silent for this time after its port is opened
+FIRST_S = 0.5  # timeout for the first byte of a device that has started
 LISTEN_S = 1.0  # duration of listening after the first byte
-REPLY_S = 0.5  # limit for a reply
+REPLY_S = 0.5  # timeout for a reply
 TEXT_BAUDS = (9600, 57_600, 38_400, 230_400, 250_000, 500_000)  # rates of boards that print lines
 REQUESTS = 20  # number of requests to a device that sends one frame per request
 Progress = Callable[[str], None]
@@ -171,28 +171,28 @@ class Report:
 
     address: str
     findings: list[Finding] = field(default_factory=list)
-    baud: int | None = None  # rate of a serial port at which the sensor was identified
-    requested: bool = False  # True where the device sends only on request
+    baud: int | None = None  # baud rate of the serial port for the findings
+    requested: bool = False  # True if the device sends only on request
     heard: int = 0  # number of bytes received
     error: str = ""  # why the address could not be probed
 
     @property
     def certain(self) -> bool:
-        """True where the best finding leaves no doubt."""
+        """True if the sensor is identified."""
         return bool(self.findings) and (self.findings[0].evidence >= CERTAIN)
 
 
-def placeholder(baud: int, line: SerialLine | None = None) -> Sensor:
-    """Return a sensor that only states how its port is set."""
-    kind = type("StandIn", (Sensor,), {"baud": baud, "rate_hz": 0.0, "line": line or SerialLine()})
-    sensor: Sensor = kind()
+def placeholder_sensor(baud: int, line: SerialLine | None = None) -> Sensor:
+    """Return a sensor that has only port settings."""
+    sensor_class = type("StandIn", (Sensor,), {"baud": baud, "rate_hz": 0.0, "line": line or SerialLine()})
+    sensor: Sensor = sensor_class()
     return sensor
 
 
 def probe(address: Address, usb_id: str = "", *, passive: bool = False, progress: Progress = lambda _: None) -> Report:
-    """Identify the sensor at ``address``. Drivers that know ``usb_id`` are tried first; ``progress`` gets a text per step.
+    """Identify the sensor at ``address``. Drivers with this ``usb_id`` are tried first; ``progress`` gets a text per step.
 
-    With ``passive`` nothing is written. An error of opening becomes the error of the report.
+    With ``passive``, nothing is sent. If the address cannot be opened, the report has the error.
     """
     try:
         report = _probe_by_listening(address, usb_id, progress)
@@ -208,14 +208,14 @@ def probe(address: Address, usb_id: str = "", *, passive: bool = False, progress
 
 
 def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Report:
-    """Return the findings without sending anything, at each likely baud rate until there is no doubt."""
+    """Return the findings without sending anything, at each likely baud rate until the sensor is identified."""
     best = Report(str(address))
     for number, baud in enumerate(_bauds(usb_id) if address.scheme == "serial" else [0]):
         progress(f"{address}: listening{f' at {baud:,} baud' if baud else ''}")
-        with closing(open_link(address, placeholder(baud), "probe")) as link:
+        with closing(open_link(address, placeholder_sensor(baud), "probe")) as link:
             chunks = _listen(link, FIRST_S if number else BOOT_S)
         report = _report(address, chunks, baud)
-        if not chunks:  # a streaming device sends bytes at any rate, if wrong ones
+        if not chunks:  # a streaming device would give bytes at any baud rate, though wrong ones
             return best
         if not best.findings or (report.findings and report.findings[0].evidence > best.findings[0].evidence):
             best = report
@@ -225,13 +225,13 @@ def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Re
 
 
 def _probe_with_requests(address: Address, usb_id: str, progress: Progress) -> Report:
-    """Return the findings after each driver's opening requests, drivers that know the device first."""
+    """Return the best findings after each driver's opening requests. Drivers with this USB id are tried first."""
     best = Report(str(address))
-    for candidate in _by_usb(candidates(Chunks.of([]), address.scheme), usb_id):
+    for candidate in _by_usb(candidates(Chunks.from_pairs([]), address.scheme), usb_id):
         sensor = candidate.sensor
         if not _has_requests(sensor):
             continue
-        progress(f"{address}: asking as {candidate.kind} does")
+        progress(f"{address}: sending the requests of {candidate.kind}")
         try:
             with closing(open_link(address, _without_settling(sensor), "probe")) as link:
                 chunks = _request_frames(link, sensor)
@@ -247,7 +247,7 @@ def _probe_with_requests(address: Address, usb_id: str, progress: Progress) -> R
 
 
 def _request_frames(link: Link, sensor: Sensor) -> Arrived:
-    """Return the bytes of a device after a sensor's opening and requests, and send the closing request at the end."""
+    """Return the bytes of a device after a sensor's opening and requests. The closing request is sent at the end."""
     try:
         entries = run_dialogue(link, _with_short_timeouts(sensor.opening(link.local)), "probe")
         request = sensor.request()
@@ -256,48 +256,48 @@ def _request_frames(link: Link, sensor: Sensor) -> Arrived:
             entries += link.read(REPLY_S)
         return entries if request else entries + _listen(link, FIRST_S)
     finally:
-        if farewell := sensor.closing():
-            link.write(farewell)
+        if closing_request := sensor.closing():
+            link.write(closing_request)
 
 
 def _listen(link: Link, first_s: float) -> Arrived:
     entries = link.read(first_s)
-    until = monotonic() + LISTEN_S
-    while entries and (left_s := until - monotonic()) > 0:
+    deadline = monotonic() + LISTEN_S
+    while entries and (left_s := deadline - monotonic()) > 0:
         entries += link.read(left_s)
     return entries
 
 
 def _report(address: Address, chunks: Arrived, baud: int, only: str = "") -> Report:
-    data = Chunks.of(chunks)
-    tried = [candidate for candidate in candidates(data, address.scheme) if only in ("", candidate.kind)]
-    findings = recognise(data, address.scheme, tried)
+    data = Chunks.from_pairs(chunks)
+    sensors = [candidate for candidate in candidates(data, address.scheme) if only in ("", candidate.kind)]
+    findings = recognise(data, address.scheme, sensors)
     return Report(str(address), findings, baud or None, heard=len(data.data))
 
 
 def _bauds(usb_id: str) -> list[int]:
-    """Return the baud rates of the serial drivers: those of drivers that know the device first, then the commonest."""
-    drivers = _by_usb(candidates(Chunks.of([]), "serial"), usb_id)
-    counted = Counter(candidate.sensor.baud for candidate in {driver.kind: driver for driver in drivers}.values())
+    """Return the baud rates of the serial drivers: first those of drivers with this USB id, then the most common."""
+    drivers = _by_usb(candidates(Chunks.from_pairs([]), "serial"), usb_id)
+    counts = Counter(candidate.sensor.baud for candidate in {driver.kind: driver for driver in drivers}.values())
     first = [candidate.sensor.baud for candidate in drivers if usb_id and usb_id in candidate.sensor.usb_ids]
-    return list(dict.fromkeys([*first, *(baud for baud, _ in counted.most_common()), *TEXT_BAUDS]))
+    return list(dict.fromkeys([*first, *(baud for baud, _ in counts.most_common()), *TEXT_BAUDS]))
 
 
 def _by_usb(sensors: list[SensorCandidate], usb_id: str) -> list[SensorCandidate]:
-    """Return one candidate per driver, drivers that know the USB device first."""
+    """Return one candidate per driver. Drivers with this USB id come first."""
     by_kind = {candidate.kind: candidate for candidate in reversed(sensors)}
     return sorted(by_kind.values(), key=lambda candidate: (usb_id not in candidate.sensor.usb_ids, candidate.kind))
 
 
 def _has_requests(sensor: Sensor) -> bool:
     """Return whether a driver sends requests."""
-    kind = type(sensor)
-    return kind.opening is not Sensor.opening or kind.request is not Sensor.request
+    driver = type(sensor)
+    return driver.opening is not Sensor.opening or driver.request is not Sensor.request
 
 
 def _without_settling(sensor: Sensor) -> Sensor:
-    """Return a placeholder that opens a port as this sensor does, without waiting: the device has started by now."""
-    return placeholder(getattr(sensor, "baud", 0), replace(sensor.line, settle_s=0.0))
+    """Return a placeholder with this sensor's port settings, but without the wait: the device has already started."""
+    return placeholder_sensor(getattr(sensor, "baud", 0), replace(sensor.line, settle_s=0.0))
 
 
 def _with_short_timeouts(dialogue: Dialogue) -> Dialogue:
@@ -311,6 +311,6 @@ def _with_short_timeouts(dialogue: Dialogue) -> Dialogue:
 
 
 def list_addresses() -> Iterator[tuple[Address, str]]:
-    """Yield the address and the USB identity of each serial port, HID device and camera."""
+    """Yield (address, USB id) of each serial port, HID device and camera."""
     for port in [*ports.serial_ports(), *ports.hid_ports(), *v4l2.cameras()]:
         yield parse(port.address), port.usb_id

@@ -21,7 +21,7 @@ from typing import Any
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io import files
 from tacpipe.links import ports
-from tacpipe.links.link import Arrived, Descriptor
+from tacpipe.links.link import Arrived, DescriptorLink
 from tacpipe.links.ports import Port
 from tacpipe.sensors.camera import COUNTS, Frame, pack_frame, pack_settings
 from tacpipe.sensors.sensor import Sensor
@@ -164,7 +164,7 @@ def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
 
 
 def _path_of(place: str, name: str) -> str:
-    paths = [port.address.removeprefix("v4l2:") for port in cameras() if port.lasting == f"v4l2:{place}"]
+    paths = [port.address.removeprefix("v4l2:") for port in cameras() if port.persistent_path == f"v4l2:{place}"]
     if len(paths) != 1:
         described = "no camera has" if not paths else f"{', '.join(paths)} have"
         raise DeviceError(f"{name}: {described} the name {place}; {_listed_cameras()}. Give a path if names are equal.")
@@ -272,7 +272,7 @@ def _set_controls(device: V4l2Device, sensor: Any, encoding: str) -> str:
     return ", ".join(described) + loss
 
 
-class V4l2Link(Descriptor):
+class V4l2Link(DescriptorLink):
     """A camera that captures. Each entry is the settings or a frame, as `tacpipe.sensors.camera` packs them."""
 
     packets = True

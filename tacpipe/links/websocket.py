@@ -9,56 +9,54 @@ from typing import TYPE_CHECKING
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import network
-from tacpipe.links.link import Arrived, Opened
+from tacpipe.links.link import Arrived, OpenLink
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
-MOST = 1 << 24  # limit of a message in bytes
-SILENT = logging.getLogger(
-    "tacpipe.links.websocket"
-)  # a lost connection is an error of its own, not a logged traceback
-SILENT.addHandler(logging.NullHandler())
-SILENT.propagate = False
-CLOSE_S = 1.0  # time that the other end has to close the connection
+MAX_MESSAGE = 1 << 24  # bytes
+LOGGER = logging.getLogger("tacpipe.links.websocket")  # a lost connection raises an error and is not logged
+LOGGER.addHandler(logging.NullHandler())
+LOGGER.propagate = False
+CLOSE_S = 1.0  # timeout for the peer to close the connection
 
 
-def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
-    """Return an open websocket of ``HOST:PORT`` or ``HOST:PORT/PATH``.
+def open_websocket(target: str, sensor: Sensor, name: str) -> WebsocketLink:
+    """Open the websocket ``HOST:PORT`` or ``HOST:PORT/PATH``.
 
-    Raises `DeviceError` for a host that is unknown, unreachable, refuses, or speaks something else.
+    Raises `DeviceError` if the host is unknown, unreachable, refuses the connection, or is not a websocket server.
     """
     with extras.explain_missing(name):
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
-    host_and_port, _, path = place.partition("/")
-    host, port = network.format_place("ws", host_and_port)
-    wire = network.connect(
+    host_and_port, _, path = target.partition("/")
+    host, port = network.parse_host_port("ws", host_and_port)
+    tcp_socket = network.connect(
         host, port, name
-    )  # our own connection uses no proxy and has the same error texts as all links
+    )  # connect here: no proxy is used, and errors have the same texts as those of other links
     try:
         connection = connect(
             f"ws://{host_and_port}/{path}",
-            sock=wire,
+            sock=tcp_socket,
             compression=None,
-            max_size=MOST,
+            max_size=MAX_MESSAGE,
             open_timeout=network.CONNECT_S,
             close_timeout=CLOSE_S,
-            logger=SILENT,
+            logger=LOGGER,
         ).__enter__()
     except (WebSocketException, TimeoutError, OSError, EOFError) as error:
-        wire.close()
+        tcp_socket.close()
         raise DeviceError(
-            f"{name}: the server at {host} port {port} is not a websocket ({error or type(error).__name__}); check "
-            "the port."
+            f"{name}: the server at {host} port {port} is not a websocket server ({error or type(error).__name__}); "
+            "check the port."
         ) from error
     return WebsocketLink(name, connection)
 
 
-class WebsocketLink(Opened):
+class WebsocketLink(OpenLink):
     """An open websocket."""
 
     packets = True

@@ -59,10 +59,10 @@ class Decoder:
                 chunks.append(block)
                 continue
             if chunks:
-                batches += self._feed(Chunks.joined(chunks))
+                batches += self._feed(Chunks.concatenate(chunks))
                 chunks = []
             if block is not None:
-                batches.append(self._reading.broken())
+                batches.append(self._reading.end_link())
         return [batch for batch in batches if len(batch)]
 
     def last(self) -> list[Batch]:

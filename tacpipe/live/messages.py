@@ -65,7 +65,7 @@ class Message:
     def numbers(self, about: Description) -> Float32s:
         """Return the numbers (column,) that `Description.columns` lists, with NaN for None."""
         parts = []
-        for value in self.declaration.recorded(LSL):
+        for value in self.declaration.values_of(LSL):
             content = value.read(self)
             width = len(value.columns_for(about.sizes))
             parts.append(np.full(width, np.nan) if content is None else np.ravel(content))
@@ -73,7 +73,7 @@ class Message:
 
     def stream_blocks(self, stream: str) -> tuple[AnyArray, ...] | None:
         """Return the values of a recorded stream as blocks (row, column) of one type, or None for no row."""
-        values = [(value.type, value.read(self)) for value in self.declaration.recorded(stream)]
+        values = [(value.type, value.read(self)) for value in self.declaration.values_of(stream)]
         if any(content is None for _, content in values):
             return None
         shape = (self.row_count(stream), -1)

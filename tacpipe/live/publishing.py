@@ -122,7 +122,7 @@ def open_publishers(options: SessionOptions, about: Description) -> Publishers:
     for name in options.own_streams:
         stream = rig.streams[name]
         assert isinstance(stream.sensor, Live)
-        host, _, port = stream.address.place.partition("?")[0].rpartition(":")
+        host, _, port = stream.address.target.partition("?")[0].rpartition(":")
         places[name], sensors[name] = (host or "127.0.0.1", int(port)), stream.sensor
     subscribed: list[Publisher] = []
     try:
@@ -164,7 +164,7 @@ class LslPublisher:
     def __init__(self, place: str, about: Description) -> None:
         with extras.explain_missing("--publish lsl"):
             import pylsl
-        lsl.quiet(pylsl)
+        lsl.silence_logging(pylsl)
         columns = about.columns()
         info = pylsl.StreamInfo(
             place, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{place}"
@@ -250,7 +250,7 @@ class UdpPublisher:
             raise UsageError(f"--publish udp:{place}?{excerpt(options)}: the only option is format, json or msgpack.")
         self.dropped = 0
         self._packed = to_json if kind == "json" else _msgpack()
-        host, port = network.format_place("udp", place)
+        host, port = network.parse_host_port("udp", place)
         try:
             family, *_, target = socket.getaddrinfo(host or "127.0.0.1", port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, socket.SOCK_DGRAM)

@@ -145,7 +145,7 @@ class WebsocketPublisher:
 
 def _listening_socket(place: str) -> socket.socket:
     """Return a socket that listens at ``HOST:PORT``. Raises `UsageError` for no port, `DeviceError` for one in use."""
-    host, port = network.format_place("ws", place)
+    host, port = network.parse_host_port("ws", place)
     try:
         family, *_, address = socket.getaddrinfo(host or HOST, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server(address, family=family)

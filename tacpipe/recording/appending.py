@@ -31,21 +31,21 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-BYTES = "bytes"  # name of the attached spool, where a driver could not decode all bytes
+BYTES = "bytes"  # name of the attached spool, which is stored if a driver could not decode all bytes
 RIG = "rig.toml"  # name of the attached rig file
 
 
 class NothingError(TacpipeError):
-    """A recording without a single sample."""
+    """No stream of a recording received any bytes."""
 
 
 def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> str:
     """Append a recording to the dataset at ``output`` and return its name.
 
-    Its shards are durable, and read again and compared, before the manifest names them. Raises `NothingError` if no stream
-    gave anything (`TacpipeError` if they gave no sample), and `DamagedError` if what was written is not what is read.
+    The shards are synced to disk, read back and compared before the manifest refers to them. Raises `NothingError` if no
+    stream received bytes, `TacpipeError` if the bytes contain no sample, and `DamagedError` if a shard reads back wrong.
     """
-    began_s = time.perf_counter()
+    start_s = time.perf_counter()
     streams = {name: stream.batches for name, stream in sealed.items() if stream.rows}
     if not streams:
         _raise_empty(spooled, sealed)
@@ -58,63 +58,63 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     files = {RIG: text}
     if any(stream.undecoded for stream in sealed.values()):  # a later driver may decode them
         with (spooled.folder / "bytes").open("rb") as spool:
-            copied = functools.partial(shutil.copyfileobj, spool)
-            files[BYTES] = store.put_written(copied, durable=True).to_json()
+            copy_spool = functools.partial(shutil.copyfileobj, spool)
+            files[BYTES] = store.put_written(copy_spool, durable=True).to_json()
     result: StoredResult = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
     provenance_entry: Provenance = {
-        **provenance.describe_provenance(round(time.perf_counter() - began_s, 4)),
+        **provenance.describe_provenance(round(time.perf_counter() - start_s, 4)),
         "irreplaceable": True,
     }
     store.commit(identity, result, provenance_entry, durable=True)
     output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
-    names: list[str] = []  # the name of the recording, last
+    names: list[str] = []  # names under which the recording was added; a retry appends another
 
-    def appended() -> directory.DirectoryChange:
-        before = existing(output)
-        recordings = {} if before is None else before.recordings
+    def add_recording() -> directory.DirectoryChange:
+        current = existing_manifest(output)
+        recordings = {} if current is None else current.recordings
         existing_name = next((name for name, entry in recordings.items() if entry["shards"] == shards), None)
-        if before is not None and existing_name is not None:  # a crash came after an earlier append
+        if current is not None and existing_name is not None:  # an earlier run appended it and then crashed
             names.append(existing_name)
-            return directory.DirectoryChange(before, may_lack=_other_paths(before, existing_name, rig_name))
+            return directory.DirectoryChange(current, may_lack=_other_paths(current, existing_name, rig_name))
         name = _free_name(spooled.header["recording"], recordings)
-        now = before or Manifest(ACQUIRE, VERSION)
-        now = now.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
-        now = replace(now, files=dict(sorted({**now.files, rig_name: text}.items())))
+        updated = current or Manifest(ACQUIRE, VERSION)
+        updated = updated.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
+        updated = replace(updated, files=dict(sorted({**updated.files, rig_name: text}.items())))
         try:
-            manifest_of.check_pages(now, fresh=True)
-            now.content  # noqa: B018  (what JSON cannot hold is refused here)
-        except (ValueError, TypeError, KeyError) as error:  # never publish what every reader would refuse
+            manifest_of.check_pages(updated, fresh=True)
+            updated.content  # noqa: B018  (raises if a value cannot be written as JSON)
+        except (ValueError, TypeError, KeyError) as error:  # never publish a manifest that readers reject
             raise TacpipeError(
                 f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
             ) from error
         names.append(name)
-        return directory.DirectoryChange(now, may_lack=_other_paths(now, name, rig_name))
+        return directory.DirectoryChange(updated, may_lack=_other_paths(updated, name, rig_name))
 
-    directory.change(store, output, appended)
+    directory.change(store, output, add_recording)
     return names[-1]
 
 
 def _other_paths(manifest: Manifest, name: str, rig: str) -> set[str]:
-    """Return the paths of all recordings and rig files except these."""
+    """Return the paths of all other recordings and rig files."""
     return {path for path, _ in manifest.objects() if not path.startswith(f"{name}/") and path != rig}
 
 
 def _raise_empty(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
-    """Raise the error for a spool without samples, and remove a spool without bytes."""
+    """Raise the error for a spool without samples. A spool without bytes is also removed."""
     received = sum(stream.received for stream in sealed.values())
     if not received and not spooled.damage:
         spooled.remove()
-        raise NothingError(f"No stream sent any data ({', '.join(sealed)}), so there is no recording.")
-    spoiled = sum(damage.bytes for damage in spooled.damage)
+        raise NothingError(f"No stream received any bytes ({', '.join(sealed)}), so there is no recording.")
+    damaged = sum(damage.bytes for damage in spooled.damage)
     raise TacpipeError(
-        f"{received:,} bytes came from {', '.join(sealed)} and hold no sample; {spoiled:,} more are spoiled. "
-        f"`tacpipe acquire --dry-run` states what each device sends."
+        f"{received:,} bytes from {', '.join(sealed)} contain no sample; {damaged:,} more bytes are damaged. "
+        f"`tacpipe acquire --dry-run` shows what each device sends."
     )
 
 
-def existing(output: Path) -> Manifest | None:
-    """Return the manifest of the acquired recordings at ``output``, or None if there is no dataset yet.
+def existing_manifest(output: Path) -> Manifest | None:
+    """Return the manifest of the acquired recordings at ``output``, or None if there is no dataset.
 
     Raises `UsageError` if another command wrote the dataset.
     """
@@ -123,32 +123,32 @@ def existing(output: Path) -> Manifest | None:
     manifest = manifest_of.find(output).manifest
     if manifest.stage != ACQUIRE:
         raise UsageError(
-            f"{output} was made by {manifest.stage}, and acquire appends only to acquired recordings. Give -o another "
-            f"directory; later stages read several datasets as one."
+            f"{output} was written by {manifest.stage}, and acquire appends only to acquired recordings. Give -o another "
+            f"directory; later stages can read several datasets."
         )
     return manifest
 
 
-def refuse_taken(output: Path, names: Sequence[str]) -> None:
-    """Raise `UsageError` if a recording at ``output`` has one of these names, in upper or lower case.
+def refuse_existing_names(output: Path, names: Sequence[str]) -> None:
+    """Raise `UsageError` if a recording at ``output`` has one of these names. Case is ignored.
 
-    Some file systems do not distinguish case. Raises it also if another command wrote the dataset.
+    Some file systems do not distinguish case. Also raises `UsageError` if another command wrote the dataset.
     """
-    before = existing(output)
-    existing_names = {} if before is None else {paths.folded_name(name): name for name in before.recordings}
+    manifest = existing_manifest(output)
+    existing_names = {} if manifest is None else {paths.folded_name(name): name for name in manifest.recordings}
     folded_names = [paths.folded_name(name) for name in names]
     conflicts = sorted(existing_names[folded] for folded in folded_names if folded in existing_names)
     if conflicts:
         raise UsageError(
-            f"{output} has recordings of these names already: {', '.join(map(plain, conflicts[:5]))}. Give another --name, "
-            f"in more than upper and lower case, or -o another directory."
+            f"{output} already has recordings with these names: {', '.join(map(plain, conflicts[:5]))}. Give a --name that "
+            f"differs in more than case, or give -o another directory."
         )
 
 
 def _free_name(requested: str, existing_names: Iterable[str]) -> str:
-    """Return ``requested``, with a number appended if another process used that name meanwhile.
+    """Return ``requested``, with a number appended if the dataset already has that name.
 
-    Names that differ only in case count as equal, as on some file systems.
+    Another process may have used the name since it was checked. Names that differ only in case count as equal.
     """
     name, number, folded = requested, 2, {paths.folded_name(existing) for existing in existing_names}
     while paths.folded_name(name) in folded:
@@ -170,33 +170,33 @@ def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader
 
 
 def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader) -> bool:
-    """Return whether a shard has the rows of the expected batches bit by bit, compared in batches."""
+    """Return whether a shard equals the expected batches bit by bit."""
     import pyarrow as pa
 
     if not stored.schema.equals(expected.schema):
         return False
-    waiting: list[pa.RecordBatch] = []  # batches of the shard
+    pending: list[pa.RecordBatch] = []  # batches of the shard that are not compared yet
     for batch in expected:
         count = batch.num_rows
-        while sum(part.num_rows for part in waiting) < count:
+        while sum(part.num_rows for part in pending) < count:
             next_batch = next(stored, None)
             if next_batch is None:
                 return False
-            waiting.append(next_batch)
-        table = pa.Table.from_batches(waiting)
+            pending.append(next_batch)
+        table = pa.Table.from_batches(pending)
         if not _equal_tables(table.slice(0, count), pa.Table.from_batches([batch])):
             return False
-        waiting = [part for part in table.slice(count).to_batches() if part.num_rows]
-    return not waiting and next(stored, None) is None
+        pending = [part for part in table.slice(count).to_batches() if part.num_rows]
+    return not pending and next(stored, None) is None
 
 
-def _equal_tables(ours: pa.Table, theirs: pa.Table) -> bool:
-    """Return whether two tables are equal bit by bit, so that NaN equals NaN."""
+def _equal_tables(stored: pa.Table, expected: pa.Table) -> bool:
+    """Return whether two tables are equal bit by bit; NaN equals NaN."""
     import pyarrow as pa
 
-    for kind, *columns in zip(theirs.schema, ours.columns, theirs.columns, strict=True):
-        if pa.types.is_floating(kind.type):
-            left, right = (column.to_numpy().view(f"u{kind.type.bit_width // 8}") for column in columns)
+    for field, *columns in zip(expected.schema, stored.columns, expected.columns, strict=True):
+        if pa.types.is_floating(field.type):
+            left, right = (column.to_numpy().view(f"u{field.type.bit_width // 8}") for column in columns)
             if not np.array_equal(left, right):
                 return False
         elif not columns[0].equals(columns[1]):
@@ -205,7 +205,7 @@ def _equal_tables(ours: pa.Table, theirs: pa.Table) -> bool:
 
 
 def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dict[str, Attribute]:
-    """Return the labels and, for each stream, the number of lost samples and the losses of a crash."""
+    """Return the labels and, for each stream, the numbers of lost, uncertain and undecoded samples or bytes."""
     master = rig.streams[rig.master]
     attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
     attributes |= {**rig.labels, **spooled.header["attributes"]}

@@ -1,4 +1,4 @@
-"""Read the clock of a recording, and wait. Tests replace it with a clock of their own."""
+"""Read the monotonic clock, and sleep. Tests replace these functions with a simulated clock."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import time
 
 
 def now_ns() -> int:
-    """Return the time of the monotonic clock in ns, which stamps arrivals too."""
+    """Return the time of the monotonic clock in ns. Arrivals are stamped with the same clock."""
     return time.monotonic_ns()
 
 
 def now_s() -> float:
-    """Return the same time in seconds."""
+    """Return the time of the monotonic clock in seconds."""
     return now_ns() / 1e9
 
 
@@ -21,7 +21,7 @@ def sleep(seconds: float) -> None:
 
 
 def suspended_ns() -> int:
-    """Return how long the computer was suspended since its start, in ns. The monotonic clock does not count that time."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system has no such clock
+    """Return how long the computer has been suspended since boot, in ns. The monotonic clock does not count that time."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # only Linux has this clock
         return 0
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()

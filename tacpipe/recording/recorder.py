@@ -26,32 +26,32 @@ from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Options
 
-TICK_S = 0.05  # period of moving bytes to the spool; a crash costs about as much
+TICK_S = 0.05  # period of moving bytes to the spool; a crash loses about this much
 SYNC_S = 0.5  # period of syncing the spool
-FIRST_S = 3.0  # limit for the first sample of a stream that sends continuously
-SILENT_S = 2.0  # such a stream counts as lost after so long without a sample, though its link is open
-DRAIN_S = 2.0  # limit for emptying the links after this program was delayed
-PREROLL_S = 0.5  # time before a trigger that is recorded too
+FIRST_S = 3.0  # timeout for the first sample of a stream that sends continuously
+SILENT_S = 2.0  # a stream that sends continuously counts as lost after this time without a sample
+DRAIN_S = 2.0  # timeout for emptying the links after a delay of this program
+PREROLL_S = 0.5  # recorded time before a trigger
 
 
 class Companion(Protocol):
-    """A follower of a rig while it is recorded, such as a model in its own process. No method may wait or raise."""
+    """A consumer of the bytes of a rig, such as a model in its own process. No method may block or raise."""
 
     def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Receive bytes or a note of a stream. The reading threads call this."""
 
     def begin(self, clock: ClockReading) -> None:
-        """Begin a recording. ``clock`` has one reading of the monotonic clock and of UTC."""
+        """Start a recording. ``clock`` has one reading of the monotonic clock and of UTC."""
 
     def end(self) -> None:
         """End the recording."""
 
     def look(self) -> Iterable[StreamNote]:
-        """Do the work that is due after each tick, and return notes for the recording."""
+        """Do the work that is due after a tick, and return notes for the recording."""
 
 
 class Recorder:
-    """An open rig. `tick` moves bytes from the links to the watches and the spool, and must be called all the time."""
+    """An open rig. `tick` moves bytes from the links to the watches and the spool, and must be called every `TICK_S`."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -59,14 +59,14 @@ class Recorder:
         self.watches = {name: Watch(stream) for name, stream in rig.streams.items()}
         self._spool: Spool | None = None
         self._companion: Companion | None = None
-        self._looked_ns: int | None = None  # time of the last tick
-        self._awake_ns = 0  # start of uninterrupted ticks: an earlier silence may be a delay of this program
-        self._held_ns = 0  # total time that this program was delayed
-        self._before: dict[str, deque[tuple[int, list[Chunks | StreamNote]]]] = {name: deque() for name in rig.streams}
+        self._last_tick_ns: int | None = None
+        self._punctual_since_ns = 0  # end of the last delay of this program, during which streams only seemed silent
+        self._delay_ns = 0  # total delay of this program
+        self._preroll: dict[str, deque[tuple[int, list[Chunks | StreamNote]]]] = {name: deque() for name in rig.streams}
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
-        """Keep all streams open in the block. Raises `DeviceError` with a sentence for each that does not open."""
+        """Keep all streams open in the block. Raises `DeviceError` with a sentence for each stream that cannot be opened."""
         started: list[Station] = []
         try:
             failed = []
@@ -84,8 +84,8 @@ class Recorder:
                 station.stop()
 
     def tick(self) -> None:
-        """Take the bytes since the last tick, spool them, and then pass them to the watches."""
-        self._look()
+        """Spool the bytes received since the last tick, and pass them to the watches."""
+        self._note_tick()
         blocks_by_stream = {name: station.take() for name, station in self.stations.items()}
         if self._spool is not None:
             for name, blocks in blocks_by_stream.items():
@@ -97,60 +97,64 @@ class Recorder:
             if self._spool is not None:
                 self._spool.note(note)
 
-    def run(self, until: Callable[[], bool], after_tick: Callable[[], None] = lambda: None) -> None:
-        """Tick until ``until()`` is true. ``after_tick`` is called after every tick."""
+    def run(self, is_finished: Callable[[], bool], after_tick: Callable[[], None] = lambda: None) -> None:
+        """Tick until ``is_finished()`` is true. ``after_tick`` is called after every tick."""
         due_s = clock.now_s()
-        while not until():
+        while not is_finished():
             self.tick()
             after_tick()
             due_s = max(due_s + TICK_S, clock.now_s())
             clock.sleep(max(0.0, due_s - clock.now_s()))
 
     def await_first(self, stopped: Callable[[], bool]) -> None:
-        """Wait for a sample of every stream that sends continuously. Raises `DeviceError` with the reasons of late ones."""
+        """Wait for a sample of every stream that sends continuously. Raises `DeviceError` with the reasons for silence."""
         deadline_s = clock.now_s() + FIRST_S
-        late = {name for name, watch in self.watches.items() if watch.stream.sensor.awaited}
+        silent_streams = {name for name, watch in self.watches.items() if watch.stream.sensor.awaited}
 
-        held_ns = self._held_ns
+        previous_delay_ns = self._delay_ns
 
-        def settled() -> bool:
-            late.difference_update({name for name in late if self.watches[name].samples})
-            self._look()
-            return not late or stopped() or clock.now_s() - (self._held_ns - held_ns) / 1e9 > deadline_s
+        def is_settled() -> bool:
+            silent_streams.difference_update({name for name in silent_streams if self.watches[name].samples})
+            self._note_tick()
+            elapsed_s = clock.now_s() - (self._delay_ns - previous_delay_ns) / 1e9
+            return not silent_streams or stopped() or elapsed_s > deadline_s
 
-        self.run(settled)
-        if late and not stopped():
-            raise DeviceError("\n".join(self._explain_silence(name) for name in sorted(late)))
+        self.run(is_settled)
+        if silent_streams and not stopped():
+            raise DeviceError("\n".join(self._explain_silence(name) for name in sorted(silent_streams)))
 
     def accompany(self, companion: Companion, streams: Iterable[str]) -> None:
-        """Have a companion follow these streams. The reading threads pass it the bytes before they are spooled."""
+        """Pass the bytes of these streams to a companion. The reading threads do so before the bytes are spooled."""
         self._companion = companion
         for name in streams:
             self.stations[name].listener = functools.partial(companion.put, name)
 
     def follow(self) -> None:
-        """Have the companion begin without a recording. Nothing is spooled."""
+        """Start the companion without a recording. Nothing is spooled."""
         if self._companion is not None:
             self._companion.begin(spool_of.read_clocks())
         for name, station in self.stations.items():
-            self._watch(name, station.begin(lambda chunks, size, last_ns: None, None))
+            self._watch(name, station.start_recording(lambda chunks, size, last_ns: None, None))
 
     @contextlib.contextmanager
     def recording(self, spool: Spool, *, preroll: bool = False) -> Iterator[None]:
-        """Spool the bytes that arrive in the block, with ``preroll`` also those right before, then finish the spool."""
+        """Spool the bytes that arrive in the block, then finish the spool.
+
+        With ``preroll``, the bytes of the `PREROLL_S` before the block are spooled too.
+        """
         stopped = threading.Event()
         syncing = threading.Thread(target=_sync, args=(spool, stopped), daemon=True)
-        since_ns = clock.now_ns() - round(PREROLL_S * 1e9)
+        preroll_start_ns = clock.now_ns() - round(PREROLL_S * 1e9)
         if self._companion is not None:
             self._companion.begin(spool.clock)
         for name, station in self.stations.items():
             self._watch(name, station.take())
-            early = _since(self._before[name], since_ns) if preroll else None
-            pending = station.begin(functools.partial(spool.tally, spool.streams[name]), early)
-            if station.error is not None:  # the loss came before the recording, so no note states it
+            preroll_blocks = _blocks_since(self._preroll[name], preroll_start_ns) if preroll else None
+            pending = station.start_recording(functools.partial(spool.tally, spool.streams[name]), preroll_blocks)
+            if station.error is not None:  # the link was lost before the recording, so no note reports it
                 spool.note(StreamNote(clock.now_ns(), name, LOST, str(station.error)))
-            if early is not None:
-                _spool_blocks(spool, name, [*early, *pending])
+            if preroll_blocks is not None:
+                _spool_blocks(spool, name, [*preroll_blocks, *pending])
             self._watch(name, pending)
         self._spool = spool
         syncing.start()
@@ -160,10 +164,10 @@ class Recorder:
             self._spool = None
             if self._companion is not None:
                 self._companion.end()
-            self._look()
-            if clock.now_ns() - self._awake_ns < DRAIN_S * 1e9:
+            self._note_tick()
+            if clock.now_ns() - self._punctual_since_ns < DRAIN_S * 1e9:
                 self._drain()
-            last = {name: station.end() for name, station in self.stations.items()}
+            last = {name: station.end_recording() for name, station in self.stations.items()}
             for name, blocks in last.items():
                 _spool_blocks(spool, name, blocks)
             stopped.set()
@@ -173,54 +177,54 @@ class Recorder:
                 self._watch(name, blocks)  # the next recording may need them as preroll
 
     def lost(self) -> list[str]:
-        """Return a sentence for each stream whose link is lost, or that is silent though its link is open.
+        """Return a sentence for each stream that is lost, or silent although its link is open.
 
-        Only the silence up to the last tick counts: a slow disk or a delay of this program is not a silence.
+        Time since the last tick is not counted: a slow disk or a delay of this program is not a silence.
         """
         sentences = []
         for name, station in self.stations.items():
-            heard_ns = max(self.watches[name].last_ns or 0, self._awake_ns)
-            silent_s = ((self._looked_ns or heard_ns) - heard_ns) / 1e9
+            last_ns = max(self.watches[name].last_ns or 0, self._punctual_since_ns)
+            silent_s = ((self._last_tick_ns or last_ns) - last_ns) / 1e9
             if station.error is not None:
                 sentences.append(str(station.error))
             elif station.stream.sensor.awaited and silent_s > SILENT_S:
                 sentences.append(
-                    f"Stream {name} ({station.stream.address}): nothing came for {silent_s:.1f} s, though it is open. "
-                    f"The device hangs or is switched off: switch it off and on."
+                    f"Stream {name} ({station.stream.address}): nothing was received for {silent_s:.1f} s, though it is "
+                    f"open. The device hangs or is switched off: power-cycle it."
                 )
         return sentences
 
     def tare(self) -> None:
-        """Have every device with such a command take its present reading as zero."""
+        """Zero every device that has a command for it, and measure the rest levels again."""
         for station in self.stations.values():
             station.tare()
         for watch in self.watches.values():
             watch.tare()
 
     def _drain(self) -> None:
-        """Wait, at most `DRAIN_S`, until the links are read empty after this program was delayed."""
-        since_ns = clock.now_ns()
-        while clock.now_ns() - since_ns < DRAIN_S * 1e9:
+        """Wait for at most `DRAIN_S` until all links have been read empty."""
+        start_ns = clock.now_ns()
+        while clock.now_ns() - start_ns < DRAIN_S * 1e9:
             clock.sleep(TICK_S)
-            if all(station.drained(since_ns) for station in self.stations.values()):
+            if all(station.is_drained(start_ns) for station in self.stations.values()):
                 return
 
-    def _look(self) -> None:
-        """Note the time of this tick, and whether it was overdue: bytes may then wait in the links."""
+    def _note_tick(self) -> None:
+        """Store the time of this tick and add its delay: after a delay, bytes may be queued in the links."""
         now_ns = clock.now_ns()
-        since_ns, self._looked_ns = now_ns - (self._looked_ns or now_ns), now_ns
-        overdue_ns = since_ns - round(TICK_S * 1e9)
+        elapsed_ns, self._last_tick_ns = now_ns - (self._last_tick_ns or now_ns), now_ns
+        overdue_ns = elapsed_ns - round(TICK_S * 1e9)
         if overdue_ns > STALL_NS:
-            self._awake_ns, self._held_ns = now_ns, self._held_ns + overdue_ns
+            self._punctual_since_ns, self._delay_ns = now_ns, self._delay_ns + overdue_ns
 
     def _watch(self, name: str, blocks: list[Chunks | StreamNote]) -> None:
-        """Pass blocks to the watch, and keep them as long as a trigger may need them."""
-        before = self._before[name]
+        """Pass blocks to the watch, and retain those of the last `PREROLL_S`."""
+        retained = self._preroll[name]
         if blocks:
             self.watches[name].feed(blocks)
-            before.append((clock.now_ns(), blocks))
-        while before and before[0][0] < clock.now_ns() - PREROLL_S * 1e9:
-            before.popleft()
+            retained.append((clock.now_ns(), blocks))
+        while retained and retained[0][0] < clock.now_ns() - PREROLL_S * 1e9:
+            retained.popleft()
 
     def _explain_silence(self, name: str) -> str:
         station, watch = self.stations[name], self.watches[name]
@@ -238,15 +242,15 @@ def _sync(spool: Spool, stopped: threading.Event) -> None:
         spool.sync()
 
 
-def _since(before: deque[tuple[int, list[Chunks | StreamNote]]], since_ns: int) -> list[Chunks | StreamNote]:
-    """Return the parts of blocks that arrived since ``since_ns``."""
-    blocks = [block for _, part in before for block in part]
+def _blocks_since(retained: deque[tuple[int, list[Chunks | StreamNote]]], start_ns: int) -> list[Chunks | StreamNote]:
+    """Return the blocks that arrived at or after ``start_ns``. Blocks that arrived partly before are cut."""
+    blocks = [block for _, batch in retained for block in batch]
     recent: list[Chunks | StreamNote] = []
     for block in blocks:
         if isinstance(block, Chunks):
-            block = block.since(since_ns)
+            block = block.since(start_ns)
             recent += [block] if len(block.size) else []
-        elif block.t_ns >= since_ns:
+        elif block.t_ns >= start_ns:
             recent.append(block)
     return recent
 
@@ -259,14 +263,14 @@ def _spool_blocks(spool: Spool, name: str, blocks: list[Chunks | StreamNote]) ->
             spool.append(name, block)
 
 
-STATED_S = 5.0  # limit for a device to state its options
+OPTIONS_S = 5.0  # timeout for a device to report its options
 
 
 def complete_rig(rig: Rig) -> Rig:
-    """Return the rig with the options that its devices state. Options in the rig file have precedence.
+    """Return the rig with the options that its devices report. Options in the rig file take precedence.
 
-    Raises `DeviceError` for a device that is missing or states nothing. The options become part of the rig's text, so that a
-    recording that a crash cut off is sealed without the device.
+    Raises `DeviceError` if a device is missing or reports nothing. The options become part of the rig's text, so that a
+    recording can be sealed without the device after a crash.
     """
     if not any(stream.sensor.incomplete for stream in rig.streams.values()):
         return rig
@@ -285,14 +289,14 @@ def _complete_stream(stream: RigStream) -> RigStream:
 
 def _read_options(stream: RigStream) -> Options:
     chunks: list[tuple[int, bytes]] = []
-    until_s = clock.now_s() + STATED_S
+    deadline_s = clock.now_s() + OPTIONS_S
     with closing(opening.open_link(stream.address, stream.sensor, stream.name)) as link:
-        while clock.now_s() < until_s:
+        while clock.now_s() < deadline_s:
             chunks += link.read(0.1)
-            options = variants.of(stream.kind, Chunks.of(chunks)) if chunks else []
+            options = variants.guess_options(stream.kind, Chunks.from_pairs(chunks)) if chunks else []
             if options:
                 return options[0]
     raise DeviceError(
-        f"Stream {stream.name} ({stream.address}): the device did not state its options within {STATED_S:g} s; "
+        f"Stream {stream.name} ({stream.address}): the device did not report its options within {OPTIONS_S:g} s; "
         "write them into the rig file."
     )

@@ -32,7 +32,7 @@ from tacpipe.sensors.sensor import Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 RESERVED = (EVENTS, "truth")  # streams of a recording that no sensor may use
-KEYS = ("name", "sensor", "transport", "options", "emulate")
+KEYS = ("name", "sensor", "transport", "options", "emulate")  # keys of a [[stream]] table
 
 
 @dataclass(frozen=True)
@@ -60,26 +60,26 @@ class Rig:
 
 
 def read(path: Path) -> Rig:
-    """Return the rig that a file describes. Raises `UsageError` with the place of the mistake."""
+    """Return the rig that a file describes. Raises `UsageError` with the location of the mistake."""
     try:
         text = regular.content(path).decode()
     except TacpipeError as error:
         raise UsageError(str(error)) from error
     except FileNotFoundError:
-        raise UsageError(f"There is no rig file {path}; its format is documented in docs/rig.md.") from None
+        raise UsageError(f"The rig file {path} does not exist; its format is documented in docs/rig.md.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"The rig file {path} cannot be read: {error}.") from error
     return parse(text, str(path))
 
 
 def parse(text: str, source: str = "rig.toml") -> Rig:
-    """Return the rig of a rig file's text. ``source`` names it in errors.
+    """Return the rig that the text of a rig file describes. ``source`` is the file's name in errors.
 
-    Raises `UsageError` for invalid TOML, an unknown key, sensor, option or address, and a reserved or repeated name.
+    Raises `UsageError` for invalid TOML, an unknown key, sensor, option or address, or a reserved or repeated name.
     """
     try:
         contents = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, brackets within brackets
+    except (ValueError, RecursionError) as error:  # numbers with thousands of digits, deeply nested brackets
         raise UsageError(f"{source} is not valid TOML: {plain(str(error), 200)}.") from error
     _refuse_unknown(contents, ("master", "labels", "stream", "emulate", "live"), source)
     tables = contents.get("stream")
@@ -108,12 +108,12 @@ def _stream(table: Values, source: str) -> RigStream:
     _refuse_unknown(table, KEYS, source)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
-            raise UsageError(f"{source}: {key} is {excerpt(table.get(key))}; it must be a text.")
+            raise UsageError(f"{source}: {key} is {excerpt(table.get(key))}; it must be text.")
     name = table["name"]
     if not NAME.fullmatch(name) or name in RESERVED:
         raise UsageError(
-            f"{source}: {excerpt(name)} cannot name a stream; use lower-case letters, digits and _, 64 at most, and "
-            f"neither of {', '.join(RESERVED)}."
+            f"{source}: {excerpt(name)} is not a valid stream name; use at most 64 lower-case letters, digits and _, and "
+            f"none of {', '.join(RESERVED)}."
         )
     kind, options, emulate = table["sensor"], _table(table, "options", source), _table(table, "emulate", source)
     address = link.parse(table["transport"])
@@ -134,24 +134,24 @@ def _table(table: Values, key: str, source: str) -> Values:
 
 
 def build_sensor(kind: str, options: Values, source: str) -> Sensor:
-    """Return a sensor with these options. Raises `UsageError` for an unknown option or a value of a wrong type."""
+    """Return a sensor with these options. Raises `UsageError` for an unknown option or a value of the wrong type."""
     sensor: Sensor = params.filled(registry.load_sensor(kind), options, source, "option")
     return sensor
 
 
 def _stream_label(name: object) -> str:
-    """Return the name of a stream for errors."""
+    """Return the name of a stream for errors, or its number if it has no name."""
     return plain(name) if isinstance(name, str) else excerpt(name)
 
 
 def _refuse_unknown(table: Iterable[str], keys: tuple[str, ...], source: str) -> None:
     for key in table:
         if key not in keys:
-            raise UsageError(f"{source}: there is no key {plain(key)}; there are {', '.join(keys)}.")
+            raise UsageError(f"{source}: there is no key {plain(key)}; the keys are {', '.join(keys)}.")
 
 
 def to_toml(rig: Rig) -> str:
-    """Return the TOML of a rig that differs from its file, as one of the emulator or one that its devices complete."""
+    """Return the TOML text of a rig that has no file, or whose options were completed by its devices."""
     parts = [f"master = {config_text.toml_value(rig.master)}\n"]
     if rig.labels:
         parts.append(

@@ -1,4 +1,4 @@
-"""Decode a spool: the samples of each stream as one table, and the faults of all streams as another."""
+"""Decode a spool to one table of samples per stream, and one table of the faults of all streams."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ if TYPE_CHECKING:
 
     from tacpipe.io.spill import Piece, Spill
 
-UNCERTAIN = "t_uncertain_ns"  # column, only where this program was delayed
-PIECE_BYTES = 1 << 22  # size of samples that are moved to disk together
+UNCERTAIN = "t_uncertain_ns"  # column that exists only if this program was delayed
+PIECE_BYTES = 1 << 22  # bytes of samples that are moved to disk together
 
 
 @dataclass(frozen=True)
 class Stamping:
-    """Functions from arrivals on the monotonic clock (sample,) to stamps in UTC, and to how late these may be."""
+    """Functions that convert arrivals on the monotonic clock (sample,) to UTC timestamps, and to their possible delays."""
 
     utc_ns: Callable[[Any], Any]
     uncertain_ns: Callable[[Times], Int64s]
 
 
 class Decoded:
-    """Samples of one stream in the order of their arrival."""
+    """Samples of one stream in order of arrival."""
 
     def __init__(self, fields: Sequence[pa.Field], spill: Spill) -> None:
         self.count = 0
         self.first_ns = self.last_ns = 0  # first and last arrival on the monotonic clock, if there are samples
         self._fields, self._spill = fields, spill
         self._device: list[pa.Field] = []  # fields of the device's clock and counters
-        self._waiting: list[pa.Table] = []
-        self._bytes = 0  # size of the waiting tables
+        self._in_memory: list[pa.Table] = []
+        self._bytes = 0  # size of the tables in memory
         self._pieces: list[Piece] = []
 
     def add(self, batch: Batch) -> None:
-        """Add samples. Raises Arrow's error for values that do not fit their columns; then nothing is added."""
+        """Add samples. Raises Arrow's error, and adds nothing, if a value does not fit its column."""
         import pyarrow as pa
 
         from tacpipe.channels import schema
@@ -57,30 +57,30 @@ class Decoded:
         device = self._device
         if not self.count:
             device = schema.device_fields(clock=batch.t_device_ns is not None, counters=batch.counters)
-        clocks = [pa.array(getattr(batch, kind.name), kind.type) for kind in device]
+        clocks = [pa.array(getattr(batch, field.name), field.type) for field in device]
         values = (block[:, number] for block in batch.values for number in range(block.shape[1]))
-        channels = [pa.array(column, kind.type) for kind, column in zip(self._fields, values, strict=True)]
+        channels = [pa.array(column, field.type) for field, column in zip(self._fields, values, strict=True)]
         arrays = [pa.array(batch.t_ns, pa.int64()), *clocks, *channels]
         table = pa.Table.from_arrays(arrays, names=[str(number) for number in range(len(arrays))])
         if not self.count:
             self._device, self.first_ns = device, int(batch.t_ns[0])
         self.count += len(batch)
         self.last_ns = int(batch.t_ns[-1])
-        self._waiting.append(table)
+        self._in_memory.append(table)
         self._bytes += table.nbytes
 
     def spill_if_large(self) -> None:
-        """Move added samples from memory to disk once they are many. Raises `StorageError` for a full disk."""
+        """Move samples from memory to disk if they exceed `PIECE_BYTES`. Raises `StorageError` if the disk is full."""
         if self._bytes > PIECE_BYTES:
-            self._spill_waiting()
+            self._spill_tables()
 
     def uncertain(self, stamping: Stamping) -> int:
-        """Return the number of samples that may be stamped late."""
+        """Return the number of samples whose timestamp may be late."""
         uncertain_ns = (stamping.uncertain_ns(table.column(0).to_numpy()) for table in self._tables())
         return sum(int((late_ns != 0).sum()) for late_ns in uncertain_ns)
 
     def batches(self, stamping: Stamping, *, uncertain: bool) -> pa.RecordBatchReader:
-        """Return the samples with their stamps in batches, with a column of how late these may be if ``uncertain``."""
+        """Return the samples with UTC timestamps in batches. If ``uncertain``, a column has their possible delays."""
         import pyarrow as pa
 
         from tacpipe.channels import schema
@@ -101,39 +101,39 @@ class Decoded:
 
         return pa.RecordBatchReader.from_batches(full_schema, stamped_batches())
 
-    def _spill_waiting(self) -> None:
+    def _spill_tables(self) -> None:
         import pyarrow as pa
 
-        if self._waiting:
-            self._pieces.append(self._spill.add(pa.concat_tables(self._waiting).combine_chunks()))
-            self._waiting, self._bytes = [], 0
+        if self._in_memory:
+            self._pieces.append(self._spill.add(pa.concat_tables(self._in_memory).combine_chunks()))
+            self._in_memory, self._bytes = [], 0
 
     def _tables(self) -> Iterator[pa.Table]:
-        self._spill_waiting()
+        self._spill_tables()
         for piece in self._pieces:
             yield self._spill.read(piece)
 
 
-END_S = 0.5  # a stream may end this much before the others without an event
+END_S = 0.5  # a stream that ends up to this time before the others gets no event
 UNDECODED = "undecoded"  # bytes that the driver could not decode
-CRASH = "crash"  # bytes that a process had read and not yet written when it ended
-IN_MEMORY = 1 << 24  # size of decoded samples that are kept in memory
-MOST_BYTES = 2 << 20  # size of chunks that are decoded together
+CRASH = "crash"  # bytes that a process had read but not written when it ended
+MEMORY_BYTES = 1 << 24  # size of decoded samples above which they move to disk
+BATCH_BYTES = 2 << 20  # bytes that are decoded together
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """One stream of a spool, and the account of its bytes."""
+    """One decoded stream of a spool, and the account of its bytes."""
 
     rows: int
-    batches: Callable[[], pa.RecordBatchReader]  # returns the samples in batches
-    span_ns: tuple[int, int] | None  # stamps of the first and the last sample, None without samples
+    batches: Callable[[], pa.RecordBatchReader]  # returns the samples
+    span_ns: tuple[int, int] | None  # timestamps of the first and the last sample; None without samples
     events: list[StreamFault]
-    lost: int  # number of lost frames, by counter where there is one
+    lost: int  # number of lost frames, by the counter if the device has one
     received: int = 0  # number of bytes
     undecoded: int = 0  # number of bytes that the driver could not decode
-    crashed: tuple[int, int] = (0, 0)  # numbers of chunks and bytes that were read and never spooled
-    uncertain: int = 0  # number of samples that waited while this program was delayed
+    crashed: tuple[int, int] = (0, 0)  # numbers of chunks and bytes that were read but never spooled
+    uncertain: int = 0  # number of samples whose timestamp may be late because this program was delayed
 
     @property
     def table(self) -> pa.Table:
@@ -142,28 +142,28 @@ class Sealed:
 
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
-    """Return every stream of a spool by name."""
+    """Return the decoded streams of a spool by name."""
     from tacpipe.io.spill import Spill
 
     end_ns = max((tally.last_ns for tally in spooled.tallied().values()), default=0)
-    spill = Spill(IN_MEMORY)
+    spill = Spill(MEMORY_BYTES)
     return {name: stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
 
 
 def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill | None = None) -> Sealed:
-    """Return one stream of a spool with ``t_ns`` in UTC, the device's time and counters, and the channels.
+    """Return one decoded stream of a spool with ``t_ns`` in UTC, the device's time and counters, and the channels.
 
-    ``end_ns`` is the arrival of the last byte of any stream: a stream that was silent long before gets an event. Samples are
-    moved to ``spill``, or to a new one, for as long as the result is used.
+    ``end_ns`` is the arrival of the last byte of any stream: a stream that ended long before gets an event. Samples are
+    moved to ``spill``, or to a new one, which lives as long as the result.
     """
     from tacpipe.io.spill import Spill
 
     sensor = rig.streams[name].sensor
-    decoded, stalls = Decoded(sensor.fields(), spill or Spill(IN_MEMORY)), Stalls()
-    read = _read(_gathered(spooled, name), sensor, decoded, stalls)
+    decoded, stalls = Decoded(sensor.fields(), spill or Spill(MEMORY_BYTES)), Stalls()
+    read = _read(_joined_blocks(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
     events = read.events + _silent_end(sensor, last_ns, end_ns)
-    crashed = _crashed(spooled, name, read.chunks, read.bytes)
+    crashed = _unspooled(spooled, name, read.chunks, read.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         events.append(StreamFault(last_ns, CRASH, bytes=crashed[1], detail=detail))
@@ -194,82 +194,82 @@ class _Read:
 
 
 def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
-    """Decode the blocks of a stream: add samples to ``decoded``, delays of the program to ``stalls``."""
-    account, reading = _Read(), LinkReader(sensor)
+    """Decode the blocks of a stream. Samples are added to ``decoded``, delays of the program to ``stalls``."""
+    account, reader = _Read(), LinkReader(sensor)
 
     def add(batch: Batch) -> None:
         account.events.extend(batch.events)
         decoded.add(batch)
 
-    away = False
+    was_lost = False
     for block in blocks:
         if isinstance(block, StreamNote):
-            away |= block.what == LOST
+            was_lost |= block.what == LOST
             if block.what == LOST:
-                add(reading.broken())
+                add(reader.end_link())
             if block.what in (STALLED, CAUGHT_UP):
-                stall = stalls.take(block)
+                stall = stalls.add(block)
                 account.events += [] if stall is None else [stall]
-            elif block.what != OPENED or away:  # opening before the recording is not an event
+            elif block.what != OPENED or was_lost:  # opening before the recording is not an event
                 account.events.append(_event_of(block, sensor))
             continue
         account.chunks += len(block.size)
         account.bytes += len(block.data)
         try:
-            add(reading.feed(block))
+            add(reader.feed(block))
         except Exception as error:  # a driver's error does not stop the other streams and blocks
             account.undecoded += len(block.data)
             reason = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
             account.events.append(StreamFault(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
-            reading = LinkReader(sensor)
+            reader = LinkReader(sensor)
         decoded.spill_if_large()
-    add(reading.finish())
+    add(reader.finish())
     return account
 
 
-def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
-    """Return the numbers of chunks and bytes of a stream that were read and not spooled."""
+def _unspooled(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
+    """Return the numbers of chunks and bytes of a stream that were read but not spooled."""
     tallied = spooled.tallied().get(name)
     return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
 
 
 def _event_of(note: StreamNote, sensor: Sensor) -> StreamFault:
-    """Return the event of a note. Packets that this computer dropped count as lost where no counter states them."""
+    """Return the event of a note. Packets that this computer dropped count as lost if the device has no counter."""
     dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
     return StreamFault(note.t_ns, note.what, dropped, detail=note.detail)
 
 
 def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[StreamFault]:
-    """Return the event of a stream that fell silent well before the end, which no counter reports."""
-    apart_s = (end_ns - last_ns) / 1e9
-    if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
+    """Return the event of a stream that ended well before the recording, which no counter shows; otherwise nothing."""
+    silent_s = (end_ns - last_ns) / 1e9
+    if not sensor.awaited or silent_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
         return []
     return [
         StreamFault(
-            end_ns, SILENT, round(apart_s * sensor.rate_hz), detail=f"{apart_s:.1f} s, up to the end, by the clock"
+            end_ns, SILENT, round(silent_s * sensor.rate_hz), detail=f"{silent_s:.1f} s, up to the end, by the clock"
         )
     ]
 
 
-def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | StreamNote]:
-    """Yield the blocks of a stream, with chunks joined to blocks that are large enough to decode."""
-    waiting: list[Chunks] = []
+def _joined_blocks(spooled: Spooled, name: str) -> Iterator[Chunks | StreamNote]:
+    """Yield the blocks of a stream, with small chunks joined to larger ones, which decode faster."""
+    pending: list[Chunks] = []
     for _, block in spooled.blocks(name):
         if isinstance(block, Chunks):
-            waiting.append(block)
-            if sum(len(chunks.data) for chunks in waiting) < MOST_BYTES and len(waiting) < 512:
+            pending.append(block)
+            if sum(len(chunks.data) for chunks in pending) < BATCH_BYTES and len(pending) < 512:
                 continue
-        if waiting:
-            yield Chunks.joined(waiting)
-            waiting = []
+        if pending:
+            yield Chunks.concatenate(pending)
+            pending = []
         if isinstance(block, StreamNote):
             yield block
-    if waiting:
-        yield Chunks.joined(waiting)
+    if pending:
+        yield Chunks.concatenate(pending)
 
 
 def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[StreamFault, str]]:
-    """Return the event of a recording that was not completed, with its duration, or nothing."""
+    """Return the event of a recording that was not completed, with its duration; otherwise nothing."""
     spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     if spooled.ended == COMPLETED or not spans_ns:
         return []
@@ -282,7 +282,7 @@ def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Strea
 
 
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
-    """Return the table of the events of all streams, in the order of time."""
+    """Return the table of the events of all streams, sorted by time."""
     import pyarrow as pa
 
     from tacpipe.channels import schema

@@ -1,15 +1,15 @@
-"""Write and read a spool: the bytes of a rig's links in a file that is only ever appended to.
+"""Write and read a spool: the bytes of a rig's links in an append-only file.
 
-The folder of a recording in the store has
+The folder of a spool contains
 
 - ``header.json``: the output and the name of the recording, and the UTC time of one reading of the monotonic clock;
-- ``bytes``: blocks, each with a mark, a check sum, and the chunks of one stream with their arrivals, or a note on a stream
-  or on the recording, such as how it ended;
-- ``tally``: how much every stream has received, in memory shared with the disk cache. It states the bytes that a killed
-  process had read and not yet written.
+- ``bytes``: blocks, each with a mark, a checksum, and either the chunks of one stream with their arrival times, or a note on
+  a stream or on the recording, such as how it ended;
+- ``tally``: the totals that each stream has received, in a memory-mapped file. It shows how many bytes a killed process had
+  read but not written.
 
-Written bytes survive the end of the process; synced bytes survive a loss of power. Reading resumes at the next mark after a
-torn or damaged block.
+Written bytes survive the end of the process; synced bytes survive a power failure. Reading resumes at the next mark after an
+incomplete or damaged block.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
 MARK = b"tacB"
-HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
+HEAD = struct.Struct("<4sIBBHII")  # mark, checksum of the remaining block, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
-WHOLE = 255  # stream number of a note on the recording, whose stream is ""
+WHOLE = 255  # stream number of a note on the whole recording; its stream name is ""
 
 
 @dataclass(frozen=True)
 class StreamNote:
-    """An event of a stream, such as a link that opened or was lost. ``what`` names it."""
+    """An event of a stream, such as a link that opened or was lost. ``what`` is the kind of event."""
 
     t_ns: int
     stream: str
@@ -66,40 +66,40 @@ class StreamNote:
 
 
 def pack_block(kind: int, stream: int, count: int, body: bytes) -> bytes:
-    """Return a block with ``body``, which has ``count`` chunks of the stream of this number."""
+    """Return a block with ``body``, which contains ``count`` chunks of the stream with number ``stream``."""
     covered = HEAD.pack(MARK, 0, kind, stream, 0, count, len(body))[8:]
     return MARK + struct.pack("<I", zlib.crc32(body, zlib.crc32(covered))) + covered + body
 
 
-def find_end(content: mmap.mmap, place: int) -> int | None:
-    """Return where the block at ``place`` ends, or None if no complete and undamaged block starts there."""
-    if place + HEAD.size > len(content) or content[place : place + 4] != MARK:
+def find_end(content: mmap.mmap, start: int) -> int | None:
+    """Return the end of the block at offset ``start``, or None if no complete and undamaged block starts there."""
+    if start + HEAD.size > len(content) or content[start : start + 4] != MARK:
         return None
-    _, check, _, _, _, _, size = HEAD.unpack_from(content, place)
-    stop = place + HEAD.size + int(size)
+    _, check, _, _, _, _, size = HEAD.unpack_from(content, start)
+    stop = start + HEAD.size + int(size)
     if stop > len(content):
         return None
-    with memoryview(content) as view, view[place + 8 : stop] as covered:
+    with memoryview(content) as view, view[start + 8 : stop] as covered:
         return stop if zlib.crc32(covered) == check else None
 
 
-def find_next(handle: int, content: mmap.mmap, place: int) -> int:
-    """Return the next place after ``place`` where a block may begin. Holes of the file are skipped unread."""
+def find_next(handle: int, content: mmap.mmap, offset: int) -> int:
+    """Return the next offset after ``offset`` at which a block may start. Holes of the file are skipped."""
     try:
-        data = os.lseek(handle, place, os.SEEK_DATA)
-        if data > place:
+        data = os.lseek(handle, offset, os.SEEK_DATA)
+        if data > offset:
             return min(data, len(content))
-        stop = min(os.lseek(handle, place, os.SEEK_HOLE), len(content))
+        stop = min(os.lseek(handle, offset, os.SEEK_HOLE), len(content))
     except OSError as error:
-        if error.errno == errno.ENXIO:  # nothing follows but a hole
+        if error.errno == errno.ENXIO:  # only a hole follows
             return len(content)
         stop = len(content)  # the file system reports no holes
-    mark = content.find(MARK, place + 1, stop)
+    mark = content.find(MARK, offset + 1, stop)
     return stop if mark < 0 else mark
 
 
 def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | StreamNote | None:
-    """Return the content of a block, or None where its check sum is right but another program wrote it."""
+    """Return the content of a block, or None if it is invalid although its checksum is right."""
     try:
         if kind == NOTE:
             entry = json.loads(body)
@@ -114,22 +114,22 @@ def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | St
 
 
 ENDED = "ended"  # a note on the whole recording
-TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
-RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice after a full disk
+TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival in ns
+RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice if the disk is full
 
 
 def read_clocks() -> ClockReading:
-    """Return one reading of the monotonic clock and the UTC time then, both in ns: the tightest of five tries."""
-    tries = []
+    """Return the time of the monotonic clock and of UTC at one instant, in ns. The quickest of five readings is used."""
+    readings = []
     for _ in range(5):
         before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        tries.append((after_ns - before_ns, (before_ns + after_ns) // 2, utc_ns))
-    _, monotonic_ns, utc_ns = min(tries)
+        readings.append((after_ns - before_ns, (before_ns + after_ns) // 2, utc_ns))
+    _, monotonic_ns, utc_ns = min(readings)
     return {"monotonic_ns": monotonic_ns, "utc_ns": utc_ns}
 
 
 class Spool:
-    """A spool that is being written. One thread appends; the threads that read links `tally` their streams."""
+    """A spool that is being written. One thread appends; the threads that read links call `tally` for their streams."""
 
     def __init__(self, store: Path, header: RecordingHeader, streams: Sequence[str]) -> None:
         self.folder = store / FOLDER / uuid.uuid4().hex
@@ -141,37 +141,37 @@ class Spool:
             self.folder.mkdir(mode=0o700)
             entry: SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-            fcntl.flock(self._file, fcntl.LOCK_EX)  # until the process ends, so that no process recovers it meanwhile
+            fcntl.flock(self._file, fcntl.LOCK_EX)  # no other process recovers a locked spool
             self._tally = _tally(self.folder, len(streams))
             content = json.dumps(entry, sort_keys=True).encode()
             write_whole(str(self.folder / "header.json"), content, str(self.folder / ".header.json"))
             for folder in (self.folder, self.folder.parent):
                 sync_folder(str(folder))
-        self._waiting: list[bytes] = []
-        self.failed: OSError | None = None  # error of a sync, which the disk reports only once
+        self._pending: list[bytes] = []
+        self.failed: OSError | None = None  # error of a sync, which the operating system reports only once
 
     def tally(self, stream: int, chunks: int, size: int, last_ns: int) -> None:
-        """Note how much a stream has received in total, before it is appended."""
+        """Store the totals that a stream has received. Call it before the bytes are appended."""
         TALLY.pack_into(self._tally, stream * TALLY.size, chunks, size, last_ns)
 
     def append(self, stream: str, chunks: Chunks) -> None:
-        """Add bytes of a link. The next `write` hands them to the operating system."""
+        """Queue bytes of a link for the next `write`."""
         if len(chunks.size):
             body = chunks.t_ns.astype("<i8").tobytes() + chunks.size.astype("<u4").tobytes() + chunks.data
-            self._waiting.append(pack_block(CHUNKS, self.streams[stream], len(chunks.size), body))
+            self._pending.append(pack_block(CHUNKS, self.streams[stream], len(chunks.size), body))
 
     def note(self, note: StreamNote) -> None:
-        """Add a note."""
+        """Queue a note for the next `write`."""
         body = json.dumps({"t_ns": note.t_ns, "what": note.what, "detail": note.detail}).encode()
-        self._waiting.append(pack_block(NOTE, self.streams[note.stream] if note.stream else WHOLE, 0, body))
+        self._pending.append(pack_block(NOTE, self.streams[note.stream] if note.stream else WHOLE, 0, body))
 
     def write(self) -> None:
-        """Hand all added blocks to the operating system, so that they survive this process.
+        """Write all queued blocks to the file, so that they survive this process.
 
-        Raises `TacpipeError` when the disk accepts no more bytes.
+        Raises `TacpipeError` if a write or an earlier sync fails.
         """
-        remaining = memoryview(b"".join(self._waiting))
-        self._waiting = []
+        remaining = memoryview(b"".join(self._pending))
+        self._pending = []
         try:
             if self.failed is not None:
                 raise self.failed
@@ -184,14 +184,14 @@ class Spool:
             ) from error
 
     def sync(self) -> None:
-        """Sync the written bytes to the disk. The next `write` reports a failed disk."""
+        """Sync the written bytes to the disk. If that fails, the next `write` raises the error."""
         try:
             os.fdatasync(self._file)
         except OSError as error:
             self.failed = error
 
     def finish(self) -> None:
-        """Write and sync the remaining blocks. No process recovers the spool until `close`. Raises as `write`."""
+        """Write and sync the remaining blocks. The spool stays locked until `close`. Raises `TacpipeError` like `write`."""
         self.write()
         self.sync()
         self.write()
@@ -211,21 +211,21 @@ class Spool:
 def _tally(folder: Path, streams: int) -> mmap.mmap:
     handle = os.open(folder / "tally", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
     try:
-        # A process that writes into a hole of a mapped file is killed where the disk is full.
+        # Allocate the file first: a write into a hole of a mapped file kills the process if the disk is full.
         os.posix_fallocate(handle, 0, max(1, streams) * TALLY.size)
         return mmap.mmap(handle, max(1, streams) * TALLY.size)
     finally:
         os.close(handle)
 
 
-KEPT = layout.KEPT  # folder of the store
-PASSED_BYTES = 1 << 23  # release mapped memory in such steps, a multiple of the page size
-HEADER_BYTES = 16 << 20  # limit of the header's size
+KEPT = layout.KEPT  # folder of the store for retained spools
+RELEASE_BYTES = 1 << 23  # mapped memory is released in steps of this size, a multiple of the page size
+MAX_HEADER_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a spool that are no block: torn off by a crash at its end, damaged by the disk elsewhere."""
+    """Bytes of a spool outside of any valid block: cut off by a crash at the end, or damaged by the disk elsewhere."""
 
     offset: int
     bytes: int
@@ -233,7 +233,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Tallied:
-    """The total that a stream had received when the process ended, spooled or not."""
+    """The totals that a stream had received when the process ended, including bytes that were not spooled."""
 
     chunks: int
     bytes: int
@@ -241,27 +241,27 @@ class Tallied:
 
 
 class Spooled:
-    """The spool of a recording that has ended, or whose process has.
+    """The spool of a recording that has ended, or whose process has ended.
 
-    ``owners`` are the user ids that its files may have; None: any. Raises `TacpipeError` for a spool without a header.
+    ``owners`` are the user ids that its files may have; None accepts any. Raises `TacpipeError` if it has no valid header.
     """
 
     def __init__(self, folder: Path, owners: frozenset[int] | None = None) -> None:
         self.folder, self._owners = folder, owners
         try:
             with self._open("header.json") as file:
-                content = file.read(HEADER_BYTES + 1)
-            if len(content) > HEADER_BYTES:
-                raise ValueError(f"it has more than {HEADER_BYTES:,} bytes")
+                content = file.read(MAX_HEADER_BYTES + 1)
+            if len(content) > MAX_HEADER_BYTES:
+                raise ValueError(f"it has more than {MAX_HEADER_BYTES:,} bytes")
             self.header: SpoolHeader = json.loads(content)
             self.streams: list[str] = [str(name) for name in self.header["streams"]]
         except FileNotFoundError:
             raise TacpipeError(
-                f"The spool {folder} has no header: its process ended before it recorded anything."
+                f"The spool {folder} has no header: its process ended before the recording started."
             ) from None
         except (OSError, ValueError, LookupError, TypeError, RecursionError, OverflowError) as error:
             raise TacpipeError(
-                f"The spool {folder} has no readable header ({error}): its recording ended before it began. "
+                f"The spool {folder} has no readable header ({error}): its process ended before the recording started. "
                 f"Remove the folder."
             ) from error
         self.damage: list[Damage] = []
@@ -269,14 +269,14 @@ class Spooled:
 
     @property
     def ended(self) -> str:
-        """How the recording ended, by the blocks that were read. Without a note of its end it was recovered."""
+        """How the recording ended, from the notes that `blocks` has read. Without such a note it was recovered."""
         entry = next((note.detail for note in self._notes if note.what == ENDED), "")
         return entry if entry in (COMPLETED, INTERRUPTED) else RECOVERED
 
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | StreamNote]]:
-        """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
+        """Yield the chunks and notes of one stream, or of all streams, in the order in which they were appended.
 
-        Bytes that are no block are skipped and noted in ``damage``. Notes on the recording are collected for `ended`.
+        Bytes outside of valid blocks are skipped and added to ``damage``. Notes on the recording are collected for `ended`.
         """
         requested = None if stream is None else self.streams.index(stream)
         self.damage, self._notes = [], []
@@ -285,29 +285,29 @@ class Spooled:
             if not os.fstat(file.fileno()).st_size:
                 return
             content = opened.enter_context(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-            place = passed = 0
-            while place < len(content):
-                if place - passed >= PASSED_BYTES:  # spools are larger than memory, so release what was read
-                    content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
-                    passed += PASSED_BYTES
-                stop = find_end(content, place)
+            start = released = 0
+            while start < len(content):
+                if start - released >= RELEASE_BYTES:  # spools can be larger than memory
+                    content.madvise(mmap.MADV_DONTNEED, released, RELEASE_BYTES)
+                    released += RELEASE_BYTES
+                stop = find_end(content, start)
                 if stop is None:
-                    next_place = find_next(file.fileno(), content, place)
-                    self._add_damage(place, next_place - place)
-                    place = next_place
+                    next_start = find_next(file.fileno(), content, start)
+                    self._add_damage(start, next_start - start)
+                    start = next_start
                     continue
-                _, _, kind, number, _, count, size = HEAD.unpack_from(content, place)
+                _, _, kind, number, _, count, size = HEAD.unpack_from(content, start)
                 if (requested is None or number == requested) and number < len(self.streams):
-                    body = content[place + HEAD.size : place + HEAD.size + size]
+                    body = content[start + HEAD.size : start + HEAD.size + size]
                     entry = unpack_block(kind, self.streams[number], count, body)
                     if entry is None:
-                        self._add_damage(place, stop - place)
+                        self._add_damage(start, stop - start)
                     else:
                         yield self.streams[number], entry
                 elif number == WHOLE:
-                    entry = unpack_block(kind, "", count, content[place + HEAD.size : place + HEAD.size + size])
+                    entry = unpack_block(kind, "", count, content[start + HEAD.size : start + HEAD.size + size])
                     self._notes += [entry] if isinstance(entry, StreamNote) else []
-                place = stop
+                start = stop
 
     def _add_damage(self, offset: int, size: int) -> None:
         last = self.damage[-1] if self.damage else None
@@ -317,25 +317,25 @@ class Spooled:
             self.damage.append(Damage(offset, size))
 
     def tallied(self) -> dict[str, Tallied]:
-        """Return the total that each stream had received."""
+        """Return the totals that each stream had received; empty if the tally is missing or too short."""
         try:
             with self._open("tally") as file:
                 content = file.read(len(self.streams) * TALLY.size)
             return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
-        except (FileNotFoundError, struct.error):  # other errors are raised, so that losses are not forgotten
+        except (FileNotFoundError, struct.error):  # other errors are raised, so that no loss is hidden
             return {}
 
     def utc_ns(self, t_ns: Any) -> Any:
-        """Return UTC time in ns for stamps of the monotonic clock."""
+        """Convert times of the monotonic clock to UTC, in ns."""
         clock = self.header["clock"]
         return t_ns + (clock["utc_ns"] - clock["monotonic_ns"])
 
     def remove(self) -> None:
-        """Remove the spool after its content is sealed."""
+        """Remove the spool. Call it after its content is sealed."""
         spool_folders.remove(self.folder)
 
     def keep(self) -> Path:
-        """Move the sealed spool to a folder where no command looks for spools, and return its new path."""
+        """Move the sealed spool to the store's folder of retained spools, and return its new path."""
         target = self.folder.parent.parent / KEPT
         with readable_errors(target.parent):
             target.mkdir(mode=0o777, exist_ok=True)
@@ -347,20 +347,21 @@ class Spooled:
         return target / self.folder.name
 
     def _open(self, name: str) -> io.FileIO:
-        """Open one of its files. Raises `TacpipeError` for a file of another user or one that is not regular."""
+        """Open a file of the spool. Raises `TacpipeError` if it belongs to another user or is not a regular file."""
         path = self.folder / name
         try:
             file = io.FileIO(path, opener=lambda name, _: os.open(name, spool_folders.READ))
         except OSError as error:
             if error.errno == errno.ELOOP:
-                raise TacpipeError(f"{path} is a symbolic link, and no spool holds one. Remove it.") from None
+                raise TacpipeError(f"{path} is a symbolic link, which a spool never contains. Remove it.") from None
             raise
         try:
             status = os.fstat(file.fileno())
             regular.require(path, status.st_mode)
             if self._owners is not None and status.st_uid not in self._owners:
                 raise TacpipeError(
-                    f"{path} belongs to another user ({spool_folders.user(status.st_uid)}). Only this user can seal it."
+                    f"{path} belongs to another user ({spool_folders.user_name(status.st_uid)}). Only this user can "
+                    f"seal it."
                 )
         except BaseException:
             file.close()

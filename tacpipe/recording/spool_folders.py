@@ -1,4 +1,4 @@
-"""Find the spools of a store, their owners and those without a writer, and remove spools.
+"""Find the spools of a store, their owners and the abandoned ones, check their headers, and remove spools.
 
 A store may be shared. A spool belongs to its user: others cannot open its folder, and a command seals or removes only spools
 of the user who runs it. No symbolic link is followed.
@@ -30,43 +30,45 @@ from tacpipe.store.layout import BESIDE_NAME
 from tacpipe.store.store import Store
 
 FOLDER = layout.SPOOL  # folder of the store
-YOUNG_S = 60.0  # a younger spool without a header may just be starting
+STARTUP_S = 60.0  # a younger spool without a header may belong to a process that is starting
 NAME = re.compile(r"[0-9a-f]{32}")  # name of a spool's folder
-FILES = ("header.json", ".header.json", "tally", "bytes")  # order of removal: a spool without header is not sealed
-READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
+FILES = ("header.json", ".header.json", "tally", "bytes")  # in order of removal: a spool without header is not sealed
+READ = (
+    os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+)  # opening a pipe without writers would otherwise block
 
 
-def users(place: Path, existing: Iterable[int]) -> frozenset[int]:
-    """Return the user ids that files of this process have in a folder whose files have the ids ``existing``.
+def own_user_ids(folder: Path, existing: Iterable[int]) -> frozenset[int]:
+    """Return the user ids of files that this process creates in a folder. ``existing`` are the ids of its files.
 
-    A network file system may give files another id than that of the process, so a file is created where ids differ.
+    A network file system may map the process's id to another, so a temporary file is created if the ids differ.
     """
     ids = {os.geteuid()}
     if not ids.issuperset(existing):
-        with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=place) as file:
+        with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
             ids.add(os.fstat(file.fileno()).st_uid)
     return frozenset(ids)
 
 
-def user(number: int) -> str:
-    """Return the name of a user, or the number of a user without name."""
+def user_name(user_id: int) -> str:
+    """Return the name of a user, or the id of a user without a name."""
     try:
-        return pwd.getpwuid(number).pw_name
+        return pwd.getpwuid(user_id).pw_name
     except (KeyError, OverflowError):
-        return str(number)
+        return str(user_id)
 
 
 def refuse_link(store: Path) -> None:
-    """Raise `TacpipeError` where a store's folder of spools is a symbolic link, which may lead to another user's files."""
+    """Raise `TacpipeError` if a store's folder of spools is a symbolic link, which may lead to another user's files."""
     if (store / FOLDER).is_symlink():
         raise TacpipeError(
-            f"{store / FOLDER} is a symbolic link. Remove it; to record to another disk, name a store there in "
-            f"TACPIPE_STORE."
+            f"{store / FOLDER} is a symbolic link. Remove it. To record to another disk, set TACPIPE_STORE to a "
+            f"store on it."
         )
 
 
 def owners(store: Path) -> dict[Path, int]:
-    """Return the folders of all spools, and the user id of each. Raises `TacpipeError` as `refuse_link`."""
+    """Return the user id of each spool by its folder. Raises `TacpipeError` if the folder of spools is a link."""
     refuse_link(store)
     owner_ids = {}
     for folder in listed(store / FOLDER):
@@ -80,17 +82,17 @@ def owners(store: Path) -> dict[Path, int]:
 def abandoned(store: Path) -> list[Path]:
     """Return the folders of this user's spools that no process writes or seals, oldest first."""
     folders = []
-    everybodys = owners(store)
-    ids = users(store / FOLDER, everybodys.values())
-    for folder in [folder for folder, owner in everybodys.items() if owner in ids]:
+    owner_ids = owners(store)
+    own_ids = own_user_ids(store / FOLDER, owner_ids.values())
+    for folder in [folder for folder, owner in owner_ids.items() if owner in own_ids]:
         try:
-            with locked(folder) as ours:
-                age_s = time.time() - (folder / "bytes" if ours else folder).stat().st_mtime
-                if ours and (folder / "header.json").exists():
+            with locked(folder) as is_locked:
+                age_s = time.time() - (folder / "bytes" if is_locked else folder).stat().st_mtime
+                if is_locked and (folder / "header.json").exists():
                     folders.append((-age_s, folder))
-                elif ours and age_s > YOUNG_S:  # its process ended before the recording or after sealing
+                elif is_locked and age_s > STARTUP_S:  # its process ended before the recording started or after sealing
                     remove(folder)
-            if not ours and age_s > YOUNG_S:
+            if not is_locked and age_s > STARTUP_S:
                 folder.rmdir()  # fails for a folder that is not empty
         except (FileNotFoundError, NotADirectoryError):
             continue
@@ -102,7 +104,7 @@ def abandoned(store: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[bool]:
-    """Lock a spool in the block. Yield False if it is gone, or if a process writes or seals it."""
+    """Lock a spool in the block. Yields False if it does not exist, or if another process writes or seals it."""
     try:
         handle = os.open(folder / "bytes", READ)
     except FileNotFoundError:
@@ -111,16 +113,16 @@ def locked(folder: Path) -> Iterator[bool]:
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            ours = os.fstat(handle).st_nlink > 0
+            is_locked = os.fstat(handle).st_nlink > 0
         except BlockingIOError:
-            ours = False
-        yield ours
+            is_locked = False
+        yield is_locked
     finally:
         os.close(handle)
 
 
 def remove(folder: Path) -> None:
-    """Remove the files of a spool, and its folder where it has no other file."""
+    """Remove the files of a spool, and its folder unless it contains other files."""
     with contextlib.suppress(FileNotFoundError):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
@@ -134,23 +136,23 @@ def remove(folder: Path) -> None:
 
 
 FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files next to the recordings
-MOST_NS = 1 << 62  # limit of clock readings
+MAX_CLOCK_NS = 1 << 62
 
 
 def output_path(store: Store, dataset: Path) -> str:
     """Return the path of a dataset for a header: relative to the store's project, so that both can be moved.
 
-    The path is absolute outside of that project, and where the store is not in a project.
+    The path is absolute if the dataset is outside of that project, or the store is not in a project.
     """
-    path, project = Path(os.path.abspath(dataset)), _project(store)  # noqa: PTH100  (without following links)
+    path, project = Path(os.path.abspath(dataset)), _project(store)  # noqa: PTH100  (links are not followed)
     return str(path.relative_to(project) if project is not None and path.is_relative_to(project) else path)
 
 
 def destination(header: SpoolHeader, store: Store, opened: Path | None) -> Path:
     """Return the dataset to which a spool is appended.
 
-    It must be the output of this command (``opened``), or lie in the project of the store or of the current folder without
-    a link that leads out of it. Raises `TacpipeError` for any other.
+    Raises `TacpipeError` unless it is the output of this command (``opened``), or in the project of the store or of the
+    current folder. Links that lead out of the project are refused.
     """
     output = header.get("output")
     if isinstance(output, str) and output and "\0" not in output:
@@ -192,26 +194,28 @@ class SpoolHeader(RecordingHeader):
 
 
 def check_header(header: SpoolHeader, streams: Iterable[str]) -> None:
-    """Raise `TacpipeError` for a header that no dataset can represent. ``streams`` are those of its rig file."""
+    """Raise `TacpipeError` if a header has invalid values. ``streams`` are the streams of its rig file."""
     name, attributes, clock = header.get("recording"), header.get("attributes"), header.get("clock")
     if not isinstance(name, str) or not is_name(name):
-        raise TacpipeError(f"Its recording is called {excerpt(name)}, and no file can have that name.")
+        raise TacpipeError(f"Its recording is named {excerpt(name)}, which is not a valid name of a folder.")
     if header.get("streams") != list(streams):
-        raise TacpipeError(f"Its streams are {excerpt(header.get('streams'))}, and its rig file has others.")
+        raise TacpipeError(f"Its streams are {excerpt(header.get('streams'))}; they differ from those in its rig file.")
     if not isinstance(attributes, dict) or not all(_is_attribute(value) for value in attributes.values()):
         raise TacpipeError(
             f"Its attributes are {excerpt(attributes)}; each must be text, a finite number, true or false."
         )
-    duration_s = header.get("duration_s")  # older spools have none
+    duration_s = header.get("duration_s")  # missing in older spools
     if not (duration_s is None or (isinstance(duration_s, int | float) and _is_attribute(duration_s))):
         raise TacpipeError(f"Its duration is {excerpt(duration_s)}; it must be a number of seconds.")
     readings = [clock.get(key) for key in ("monotonic_ns", "utc_ns")] if isinstance(clock, dict) else [None]
-    if not all(type(reading) is int and abs(reading) < MOST_NS for reading in readings):
-        raise TacpipeError(f"Its clock is {excerpt(clock)}; it must hold monotonic_ns and utc_ns, whole nanoseconds.")
+    if not all(type(reading) is int and abs(reading) < MAX_CLOCK_NS for reading in readings):
+        raise TacpipeError(
+            f"Its clock is {excerpt(clock)}; it must have monotonic_ns and utc_ns, in whole nanoseconds."
+        )
 
 
 def is_name(name: str) -> bool:
-    """Return whether a recording can have this name: a valid folder name that no file of the dataset has.
+    """Return whether a recording can have this name: a valid folder name that no file of a dataset uses.
 
     >>> [is_name(name) for name in ("press-001", "木", "a/b", "../a", ".a", "manifest.json", "rig-0123abcd.toml")]
     [True, True, False, False, False, False, False]
@@ -224,13 +228,13 @@ def _is_attribute(value: object) -> bool:
 
 
 def _project(store: Store) -> Path | None:
-    """Return the project that a store belongs to, or None for a store that TACPIPE_STORE names."""
+    """Return the project of a store, or None for a store outside of projects."""
     root = Path(os.path.abspath(store.root))  # noqa: PTH100
     return root.parent if root.name == BESIDE_NAME else None
 
 
 def _projects(store: Store) -> list[Path]:
-    """Return the projects that may contain a spool's dataset. Relative paths start at the first."""
+    """Return the projects that may contain a spool's dataset. Relative paths are resolved against the first."""
     project, current = _project(store), location.project()
     return [current] if project is None or project == current else [project, current]
 
@@ -244,10 +248,10 @@ def _is_in_project(path: Path, project: Path) -> bool:
 COMPLETED, INTERRUPTED, RECOVERED = "completed", "interrupted", "recovered"  # values of the attribute `ended`
 REASONS = {
     INTERRUPTED: "interrupted before its end",
-    RECOVERED: "recovered after a crash or a loss of power",
+    RECOVERED: "recovered after a crash or a power failure",
 }
-MOST = 20  # lines
-UNCERTAIN = "_uncertain_samples"
+MAX_LINES = 20
+UNCERTAIN = "_uncertain_samples"  # suffix of attributes
 
 
 class StreamDuration(TypedDict, total=False):
@@ -259,7 +263,7 @@ class StreamDuration(TypedDict, total=False):
 def describe_incomplete(
     attributes: Mapping[str, Mapping[str, Attribute]], recordings: Mapping[str, Mapping[str, StreamDuration]]
 ) -> list[str]:
-    """Return one line per recording that was cut off, and one per recording with uncertain arrivals.
+    """Return one line per incomplete recording, and one per recording with uncertain arrival times.
 
     ``attributes`` has the attributes of each recording, ``recordings`` the figures of its streams.
     """
@@ -278,5 +282,5 @@ def describe_incomplete(
             described = ", ".join(
                 f"{count} samples of {plain(key.removesuffix(UNCERTAIN))}" for key, count in late.items()
             )
-            lines.append(f"recorder held up: {plain(name)}: the arrival of {described} is uncertain")
-    return lines[:MOST] + ([f"… and {len(lines) - MOST} more"] if len(lines) > MOST else [])
+            lines.append(f"recorder delayed: {plain(name)}: the arrival time of {described} is uncertain")
+    return lines[:MAX_LINES] + ([f"… and {len(lines) - MAX_LINES} more"] if len(lines) > MAX_LINES else [])

@@ -21,7 +21,7 @@ from tacpipe.recording.appending import NothingError
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import ENDED, Spool, Spooled, StreamNote
-from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, RecordingHeader, users
+from tacpipe.recording.spool_folders import COMPLETED, INTERRUPTED, RecordingHeader, own_user_ids
 from tacpipe.recording.watch import RigView
 from tacpipe.store.store import Store
 
@@ -30,7 +30,7 @@ NAME = re.compile(r"[\w-][\w.-]*")
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """The recordings to make, and what starts and stops them."""
+    """The planned recordings, and the events that start and stop them."""
 
     output: Path
     name: str
@@ -44,13 +44,13 @@ class RecordingPlan:
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     @property
-    def requested(self) -> bool:
-        """True where an end is defined. Otherwise the recording lasts until it is interrupted, which completes it."""
+    def has_end(self) -> bool:
+        """True if an end is defined. Otherwise the recording lasts until it is interrupted, and counts as completed."""
         return self.duration_s is not None or self.stop != "duration"
 
     @property
     def names(self) -> list[str]:
-        """The names of the recordings: the given name, with a trial number if there are several."""
+        """The names of the recordings: ``name``, with a trial number if there are several trials."""
         return [self.name] if self.trials == 1 else [f"{self.name}-{trial + 1:03d}" for trial in range(self.trials)]
 
 
@@ -74,23 +74,23 @@ def attributes(labels: Sequence[str], note: str | None) -> dict[str, Attribute]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One recording that was appended."""
+    """A recording that was appended to a dataset."""
 
     name: str
     seconds: float
-    rows: dict[str, int]  # stream to samples
-    lost: dict[str, int]  # stream to frames
+    rows: dict[str, int]  # number of samples by stream
+    lost: dict[str, int]  # number of lost frames by stream
     ended: str = COMPLETED  # completed, interrupted or recovered
-    spool: str = ""  # path of its retained spool
+    spool: str = ""  # path of its retained spool; empty if the spool was removed
 
     def line(self) -> str:
-        """Return a sentence on it."""
-        described = ", ".join(
+        """Return the recording's name, duration, samples and losses as one line."""
+        counts = ", ".join(
             f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
             for name, rows in self.rows.items()
         )
-        retained = f"; its spool is kept in {self.spool}" if self.spool else ""
-        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {described}{retained}"
+        retained = f"; its spool was moved to {self.spool}" if self.spool else ""
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {counts}{retained}"
 
 
 def run(
@@ -98,16 +98,16 @@ def run(
 ) -> tuple[list[Recorded], list[str]]:
     """Record the trials of ``plan`` until ``stopping`` is true or a stream is lost.
 
-    Return the recordings, and a sentence for each lost stream.
+    Returns the recordings, and a sentence for each lost stream.
     """
-    recorded: list[Recorded] = []
+    recordings: list[Recorded] = []
     tap = triggers.MessageTrigger(recorder.watches) if "tap" in (plan.start, plan.stop) else None
     with _keys(plan) as pressed:
         for trial in range(plan.trials):
             if plan.tare:
                 recorder.tare()
             starts, stops = _triggers(recorder, plan, pressed, tap)
-            _await(
+            _wait_for_start(
                 recorder,
                 starts,
                 stopping,
@@ -117,34 +117,36 @@ def run(
             if stopping():
                 break
             recording, lost = _record(recorder, store, plan, trial, stops, view, stopping)
-            recorded.append(recording)
+            recordings.append(recording)
             if lost or stopping():
-                return recorded, lost
-    return recorded, []
+                return recordings, lost
+    return recordings, []
 
 
 def _keys(plan: RecordingPlan) -> contextlib.AbstractContextManager[triggers.Keys]:
-    """Listen to the keyboard only if a key starts or stops trials, so that other programs can use the terminal."""
+    """Return the keyboard's keys if a key starts or stops trials. Otherwise other programs can use the terminal."""
     return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
 
 
-def _await(recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: RigView, waiting: str) -> None:
-    recorder.run(lambda: stopping() or starts(), lambda: view.show(waiting))
+def _wait_for_start(
+    recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: RigView, state: str
+) -> None:
+    recorder.run(lambda: stopping() or starts(), lambda: view.show(state))
 
 
 def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     """Seal an abandoned spool and append it to its dataset.
 
-    ``opened`` is the output of this command, None for none. Raises `TacpipeError`, and leaves the spool unchanged, where it
-    belongs to another user, has an invalid header, or names a dataset elsewhere.
+    ``opened`` is the output of this command, or None. Raises `TacpipeError`, and leaves the spool unchanged, if it belongs
+    to another user, has an invalid header, or was recorded for a dataset elsewhere.
     """
     from tacpipe.recording import rig as rig_of
 
-    spooled = Spooled(folder, users(folder.parent, [folder.lstat().st_uid]))
-    described = spooled.header.get("rig")
-    if not isinstance(described, str):
-        raise TacpipeError(f"Its rig file is {excerpt(described)}; it must be a text.")
-    rig = rig_of.parse(described, f"The rig file in {folder}")
+    spooled = Spooled(folder, own_user_ids(folder.parent, [folder.lstat().st_uid]))
+    rig_text = spooled.header.get("rig")
+    if not isinstance(rig_text, str):
+        raise TacpipeError(f"Its rig file is {excerpt(rig_text)}; it must be text.")
+    rig = rig_of.parse(rig_text, f"The rig file in {folder}")
     spool_folders.check_header(spooled.header, rig.streams)
     return _seal(store, spool_folders.destination(spooled.header, store, opened), spooled, rig)
 
@@ -169,24 +171,24 @@ def _record(
         "rig": recorder.rig.text,
     }
     spool = Spool(store.root, header, list(recorder.stations))
-    began_s = clock.now_s()
+    start_s = clock.now_s()
     ending = COMPLETED
 
-    def over() -> bool:
+    def is_over() -> bool:
         nonlocal ending
-        if plan.duration_s is not None and clock.now_s() - began_s >= plan.duration_s:
+        if plan.duration_s is not None and clock.now_s() - start_s >= plan.duration_s:
             return True
-        if stopping() and (plan.requested or stopping.number == signal.SIGHUP):
+        if stopping() and (plan.has_end or stopping.number == signal.SIGHUP):
             ending = INTERRUPTED
         return stopping() or stops()
 
-    advice = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
+    advice = f"The recorded data is in {spool.folder}; `tacpipe acquire --recover` seals it"
     # The spool stays locked until it is sealed, so that no other process recovers it.
     with termination.reporting(f"tacpipe: interrupted. {advice}."), contextlib.closing(spool):
         with recorder.recording(spool, preroll=plan.start != "now"):
-            recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
+            recorder.run(is_over, lambda: view.show(f"recording {name}, {clock.now_s() - start_s:.0f} s"))
             spool.note(StreamNote(clock.now_ns(), "", ENDED, ending))
-        lost = recorder.lost()  # before sealing, during which nothing is read
+        lost = recorder.lost()  # before sealing, because nothing is read during it
         view.show(f"sealing {name}")
         try:
             return _seal(store, plan.output, Spooled(spool.folder), recorder.rig), lost
@@ -213,7 +215,7 @@ def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
 def _triggers(
     recorder: Recorder, plan: RecordingPlan, pressed: triggers.Keys, tap: triggers.MessageTrigger | None
 ) -> tuple[triggers.Trigger, triggers.Trigger]:
-    """Return the trigger that starts the next trial, and the one that stops it besides its duration."""
+    """Return the triggers that start and stop the next trial. The duration of a trial is not a trigger."""
     contact = None
     if "contact" in (plan.start, plan.stop):
         contact = triggers.ContactTrigger(recorder.watches, plan.contact_count)
@@ -227,7 +229,7 @@ def _triggers(
     return starts[plan.start], stops[plan.stop]
 
 
-MOST_WORDS = 300  # characters of an unexpected error
+MAX_ERROR_LENGTH = 300  # characters of an unexpected error
 
 
 @dataclass(frozen=True)
@@ -238,35 +240,35 @@ class Unsealed:
     reason: str
 
     def line(self) -> str:
-        """Return a sentence on it."""
-        return f"The spool {self.folder} stays as it is. {self.reason}"
+        """Return a sentence with the folder and the reason."""
+        return f"The spool {self.folder} was not sealed. {self.reason}"
 
 
 def recover_spools(store: Store, output: Path | None) -> Iterator[Recorded | Unsealed]:
-    """Seal the spools that no process uses and yield the result of each. Spools without a sample are skipped.
+    """Seal the spools that no process uses and yield the result of each. Spools without bytes are skipped.
 
-    A spool that cannot be sealed stays and does not stop the others. ``output`` is the dataset of the command.
+    A spool that cannot be sealed is retained; the others are sealed. ``output`` is the dataset of the command.
     """
     for folder in spool_folders.abandoned(store.root):
         try:
-            with spool_folders.locked(folder) as ours:
-                if not ours:
+            with spool_folders.locked(folder) as is_locked:
+                if not is_locked:
                     continue
                 recorded = recover(store, folder, output)
         except NothingError:
-            continue  # it ended before its first sample
+            continue  # it ended before it received a byte
         except TacpipeError as error:
             yield Unsealed(folder, str(error))
         except Exception as error:  # a damaged spool or another version's driver may raise anything
-            yield Unsealed(folder, plain(f"{type(error).__name__}: {error}", MOST_WORDS))
+            yield Unsealed(folder, plain(f"{type(error).__name__}: {error}", MAX_ERROR_LENGTH))
         else:
             yield recorded
 
 
 def spools_of_others(store: Store) -> dict[Path, str]:
-    """Return the spools of other users in a shared store, with the user of each."""
-    with contextlib.suppress(OSError):  # a failed disk was reported already
+    """Return the owners' names of other users' spools in a shared store, by folder."""
+    with contextlib.suppress(OSError):  # a failed disk has already been reported
         owners = spool_folders.owners(store.root)
-        ours = spool_folders.users(store.root / spool_folders.FOLDER, owners.values())
-        return {folder: spool_folders.user(owner) for folder, owner in owners.items() if owner not in ours}
+        own_ids = spool_folders.own_user_ids(store.root / spool_folders.FOLDER, owners.values())
+        return {folder: spool_folders.user_name(owner) for folder, owner in owners.items() if owner not in own_ids}
     return {}

@@ -1,4 +1,4 @@
-"""Follow the streams of a rig: rate, losses, jitter, latency, the newest values."""
+"""Compute and show live figures of a rig's streams: rate, losses, jitter, latency, newest values."""
 
 from __future__ import annotations
 
@@ -22,54 +22,54 @@ from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 
-SPAN_NS = 2_000_000_000  # time over which rate and jitter are computed
-REST_S = 0.5  # time over which the rest level of a tactile channel is averaged
+WINDOW_NS = 2_000_000_000  # window of rate and jitter
+REST_S = 0.5  # window over which the rest level of a tactile channel is averaged
 
 
 @dataclass(frozen=True)
 class Figures:
-    """The present figures of a stream."""
+    """The current figures of a stream."""
 
     rate_hz: float
     jitter_ms: float  # standard deviation of the time between arrivals
-    latency_ms: float | None  # median delay behind the fastest sample, by the device's clock; None without clock
+    latency_ms: float | None  # median delay relative to the fastest sample, by the device's clock; None without a clock
     samples: int  # total
     lost: int  # total
     bytes_lost: int  # total
 
 
 class Watch:
-    """Follows one stream and keeps only its newest samples."""
+    """Decode one stream, and retain only its newest samples."""
 
     def __init__(self, stream: RigStream) -> None:
         self.stream = stream
         self.samples = 0
         self.error = ""  # the last error of its driver
         self.newest: Floats | None = None  # (channel,)
-        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to recognise the device where no frame is found
+        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to identify the device if they contain no frame
         self.last_ns: int | None = None  # arrival of the newest sample
-        self._reading = LinkReader(stream.sensor)
+        self._reader = LinkReader(stream.sensor)
         self._recent: deque[tuple[Int64s, Int64s | None]] = deque()
         self._rest_samples: list[Floats] = []
-        self.rest_level: Floats | None = None  # (channel,), once it is measured
+        self.rest_level: Floats | None = None  # (channel,), None until it is measured
 
     def feed(self, blocks: list[Chunks | StreamNote]) -> None:
-        """Decode blocks. A driver's error is kept in ``error``, because a watch must not end a recording."""
+        """Decode blocks. A driver's error is stored in ``error``, because a watch must not end a recording."""
         for block in blocks:
             if isinstance(block, Chunks):
                 self.heard.append(block)
             try:
                 if isinstance(block, Chunks):
-                    self._look(self._reading.feed(block))
+                    self._add_batch(self._reader.feed(block))
                 elif block.what == LOST:
-                    self._look(self._reading.broken())
+                    self._add_batch(self._reader.end_link())
             except Exception as error:
                 self.error = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-                self._reading = LinkReader(self.stream.sensor)
+                self._reader = LinkReader(self.stream.sensor)
 
     def figures(self, now_ns: int) -> Figures:
-        """Return the figures at ``now_ns`` of the monotonic clock."""
-        self._forget(now_ns)
+        """Return the figures at ``now_ns`` on the monotonic clock."""
+        self._drop_old(now_ns)
         t_ns = np.concatenate([stamps for stamps, _ in self._recent] or [np.zeros(0, dtype=np.int64)])
         steps_ns = np.diff(t_ns)
         rate_hz = float((len(t_ns) - 1) * 1e9 / (t_ns[-1] - t_ns[0])) if len(t_ns) > 1 and t_ns[-1] > t_ns[0] else 0.0
@@ -79,53 +79,57 @@ class Watch:
         if device and len(device) == len(self._recent):
             late_ns = t_ns - np.concatenate(device)
             latency_ms = float(np.median(late_ns - late_ns.min()) / 1e6)
-        lost = self._reading.lost
-        return Figures(rate_hz, jitter_ms, latency_ms, self.samples, lost, self._reading.account.lost)
+        lost = self._reader.lost
+        return Figures(rate_hz, jitter_ms, latency_ms, self.samples, lost, self._reader.account.lost)
 
     def tare(self) -> None:
-        """Measure the rest level again, from the next samples."""
+        """Measure the rest level again from the next samples."""
         self._rest_samples, self.rest_level = [], None
 
-    def _look(self, batch: Batch) -> None:
+    def _add_batch(self, batch: Batch) -> None:
         if not len(batch):
             return
         self.samples += len(batch)
         self.last_ns = int(batch.t_ns[-1])
         self._recent.append((batch.t_ns, batch.t_device_ns))
-        self._forget(self.last_ns)
+        self._drop_old(self.last_ns)
         numbers = [block[-1].astype(np.float64) for block in batch.values if block.dtype.kind in "iufb"]
         self.newest = np.concatenate(numbers) if numbers else None
         if self.rest_level is None and self.newest is not None:
             self._rest_samples.append(self.newest)
-            enough = REST_S * (self.stream.sensor.rate_hz or 1.0)
-            if len(self._rest_samples) >= min(10.0, max(1.0, enough)):
+            rest_count = REST_S * (self.stream.sensor.rate_hz or 1.0)
+            if len(self._rest_samples) >= min(10.0, max(1.0, rest_count)):
                 self.rest_level = np.mean(self._rest_samples, axis=0)
 
-    def _forget(self, now_ns: int) -> None:
-        while self._recent and self._recent[0][0][-1] < now_ns - SPAN_NS:
+    def _drop_old(self, now_ns: int) -> None:
+        while self._recent and self._recent[0][0][-1] < now_ns - WINDOW_NS:
             self._recent.popleft()
 
 
 def tactile_channels(stream: RigStream) -> list[tuple[int, Any]]:
-    """Return the position among the numeric channels and the field of each tactile channel of a stream."""
+    """Return (position among the numeric channels, field) of each tactile channel of a stream."""
     import pyarrow as pa
 
     numeric = [
-        kind
-        for kind in stream.sensor.fields()
-        if pa.types.is_integer(kind.type) or pa.types.is_floating(kind.type) or pa.types.is_boolean(kind.type)
+        field
+        for field in stream.sensor.fields()
+        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
     ]
-    return [(place, kind) for place, kind in enumerate(numeric) if (kind.metadata or {}).get(b"quantity") == b"tactile"]
+    return [
+        (position, field)
+        for position, field in enumerate(numeric)
+        if (field.metadata or {}).get(b"quantity") == b"tactile"
+    ]
 
 
-FRAMES_HZ = 8.0  # refresh rate on a terminal
-LINE_S = 5.0  # pause between two plain lines
+REFRESH_HZ = 8.0  # refresh rate on a terminal
+LINE_S = 5.0  # period of plain lines without a terminal
 SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange1", "red")
-COLUMNS = 16  # largest number of columns of the heat map
+MAX_COLUMNS = 16  # of the heat map
 
 
 class RigView:
-    """Shows the watches of a rig. `show` may be called at any rate."""
+    """Show the figures of a rig's streams. `show` may be called at any rate."""
 
     def __init__(
         self, watches: Mapping[str, Watch], *, quiet: bool = False, footer: Callable[[], Sequence[str]] = lambda: ()
@@ -135,39 +139,39 @@ class RigView:
         self._live: Any = None
         self._shown_s = clock.now_s()
         self._tactile = {
-            name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
+            name: [position for position, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
         }
         self._largest = dict.fromkeys(watches, 1.0)
 
     @contextlib.contextmanager
     def open(self) -> Iterator[RigView]:
-        """Show the view on the terminal in the block, where there is a terminal."""
+        """Show the view during the block if there is a terminal."""
         if self._quiet or not terminal.is_visible():
             yield self
             return
         from rich.console import Console
         from rich.live import Live
 
-        with Live(console=Console(file=sys.stderr), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
+        with Live(console=Console(file=sys.stderr), refresh_per_second=REFRESH_HZ, transient=True) as self._live:
             yield self
         self._live = None
 
     def show(self, state: str) -> None:
-        """Show the figures of the streams, and ``state``: what the rig is doing."""
+        """Show the figures of the streams, and ``state``, a description of what the rig is doing."""
         now_s = clock.now_s()
-        if self._quiet or now_s - self._shown_s < (1 / FRAMES_HZ if self._live else LINE_S):
+        if self._quiet or now_s - self._shown_s < (1 / REFRESH_HZ if self._live else LINE_S):
             return
         self._shown_s = now_s
         figures = {name: watch.figures(clock.now_ns()) for name, watch in self._watches.items()}
         if self._live is not None:
-            self._live.update(self._picture(state, figures))
+            self._live.update(self._render(state, figures))
         else:
-            described = "; ".join(describe_figures(name, values) for name, values in figures.items())
-            terminal.note(f"{state}: {described}")
+            summary = "; ".join(describe_figures(name, values) for name, values in figures.items())
+            terminal.note(f"{state}: {summary}")
             for footer_line in self._footer():
                 terminal.note(footer_line)
 
-    def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
+    def _render(self, state: str, figures: Mapping[str, Figures]) -> Any:
         from rich.console import Group
         from rich.table import Table
         from rich.text import Text
@@ -179,21 +183,21 @@ class RigView:
             latency = "" if values.latency_ms is None else f"{values.latency_ms:.2f}"
             row = (f"{values.rate_hz:.1f}", f"{values.jitter_ms:.2f}", latency, str(values.samples))
             table.add_row(name, *row, str(values.lost), str(values.bytes_lost), style="red" if values.lost else None)
-        maps = [Text.assemble(name + "\n", *self._heat(name)) for name in figures if self._tactile[name]]
+        maps = [Text.assemble(name + "\n", *self._heat_map(name)) for name in figures if self._tactile[name]]
         return Group(table, *(Text(printable.shown(footer_line)) for footer_line in self._footer()), *maps)
 
-    def _heat(self, name: str) -> list[Any]:
-        """Return the tactile channels of a stream as coloured cells, by how far each is from rest."""
-        watch, places = self._watches[name], self._tactile[name]
+    def _heat_map(self, name: str) -> list[Any]:
+        """Return the tactile channels of a stream as cells, coloured by the distance of each from its rest level."""
+        watch, positions = self._watches[name], self._tactile[name]
         if watch.newest is None or watch.rest_level is None:
             return []
-        away = np.abs(watch.newest[places] - watch.rest_level[places])
-        self._largest[name] = max(self._largest[name], float(away.max()))
-        shade = np.minimum(away / self._largest[name] * len(SHADES), len(SHADES) - 1).astype(int)
+        distance = np.abs(watch.newest[positions] - watch.rest_level[positions])
+        self._largest[name] = max(self._largest[name], float(distance.max()))
+        shade = np.minimum(distance / self._largest[name] * len(SHADES), len(SHADES) - 1).astype(int)
         cells: list[Any] = []
         for number, level in enumerate(shade.tolist()):
             cells.append(("  ", f"on {SHADES[level]}"))
-            if (number + 1) % COLUMNS == 0:
+            if (number + 1) % MAX_COLUMNS == 0:
                 cells.append("\n")
         return cells
 

@@ -1,8 +1,8 @@
-"""ATI Net F/T boxes: force and torque by UDP, up to 7000 times a second (RDT, raw data transfer).
+"""ATI Net F/T boxes: force and torque by UDP at up to 7000 Hz (RDT, raw data transfer).
 
-A request is 8 bytes: 0x1234, a command, how many records are wanted (0: without end). A record is 36 bytes, big-endian: a
-counter of records sent, a counter of samples taken, a status, six int32 counts. How many counts make a newton or a newton
-metre stands on the box's configuration page. Source: ATI, Net F/T manual 9620-05-net ft, section 10.
+A request has 8 bytes: 0x1234, a command, and the number of records (0: unlimited). A record has 36 bytes, big-endian: a
+counter of sent records, a counter of measured samples, a status, and six int32 counts. The box's configuration page shows
+the counts per newton and newton metre. Source: ATI, Net F/T manual 9620-05-net ft, section 10.
 """
 
 from __future__ import annotations
@@ -24,48 +24,50 @@ if TYPE_CHECKING:
 REQUEST = struct.Struct(">HHI")  # 0x1234, command, records
 MAGIC = 0x1234
 STOP, START, BIAS = 0, 2, 0x42
-STARTS = (1, START, 3)  # the first of newer boxes; the third buffers only where it is set up so
+STARTS = (1, START, 3)  # 1 is for newer boxes; 3 buffers records if the box is configured to
 RECORD = np.dtype([("rdt_seq", ">u4"), ("ft_seq", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)])
-BIAS_S = 0.1  # time that the box needs to take its present load as zero
+BIAS_S = 0.1  # time that the box needs to zero its load
 
 
 @dataclass(frozen=True)
 class AtiNetFT(Sensor):
     """A force-torque sensor behind an ATI Net F/T box.
 
-    The box sends every so-manieth of the samples it takes; its counter of samples is divided by that, so that it grows by
-    one a record as the other does.
+    The box may send only decimation n-th sample. Its counter of samples is divided by n, so that both counters increase
+    by one per record.
     """
 
     summary: ClassVar[str] = "ATI 6-axis force-torque sensors behind a Net F/T box."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     counter: ClassVar[int | None] = 1 << 32
-    exclusive: ClassVar[str] = "The box sends to one program: once another asks for records, they stop here."
+    exclusive: ClassVar[str] = "The box sends to one program: if another requests records, they stop here."
 
-    rate_hz: float = 7000.0  # RDT output rate on the box's communications page: what it takes, or a whole part of it
-    internal_hz: float = 7000.0  # samples a second that the box takes: 7000 of a Net F/T, 7912 of an Ethernet Axia
-    counts_per_force: float = 0.0  # counts a newton on the box's configuration page; 0: counts are kept as they are
-    counts_per_torque: float = 0.0  # counts a newton metre; 0: counts are kept
+    rate_hz: float = (
+        7000.0  # RDT output rate on the box's communications page: internal_hz, or that divided by a whole number
+    )
+    internal_hz: float = 7000.0  # internal sampling rate in Hz: 7000 for a Net F/T, 7912 for an Ethernet Axia
+    counts_per_force: float = 0.0  # counts per newton on the box's configuration page; 0: counts are not converted
+    counts_per_torque: float = 0.0  # counts per newton metre; 0: counts are not converted
 
     def __post_init__(self) -> None:
         if not 1 <= self.rate_hz <= self.internal_hz:
             raise UsageError(
-                f"ati-netft: rate_hz is {self.rate_hz:g}; the box sends 1 to {self.internal_hz:g} a second (internal_hz)."
+                f"ati-netft: rate_hz is {self.rate_hz:g}; it must be between 1 and {self.internal_hz:g} (internal_hz)."
             )
         if (self.counts_per_force > 0) != (self.counts_per_torque > 0) or self.counts_per_force < 0:
             raise UsageError(
                 f"ati-netft: counts_per_force is {self.counts_per_force:g} and counts_per_torque "
-                f"{self.counts_per_torque:g}; give both as the box's configuration page states them, or neither."
+                f"{self.counts_per_torque:g}; give both, from the box's configuration page, or neither."
             )
-        object.__setattr__(self, "device_counter", (1 << 32) // self.every)
+        object.__setattr__(self, "device_counter", (1 << 32) // self.decimation)
 
     @property
-    def every(self) -> int:
-        """How many samples the box takes for each that it sends."""
+    def decimation(self) -> int:
+        """The number of samples that the box measures per sample that it sends."""
         return max(1, round(self.internal_hz / self.rate_hz))
 
     def fields(self) -> list[pa.Field]:
-        """Return ``status`` (uint32, 0: all is well) and the load: int32 counts, or N and N m where those are given."""
+        """Return ``status`` (uint32, 0: no error) and the load: int32 counts, or N and N m if counts per unit are set."""
         import pyarrow as pa
 
         from tacpipe.channels import schema
@@ -80,11 +82,11 @@ class AtiNetFT(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer that takes packets of a record's size; UDP has a sum of its own."""
+        """Return a framer for packets with the size of a record; UDP has its own checksum."""
         return PacketFramer([RECORD.itemsize])
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return status and load, with the counters of records sent and of samples taken."""
+        """Return status and load, with the counters of sent records and of measured samples."""
         records = np.ascontiguousarray(frames).view(RECORD)[:, 0]
         load: AnyArray = records["counts"].astype(np.int32)  # (frame, axis)
         if self.counts_per_force:
@@ -92,16 +94,16 @@ class AtiNetFT(Sensor):
         return Samples(
             (records["status"].astype(np.uint32)[:, None], load),
             seq=records["rdt_seq"].astype(np.int64),
-            device_seq=records["ft_seq"].astype(np.int64) // self.every,
+            device_seq=records["ft_seq"].astype(np.int64) // self.decimation,
         )
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the records that hold these samples."""
+        """Return the records of these samples."""
         status, load = samples.values
         assert samples.seq is not None and samples.device_seq is not None
         records = np.zeros(len(load), RECORD)
         records["rdt_seq"] = samples.seq % (1 << 32)
-        records["ft_seq"] = samples.device_seq * self.every % (1 << 32)
+        records["ft_seq"] = samples.device_seq * self.decimation % (1 << 32)
         records["status"] = status[:, 0]
         records["counts"] = np.rint(load * self._scale) if self.counts_per_force else load
         return records.view(np.uint8).reshape(len(load), RECORD.itemsize)
@@ -111,7 +113,7 @@ class AtiNetFT(Sensor):
         return np.repeat([self.counts_per_force, self.counts_per_torque], 3)  # (axis,)
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Ask for records without end; the first of them is the reply."""
+        """Request an unlimited number of records. The first record is the reply."""
         yield Ask(request(START))
 
     def closing(self) -> bytes:
@@ -119,7 +121,7 @@ class AtiNetFT(Sensor):
         return request(STOP)
 
     def taring(self) -> Dialogue:
-        """Take the present load for zero."""
+        """Zero the load."""
         yield Ask(request(BIAS), pause_s=BIAS_S)
 
     def device(self) -> Device:
@@ -128,7 +130,7 @@ class AtiNetFT(Sensor):
 
 
 class _Box(Device):
-    """The box's side: streams without end, or as many records as it was asked for."""
+    """An emulated box: it streams without limit, or sends the requested number of records."""
 
     requested = 0
 
@@ -148,7 +150,7 @@ class _Box(Device):
 
 
 def request(command: int, records: int = 0) -> bytes:
-    """Return a request to the box for so many records, 0: without end.
+    """Return a request to the box for ``records`` records; 0 means unlimited.
 
     >>> request(START).hex(" ")
     '12 34 00 02 00 00 00 00'

@@ -1,18 +1,15 @@
-"""SynTouch BioTac behind a microcontroller that reads its SPI bus and passes frames on over serial.
+"""SynTouch BioTac, read by a microcontroller on its SPI bus that forwards frames over serial.
 
-The published part is the word and the frame. A word is two bytes, each of 7 bits and, lowest, the bit that makes their
-parity odd; the reading of 12 bits is ``(b0 >> 1) << 5 | b1 >> 3``. A frame is 44 words at 4400 a second: E1, PAC, E2,
-PAC, … E19, PAC, PDC, PAC, TAC, PAC, TDC, PAC. So everything but PAC comes at 100 Hz, PAC at 2200 Hz, 22 of them in a
-row.
+The word and the frame are published by the vendor. A word has two bytes, each with 7 bits and, as the lowest bit, odd
+parity; the 12-bit reading is ``(b0 >> 1) << 5 | b1 >> 3``. A frame has 44 words, sent at 4400 Hz: E1, PAC, E2, PAC, … E19,
+PAC, PDC, PAC, TAC, PAC, TDC, PAC. PAC is therefore sampled at 2200 Hz (22 values per row), and all other channels at 100 Hz.
 Source: SynTouch's C library for the Cheetah adapter (biotac.c, free for redistribution).
 
-The envelope is this project's, for there is no published bridge: ``42 54`` ("BT"), one byte that counts the fingers, a
-counter of frames (uint16, little-endian), then the 44 words, of each word one finger after another, and the 16-bit
-little-endian sum of all bytes before. A bridge that sends this can be read; firmware for one is a loop of SPI transfers
-and one write.
+The envelope is defined by this project, because no bridge is published: ``42 54`` ("BT"), the number of fingers (1 byte), a
+frame counter (uint16, little-endian), the 44 words (for each word, all fingers), and the 16-bit little-endian sum of all
+preceding bytes. The firmware of a bridge is a loop of SPI transfers and one write.
 
-One row is one frame. Its time is that of the frame; each field states with ``offset_ns`` how much later its word was
-sampled.
+A frame is one row. Its time is that of the frame; ``offset_ns`` of each field is the delay after which its word was sampled.
 """
 
 from __future__ import annotations
@@ -36,11 +33,11 @@ if TYPE_CHECKING:
 
 MARKER = b"BT"
 HEADER = 5  # marker, fingers, counter
-WORDS = 2 * VIBRATIONS  # words per frame, every second of them PAC
+WORDS = 2 * VIBRATIONS  # words per frame; every second one is PAC
 WORD_HZ = 4400
-HIGHEST = 0x0FFF  # largest value of 12 bits
-MOST_FINGERS = 5  # fingers per adapter
-SLOTS = (  # word of the frame that each of `biotac_fields` is: tdc, tac, pdc, pac…, electrodes
+MAX_VALUE = 0x0FFF  # 12 bits
+MAX_FINGERS = 5  # per adapter
+SLOTS = (  # position in the frame of each field of `biotac_fields`: tdc, tac, pdc, pac…, electrodes
     *(2 * VIBRATIONS - 2, 2 * VIBRATIONS - 4, 2 * VIBRATIONS - 6),
     *range(1, WORDS, 2),
     *range(0, 2 * ELECTRODES, 2),
@@ -51,28 +48,30 @@ SLOTS = (  # word of the frame that each of `biotac_fields` is: tdc, tac, pdc, p
 class BioTac(Sensor):
     """One or more BioTacs behind a serial bridge."""
 
-    summary: ClassVar[str] = "SynTouch BioTac fingertips behind a serial bridge that passes on their SPI frames."
+    summary: ClassVar[str] = "SynTouch BioTac fingertips behind a serial bridge that forwards their SPI frames."
     counter: ClassVar[int | None] = 1 << 16
 
-    fingers: int = 1  # BioTacs on the bridge, 1 to 5
-    rate_hz: float = 100.0  # frames a second: 4400 words by 44
+    fingers: int = 1  # number of BioTacs on the bridge, 1 to 5
+    rate_hz: float = 100.0  # frames per second, fixed: 4400 words per second in frames of 44
     baud: int = 921600  # baud rate of the bridge
 
     def __post_init__(self) -> None:
-        if not 1 <= self.fingers <= MOST_FINGERS:
-            raise UsageError(f"biotac: fingers is {self.fingers}; a bridge has 1 to {MOST_FINGERS}.")
+        if not 1 <= self.fingers <= MAX_FINGERS:
+            raise UsageError(f"biotac: fingers is {self.fingers}; it must be between 1 and {MAX_FINGERS}.")
         if self.rate_hz != WORD_HZ / WORDS:
-            raise UsageError(f"biotac: rate_hz is {self.rate_hz:g}; 44 words at 4400 a second make 100 frames.")
+            raise UsageError(
+                f"biotac: rate_hz is {self.rate_hz:g}; it must be 100 (4400 words per second in frames of 44)."
+            )
 
     @property
     def size(self) -> int:
-        """How many bytes a frame has, envelope included."""
+        """Bytes of a frame, including the envelope."""
         return HEADER + 2 * WORDS * self.fingers + 2
 
     def fields(self) -> list[pa.Field]:
         """Return the 44 fields of `biotac_fields` for each finger, with ``offset_ns`` from the frame's first word.
 
-        Names begin with ``finger1_``, … where there are more fingers than one.
+        With several fingers, names start with ``finger1_``, ….
         """
         fields = []
         for finger in range(1, self.fingers + 1):
@@ -85,12 +84,12 @@ class BioTac(Sensor):
         return fields
 
     def framer(self) -> Framer:
-        """Return a framer of frames with their sum, and in which every byte has odd parity."""
+        """Return a framer for frames with the right sum in which every byte of a word has odd parity."""
         marker = MARKER + bytes([self.fingers])
         return ByteFramer(Framing(marker=marker, size=self.size, check=_is_whole))
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the readings (frame, 44 a finger), 12 bits each, and the bridge's counter."""
+        """Return the 12-bit readings (frame, 44 per finger) and the bridge's counter."""
         pairs = frames[:, HEADER:-2].reshape(len(frames), WORDS, self.fingers, 2).astype(np.uint16)
         words = (pairs[..., 0] >> 1) << 5 | pairs[..., 1] >> 3  # (frame, word, finger)
         readings = words[:, list(SLOTS)].transpose(0, 2, 1).reshape(len(frames), -1)
@@ -98,11 +97,11 @@ class BioTac(Sensor):
         return Samples((readings,), seq=seq.astype(np.int64))
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the frames of these samples; a reading above 4095 saturates."""
+        """Return the frames of these samples. Readings above 4095 are clipped."""
         (readings,) = samples.values
         assert samples.seq is not None
         words = np.empty((len(readings), WORDS, self.fingers), dtype=np.uint16)
-        clipped = np.minimum(readings, HIGHEST)
+        clipped = np.minimum(readings, MAX_VALUE)
         words[:, list(SLOTS)] = clipped.reshape(len(readings), self.fingers, len(SLOTS)).transpose(0, 2, 1)
         pairs = np.stack([with_parity(words >> 5), with_parity((words & 0x1F) << 2)], axis=-1)  # (…, finger, byte)
         head = np.broadcast_to(np.frombuffer(MARKER + bytes([self.fingers]), np.uint8), (len(readings), 3))
@@ -112,7 +111,7 @@ class BioTac(Sensor):
 
 
 def with_parity(bits: Ints) -> NDArray[np.uint8]:
-    """Return 7 bits each with the lowest bit that makes their parity odd, as bytes.
+    """Return 7-bit values as bytes with odd parity in the lowest bit.
 
     >>> [hex(byte) for byte in with_parity(np.array([0, 1, 0x7F], dtype=np.uint16))]
     ['0x1', '0x2', '0xfe']

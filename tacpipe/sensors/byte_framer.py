@@ -1,13 +1,13 @@
-"""Cut a stream of bytes, or lines and packets of text, into frames: lock on marks, check sums, resynchronize.
+"""Split a stream of bytes, lines or packets of text into frames: find marks, verify checksums, resynchronize.
 
-No byte is looked at by itself in Python: as long as all is well, the bytes at hand are one array (frame, byte).
+Undisturbed bytes are processed as one array (frame, byte), without a Python loop over bytes.
 
-A frame is given out when it is known to be one. Where nothing but the marks speaks for it (`Framing.check` is None), or a
-sum of 8 bits, that is once ``confirm`` good frames follow it: the frame before a disturbance may be a part of it. After a
-disturbance a lock takes ``lock`` good frames in a row, all of which are then given out.
+A frame is returned as soon as it is verified. With only marks (`Framing.check` is None) or an 8-bit checksum, ``confirm``
+good frames must follow it, because the last frame before a disturbance may be damaged. After a disturbance, the framer locks
+again on ``lock`` good frames in a row, which are all returned.
 
-A frame of text is recognised by its content. A sensor that checks many texts at once, faster, states as ``check_all``
-whether all of them are frames; a text that is none is then found by halving.
+A text frame is recognised by its content. A sensor that can check many texts faster at once provides ``check_all``, which
+returns whether all of them are frames; texts that are not are then located by bisection.
 """
 
 from __future__ import annotations
@@ -25,47 +25,48 @@ from tacpipe.sensors.framing import (
     START,
     UNCONFIRMED,
     Account,
+    ByteBuffer,
     Chunks,
     FrameRun,
     Framing,
     FramingLoss,
-    Pending,
 )
 
-AMBIGUOUS = 64  # frames that are kept while marks repeat in more than one place
-MOST_BYTES = 1 << 23  # looked at in one go, which bounds the memory of a check
-Span = tuple[int, int, int]  # frames of one size that follow one another: where they start, their size, how many
+AMBIGUOUS = 64  # number of frames after which an ambiguous phase is decided
+MAX_CHECKED_BYTES = 1 << 23  # bytes that are checked at once, which bounds the memory
+Span = tuple[int, int, int]  # consecutive frames of one size: start, size, count
 
 
 class ByteFramer:
-    """Cuts a stream of bytes into frames as a `Framing` states."""
+    """Split a stream of bytes into the frames that a `Framing` describes."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
         self.account = Account()
-        self._text = Pending()
+        self._text = ByteBuffer()
         self._locked = False
         self._has_frames = False  # True after the first frame
-        self._broken_at: int | None = None  # place, from the first byte, where an expected frame did not begin
-        self._barred = -1  # place where the broken chain must not begin again
-        self._usual = framing.size or 0  # size of the last good frame
-        self._marked: tuple[int, list[tuple[int, bytes]]] = (0, [])  # marks of frames of the last size, see `_marks`
-        self._last_header = (b"", 0)  # the last header whose size was computed, and the size
-        self._follows_tail = False  # True where the buffered bytes begin right after a tail that was cut off
-        self._ruined: set[int] = set()  # places, from the first byte, where no chain begins
+        # Offsets of these attributes are counted from the first byte of the stream.
+        self._broken_at: int | None = None  # offset at which an expected frame did not start
+        self._excluded = -1  # offset at which the broken chain started; it must not start there again
+        self._last_size = framing.size or 0  # size of the last good frame
+        self._cached_marks: tuple[int, list[tuple[int, bytes]]] = (0, [])  # size and marks of the last call of `_marks`
+        self._last_header = (b"", 0)  # the last header whose size was computed, and that size
+        self._follows_tail = False  # True if the buffered bytes start right after a tail
+        self._dead_starts: set[int] = set()  # offsets at which no chain starts
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Take what a link gave; return the frames that are complete now, and what was lost."""
+        """Add bytes, and return the frames that are now complete, and the losses."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
         return self._scan(at_end=False)
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return what is left when nothing more comes: frames with a sum are good, others lack what confirms them."""
+        """Return the last frames and losses at the end of the stream. Frames without a checksum need a confirmation."""
         runs, losses = self._scan(at_end=True)
         remaining = len(self._text.data)
         if remaining:
-            complete = self._locked and bool(self._usual) and remaining >= self._usual
+            complete = self._locked and bool(self._last_size) and remaining >= self._last_size
             losses.append(self._lose(0, remaining, UNCONFIRMED if complete else CUT if self._has_frames else START))
             self._text.cut(remaining)
         return runs, losses
@@ -73,245 +74,249 @@ class ByteFramer:
     def _scan(self, *, at_end: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
         runs: list[FrameRun] = []
         losses: list[FramingLoss] = []
-        place, size = 0, len(self._text.data)
-        while place < size:
+        offset, size = 0, len(self._text.data)
+        while offset < size:
             if not self._locked:
-                start, retained = self._search(place, at_end=at_end)
+                start, retained = self._search(offset, at_end=at_end)
                 if start is None:
-                    place = self._skip(place, retained, losses) if retained - place > self.framing.most else place
+                    if retained - offset > self.framing.max_size:
+                        offset = self._skip(offset, retained, losses)
                     break
-                place = self._skip(place, start, losses)
+                offset = self._skip(offset, start, losses)
                 self._locked = self._has_frames = True
-                self._ruined.clear()
+                self._dead_starts.clear()
                 self._broken_at = None
-            spans, stop, broken = self._chain(place)
-            unconfirmed = 0 if at_end and not broken and self.framing.summed else self.framing.confirm
-            place = self._give(spans, unconfirmed, runs, place)
+            spans, stop, broken = self._chain(offset)
+            unconfirmed = 0 if at_end and not broken and self.framing.has_checksum else self.framing.confirm
+            offset = self._add_runs(spans, unconfirmed, runs, offset)
             if not broken:
                 break
-            self._locked, self._broken_at, self._barred = False, self._text.base + stop, self._text.base + place
-        if place:
+            self._locked, self._broken_at, self._excluded = False, self._text.base + stop, self._text.base + offset
+        if offset:
             tail = self.framing.tail
-            self._follows_tail = bool(tail) and self._text.data[max(0, place - len(tail)) : place] == tail
-        self._text.cut(place)
+            self._follows_tail = bool(tail) and self._text.data[max(0, offset - len(tail)) : offset] == tail
+        self._text.cut(offset)
         return runs, losses
 
-    def _give(self, spans: Sequence[Span], unconfirmed: int, runs: list[FrameRun], place: int) -> int:
-        """Append the runs of a chain but for its last ``unconfirmed`` frames; return where those begin."""
-        give = -unconfirmed
+    def _add_runs(self, spans: Sequence[Span], unconfirmed: int, runs: list[FrameRun], offset: int) -> int:
+        """Append a chain without its last ``unconfirmed`` frames to ``runs``, and return the offset of those frames."""
+        confirmed = -unconfirmed
         for _, _, count in spans:
-            give += count
+            confirmed += count
         for start, size, count in spans:
-            count = min(count, give)
+            count = min(count, confirmed)
             if count <= 0:
                 break
-            give -= count
-            place = start + count * size
+            confirmed -= count
+            offset = start + count * size
             runs.append(
-                FrameRun(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, place, size)))
+                FrameRun(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, offset, size)))
             )
             self.account.framed += count * size
-            self._usual = size
-        return place
+            self._last_size = size
+        return offset
 
-    def _chain(self, place: int, limit: int | None = None) -> tuple[list[Span], int, bool]:
-        """Return the good frames that follow one another from ``place``: spans of (start, size, count).
+    def _chain(self, offset: int, limit: int | None = None) -> tuple[list[Span], int, bool]:
+        """Return the consecutive good frames from ``offset`` on, their end, and whether no frame can start there.
 
-        Return also where they end, and whether it is certain that no frame begins there. ``limit`` is the largest count.
+        The frames are spans (start, size, count). ``limit`` is the largest number of frames.
         """
         spans: list[Span] = []
         size_of_text = len(self._text.data)
         limit = size_of_text if limit is None else limit
         while limit > 0:
-            size = self._size(place)
-            if size is None or place + size > size_of_text:
-                return spans, place, False
+            size = self._size(offset)
+            if size is None or offset + size > size_of_text:
+                return spans, offset, False
             if size == 0:
-                return spans, place, True
-            count = max(1, min((size_of_text - place) // size, MOST_BYTES // size, limit))
-            run = self._good(place, size, count)
+                return spans, offset, True
+            count = max(1, min((size_of_text - offset) // size, MAX_CHECKED_BYTES // size, limit))
+            run = self._count_good(offset, size, count)
             if run:
-                spans.append((place, size, run))
-                place += run * size
+                spans.append((offset, size, run))
+                offset += run * size
                 limit -= run
-            if run < count and (run == 0 or self._size(place) == size):
-                return spans, place, True
-        return spans, place, False
+            if run < count and (run == 0 or self._size(offset) == size):
+                return spans, offset, True
+        return spans, offset, False
 
-    def _size(self, place: int) -> int | None:
-        """Return the size of the frame that begins at ``place``, 0 if none does, None if too few bytes are there."""
+    def _size(self, offset: int) -> int | None:
+        """Return the size of the frame at ``offset``. Returns 0 if no frame starts there, None if bytes are missing."""
         text, framing = self._text.data, self.framing
-        if not text.startswith(framing.marker, place):
-            mark = text[place : place + len(framing.marker)]
+        if not text.startswith(framing.marker, offset):
+            mark = text[offset : offset + len(framing.marker)]
             if len(mark) == len(framing.marker) or not framing.marker.startswith(mark):
                 return 0
         if framing.size is not None:
             return framing.size
         if framing.sizes is None:
-            return self._size_to_tail(place)
-        head = text[place : place + framing.header]
+            return self._size_to_tail(offset)
+        head = text[offset : offset + framing.header]
         if len(head) < framing.header:
             return None
         if head != self._last_header[0]:
             size = int(framing.sizes(np.frombuffer(head, np.uint8)[None])[0])
-            self._last_header = head, size if framing.header <= size <= framing.most else 0
+            self._last_header = head, size if framing.header <= size <= framing.max_size else 0
         return self._last_header[1]
 
-    def _size_to_tail(self, place: int) -> int | None:
-        """Return how many bytes there are up to the next tail: the usual number if that gives a tail as well."""
+    def _size_to_tail(self, offset: int) -> int | None:
+        """Return the size of a frame from ``offset`` to its tail: the size of the last frame if a tail is there, too."""
         text, tail = self._text.data, self.framing.tail
-        if self._usual and text[place + self._usual - len(tail) : place + self._usual] == tail:
-            return self._usual
-        tail_at = place + len(self.framing.marker) - 1
-        while (tail_at := text.find(tail, tail_at + 1, place + self.framing.most)) >= 0:
+        if self._last_size and text[offset + self._last_size - len(tail) : offset + self._last_size] == tail:
+            return self._last_size
+        tail_at = offset + len(self.framing.marker) - 1
+        while (tail_at := text.find(tail, tail_at + 1, offset + self.framing.max_size)) >= 0:
             stop = tail_at + len(tail)
-            frame = np.frombuffer(text, np.uint8, stop - place, place)[None]  # (1, byte)
+            frame = np.frombuffer(text, np.uint8, stop - offset, offset)[None]  # (1, byte)
             if self.framing.check is None or self.framing.check(frame)[0]:
-                return stop - place
+                return stop - offset
             if text.startswith(self.framing.marker, stop) and stop < len(text):
-                return 0  # another frame begins right behind, so this was the tail, and the sum is wrong
-        return 0 if len(text) - place >= self.framing.most else None
+                return 0  # another frame starts here, so this was the tail, and the check failed
+        return 0 if len(text) - offset >= self.framing.max_size else None
 
-    def _good(self, place: int, size: int, count: int) -> int:
-        """Return how many of ``count`` frames from ``place`` on, up to the first that has not, have marks, size and sum."""
+    def _count_good(self, offset: int, size: int, count: int) -> int:
+        """Return the number of good frames at ``offset`` before the first bad one, at most ``count``.
+
+        A good frame has the right marks, size and checksum.
+        """
         framing, text = self.framing, self._text.data
         for at, mark in self._marks(size):
-            column = text[place + at : place + count * size : size]  # the mark's byte of each frame
+            column = text[offset + at : offset + count * size : size]  # this byte of each frame
             count -= len(column.lstrip(mark))
-        if framing.sizes is not None and count > 1:  # the first was asked for its size
-            count = _leading(framing.sizes(self._frames(place, size, count)[:, : framing.header]) == size)
+        if framing.sizes is not None and count > 1:  # the size of the first is already known
+            count = _count_leading(framing.sizes(self._frames(offset, size, count)[:, : framing.header]) == size)
         if framing.check is not None and count:
-            count = _leading(framing.check(self._frames(place, size, count)))
+            count = _count_leading(framing.check(self._frames(offset, size, count)))
         return count
 
     def _marks(self, size: int) -> list[tuple[int, bytes]]:
-        """Return where in a frame of so many bytes its marks are, byte by byte."""
-        if size != self._marked[0]:
+        """Return (offset, byte) of each byte of the marks of frames of this size."""
+        if size != self._cached_marks[0]:
             framing = self.framing
-            places = [*range(len(framing.marker)), *range(size - len(framing.tail), size)]
+            offsets = [*range(len(framing.marker)), *range(size - len(framing.tail), size)]
             marks = framing.marker + framing.tail
-            self._marked = size, [(at, marks[row : row + 1]) for row, at in enumerate(places)]
-        return self._marked[1]
+            self._cached_marks = size, [(at, marks[row : row + 1]) for row, at in enumerate(offsets)]
+        return self._cached_marks[1]
 
-    def _frames(self, place: int, size: int, count: int) -> Bytes:
-        """Return frames of one size as an array (frame, byte), without a copy."""
-        return np.frombuffer(self._text.data, np.uint8, count * size, place).reshape(count, size)
+    def _frames(self, offset: int, size: int, count: int) -> Bytes:
+        """Return frames of one size as an array (frame, byte), without copying."""
+        return np.frombuffer(self._text.data, np.uint8, count * size, offset).reshape(count, size)
 
-    def _search(self, place: int, *, at_end: bool) -> tuple[int | None, int]:
-        """Return the first place from ``place`` on at which ``lock`` good frames follow one another, or None.
+    def _search(self, offset: int, *, at_end: bool) -> tuple[int | None, int]:
+        """Return the first offset from ``offset`` on at which ``lock`` good frames start, or None.
 
-        And the first place at which they still may, once more bytes are there.
+        Also returns the first offset at which they may still start when more bytes arrive.
         """
         possible: int | None = None
         size_of_text = len(self._text.data)
-        enough = 1 if at_end and self.framing.summed else self.framing.lock
+        required = 1 if at_end and self.framing.has_checksum else self.framing.lock
         base = self._text.base
-        self._ruined = {start for start in self._ruined if start >= base + place}
-        for start in self._candidates(place):
-            if base + start in self._ruined:
+        self._dead_starts = {start for start in self._dead_starts if start >= base + offset}
+        for start in self._candidates(offset):
+            if base + start in self._dead_starts:
                 continue
-            spans, stop, ruined = self._chain(start, self.framing.lock)
+            spans, stop, broken = self._chain(start, self.framing.lock)
             count = sum(frames for _, _, frames in spans)
-            if count >= enough and (count >= self.framing.lock or (stop == size_of_text and not ruined)):
-                return self._phase(start)
-            if ruined:
-                self._ruined.add(base + start)
+            if count >= required and (count >= self.framing.lock or (stop == size_of_text and not broken)):
+                return self._choose_phase(start)
+            if broken:
+                self._dead_starts.add(base + start)
             elif possible is None:
                 possible = start
         return None, size_of_text if possible is None else possible
 
-    def _phase(self, start: int) -> tuple[int | None, int]:
-        """Return of the places within a frame from ``start`` on the one at which marks repeat for longest, as `_search`.
+    def _choose_phase(self, start: int) -> tuple[int | None, int]:
+        """Return the start within one frame from ``start`` on at which marks repeat for longest. Returns like `_search`.
 
-        A payload that holds still may show the marker in every frame. Where marks alone speak for frames, only its change
-        states the true place.
+        A constant payload may contain the marker in every frame. Without a checksum, only a change of the payload reveals
+        the true start.
         """
         size = self.framing.size
-        if self.framing.summed or size is None:
+        if self.framing.has_checksum or size is None:
             return start, start
-        places = [start]
+        starts = [start]
         for candidate in self._candidates(start + 1):
             if candidate >= start + size:
                 break
-            places.append(candidate)
+            starts.append(candidate)
         size_of_text = len(self._text.data)
-        chains = [self._chain(place, AMBIGUOUS) for place in places]
-        alive = [place for place, (_, _, ruined) in zip(places, chains, strict=True) if not ruined]
-        complete = [place for place in alive if place + size * self.framing.lock <= size_of_text]
+        chains = [self._chain(candidate, AMBIGUOUS) for candidate in starts]
+        unbroken = [candidate for candidate, (_, _, broken) in zip(starts, chains, strict=True) if not broken]
+        complete = [candidate for candidate in unbroken if candidate + size * self.framing.lock <= size_of_text]
         if len(complete) > 1:
             return None, max(start, size_of_text - AMBIGUOUS * size)
-        longest = max(range(len(places)), key=lambda number: chains[number][1] - places[number])
-        chosen = complete[0] if complete else places[longest]
+        longest = max(range(len(starts)), key=lambda number: chains[number][1] - starts[number])
+        chosen = complete[0] if complete else starts[longest]
         return chosen, chosen
 
-    def _candidates(self, place: int) -> Iterable[int]:
-        """Yield where a frame may begin: at markers, or behind tails; not where the chain that broke began."""
+    def _candidates(self, offset: int) -> Iterable[int]:
+        """Yield the offsets at which a frame may start: at markers, or after tails, except the start of the broken chain."""
         text, framing = self._text.data, self.framing
         mark = framing.marker or framing.tail
         shift = 0 if framing.marker else len(mark)
-        barred = self._barred - self._text.base
-        if shift and self._follows_tail and place == 0 != barred:
+        excluded = self._excluded - self._text.base
+        if shift and self._follows_tail and offset == 0 != excluded:
             yield 0
-        mark_at = text.find(mark, max(0, place - shift))
+        mark_at = text.find(mark, max(0, offset - shift))
         while mark_at >= 0:
-            if mark_at + shift >= place and mark_at + shift != barred:
+            if mark_at + shift >= offset and mark_at + shift != excluded:
                 yield mark_at + shift
             mark_at = text.find(mark, mark_at + 1)
-        for length in range(len(mark) - 1, 0, -1):  # a mark of which the end is not there yet
+        for length in range(len(mark) - 1, 0, -1):  # an incomplete mark at the end of the buffer
             start = len(text) - length
-            if start >= place and start != barred and text.endswith(mark[:length]):
+            if start >= offset and start != excluded and text.endswith(mark[:length]):
                 yield start
 
-    def _skip(self, place: int, start: int, losses: list[FramingLoss]) -> int:
-        if start > place:
-            losses.append(self._lose(place, start, self._cause(place, start)))
+    def _skip(self, offset: int, start: int, losses: list[FramingLoss]) -> int:
+        if start > offset:
+            losses.append(self._lose(offset, start, self._cause(offset, start)))
         return start
 
-    def _cause(self, place: int, start: int) -> str:
-        """Return what became of the bytes from ``place`` to ``start``, between good frames."""
+    def _cause(self, offset: int, start: int) -> str:
+        """Return the cause of the loss of the bytes from ``offset`` to ``start``, between good frames."""
         if not self._has_frames:
             return START
-        broken = place if self._broken_at is None else max(place, self._broken_at - self._text.base)
-        between, usual = start - broken, self._usual
+        broken = offset if self._broken_at is None else max(offset, self._broken_at - self._text.base)
+        between, frame_size = start - broken, self._last_size
         if between <= 0:
             return UNCONFIRMED
-        if usual and between % usual == 0:
+        if frame_size and between % frame_size == 0:
             return GARBLED
         marker = self.framing.marker
-        begins = bool(marker) and self._text.data.startswith(marker, broken)
-        if between < usual:
-            return CUT if begins or not marker or place < broken else NOISE
+        has_marker = bool(marker) and self._text.data.startswith(marker, broken)
+        if between < frame_size:
+            return CUT if has_marker or not marker or offset < broken else NOISE
         return GARBLED
 
     def _lose(self, start: int, stop: int, cause: str) -> FramingLoss:
         self.account.lost += stop - start
-        usual = self._usual or stop - start
-        frames = 0 if cause in (START, NOISE) else max(1, round((stop - start) / usual))
+        frame_size = self._last_size or stop - start
+        frames = 0 if cause in (START, NOISE) else max(1, round((stop - start) / frame_size))
         return FramingLoss(self._text.arrival(stop - 1), cause, frames, stop - start)
 
 
-def _leading(good: Bools) -> int:
-    """Return how many frames are good (frame,) before the first that is not."""
+def _count_leading(good: Bools) -> int:
+    """Return the number of True values in the mask ``good`` (frame,) before the first False."""
     first = int(good.argmin())
     return len(good) if good[first] else first
 
 
-FEW = 8  # texts that are looked at one by one
+FEW = 8  # fewer texts are checked one by one
 Check = Callable[[bytes], bool]
-CheckOfAll = Callable[[Sequence[bytes]], bool]
+CheckAll = Callable[[Sequence[bytes]], bool]
 
 
 class TextFramer:
-    """Takes each packet of a link for a frame of text: those that ``check`` takes."""
+    """Treat each packet of a link as a text frame if ``check`` accepts it."""
 
-    def __init__(self, check: Check, check_all: CheckOfAll | None = None) -> None:
+    def __init__(self, check: Check, check_all: CheckAll | None = None) -> None:
         self.check, self.check_all = check, check_all
         self.account = Account()
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the packets that are frames, as a list of bytes, and the others as losses."""
+        """Return the accepted packets as one run, and the others as losses."""
         packets = chunks.packets()
-        good = _good(packets, self.check, self.check_all)
+        good = _check_texts(packets, self.check, self.check_all)
         lost = int(chunks.size[~good].sum())
         self.account.received += len(chunks.data)
         self.account.framed += len(chunks.data) - lost
@@ -324,36 +329,36 @@ class TextFramer:
         return ([FrameRun(accepted, chunks.t_ns[good])] if accepted else []), losses
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return nothing: a packet is whole or it is none."""
+        """Return nothing: packets are never incomplete."""
         return [], []
 
 
 class LineFramer:
-    """Cuts a stream of text into its lines, without their ends; ``check`` states which are frames."""
+    """Split a stream of text into lines without their ends. Lines that ``check`` accepts are frames."""
 
-    def __init__(self, check: Check, check_all: CheckOfAll | None = None, most: int = 4096) -> None:
-        self.check, self.check_all, self.most = check, check_all, most
+    def __init__(self, check: Check, check_all: CheckAll | None = None, max_size: int = 4096) -> None:
+        self.check, self.check_all, self.max_size = check, check_all, max_size
         self.account = Account()
-        self._text = Pending()
+        self._text = ByteBuffer()
         self._has_lines = False
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the lines that are complete now, and those that are not frames as losses."""
+        """Return the frames among the lines that are now complete, and the other lines as losses."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
         text = self._text.data
         stop = text.rfind(b"\n") + 1
         if not stop:
-            return [], (self._drop(len(text)) if len(text) > self.most else [])
+            return [], (self._drop(len(text)) if len(text) > self.max_size else [])
         lines = text[: stop - 1].split(b"\n")
         sizes = np.fromiter(map(len, lines), np.int64, len(lines)) + 1
         arrival = self._text.arrivals(sizes.cumsum() - 1)
         losses = []
-        if not self._has_lines:  # the first line of all began before the recording did
+        if not self._has_lines:  # the first line may have started before the recording
             losses = [FramingLoss(int(arrival[0]), START, 0, int(sizes[0]))]
             lines, sizes, arrival = lines[1:], sizes[1:], arrival[1:]
         lines = [line.strip() for line in lines]
-        good = _good(lines, self.check, self.check_all)
+        good = _check_texts(lines, self.check, self.check_all)
         bad = np.flatnonzero(~good).tolist()
         losses += [FramingLoss(int(arrival[row]), GARBLED, 1, int(sizes[row])) for row in bad]
         self._has_lines = True
@@ -365,7 +370,7 @@ class LineFramer:
         return ([FrameRun(accepted, arrival[good])] if accepted else []), losses
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return what is left of a line that has no end."""
+        """Return the incomplete last line as a loss."""
         return [], self._drop(len(self._text.data))
 
     def _drop(self, count: int) -> list[FramingLoss]:
@@ -377,15 +382,15 @@ class LineFramer:
         return [FramingLoss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
 
 
-def _good(texts: Sequence[bytes], check: Check, check_all: CheckOfAll | None) -> Bools:
-    """Return which texts are frames (text,)."""
+def _check_texts(texts: Sequence[bytes], check: Check, check_all: CheckAll | None) -> Bools:
+    """Return a mask (text,) of the texts that are frames."""
     if check_all is None or len(texts) < FEW:
         return np.fromiter(map(check, texts), bool, len(texts))
     if check_all(texts):
         return np.ones(len(texts), dtype=bool)
     half = len(texts) // 2
-    return np.concatenate([_good(texts[:half], check, check_all), _good(texts[half:], check, check_all)])
+    return np.concatenate([_check_texts(texts[:half], check, check_all), _check_texts(texts[half:], check, check_all)])
 
 
 def _select(texts: list[bytes], good: Bools) -> list[bytes]:
-    return texts if good.all() else [text for text, fine in zip(texts, good.tolist(), strict=True) if fine]
+    return texts if good.all() else [text for text, is_good in zip(texts, good.tolist(), strict=True) if is_good]

@@ -1,4 +1,4 @@
-"""Check sums of frames, over whole arrays: bytes (frame, byte) in, one number a frame out."""
+"""Compute checksums of many frames at once: from bytes (frame, byte) to one number per frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tacpipe.arrays import Bytes, Counts
 
 Step = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.uint32]]  # (value,), (256,) to (value,)
 
-MOST_LOOKED_UP = 1 << 18  # bytes at a time, which bounds the memory of a CRC
+MAX_BLOCK = 1 << 18  # bytes that are looked up at once, which bounds the memory
 
 
 def sum8(data: Bytes) -> Bytes:
@@ -28,7 +28,7 @@ def sum16(data: Bytes) -> Counts:
 
 
 def lrc(data: Bytes) -> Bytes:
-    """Return the two's complement of the sum of each frame (frame,): with it, the sum is 0."""
+    """Return the two's complement of the 8-bit sum of each frame (frame,)."""
     return (-sum8(data)).astype(np.uint8)
 
 
@@ -39,12 +39,12 @@ def xor8(data: Bytes) -> Bytes:
 
 
 def crc8(data: Bytes, polynomial: int = 0x07) -> Bytes:
-    """Return the CRC-8 of each frame (frame,): most significant bit first, from 0."""
+    """Return the CRC-8 of each frame (frame,): most significant bit first, initial value 0."""
     return _crc(data, _high_bit_first, polynomial, 8, b"").astype(np.uint8)
 
 
 def crc16_modbus(data: Bytes) -> Counts:
-    """Return the CRC-16/MODBUS of each frame (frame,): polynomial 0xA001 reflected, from 0xFFFF.
+    """Return the CRC-16/MODBUS of each frame (frame,): polynomial 0xA001 reflected, initial value 0xFFFF.
 
     Source: MODBUS over Serial Line, V1.02, section 6.2.2.
     """
@@ -52,30 +52,31 @@ def crc16_modbus(data: Bytes) -> Counts:
 
 
 def crc16_ccitt(data: Bytes) -> Counts:
-    """Return the CRC-16 of each frame (frame,): polynomial 0x1021, most significant bit first, from 0xFFFF."""
+    """Return the CRC-16 of each frame (frame,): polynomial 0x1021, most significant bit first, initial value 0xFFFF."""
     return _crc(data, _high_bit_first, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 
 
 def crc16_wts(data: Bytes) -> Counts:
-    """Return the check sum of Weiss WTS frames (frame,): the table of 0x1021, but shifted to the right, from 0xFFFF."""
+    """Return the checksum of Weiss WTS frames (frame,): the table of 0x1021, shifted to the right, initial value 0xFFFF."""
     return _crc(data, _mixed, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 
 
 def crc32(data: Bytes) -> NDArray[np.uint32]:
-    """Return the CRC-32 of each frame (frame,) as of Ethernet and zip: 0xEDB88320 reflected, from and with all bits."""
+    """Return the CRC-32 (Ethernet, zip) of each frame (frame,): 0xEDB88320 reflected, initial and final XOR all ones."""
     return ~_crc(data, _low_bit_first, 0xEDB88320, 32, b"\xff\xff\xff\xff")
 
 
-Kind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]  # polynomial and bits to a table (256,) and a step
+CrcKind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]  # from polynomial and bits to a table (256,) and a step
 
 
-def _crc(data: Bytes, kind: Kind, polynomial: int, bits: int, start: bytes) -> NDArray[np.uint32]:
-    """Return the CRC of each frame (frame,); ``start`` is its first value, byte by byte as data meets it.
+def _crc(data: Bytes, kind: CrcKind, polynomial: int, bits: int, start: bytes) -> NDArray[np.uint32]:
+    """Return the CRC of each frame (frame,). ``start`` is the initial value, in the order in which data bytes meet it.
 
-    A CRC is the exclusive or of what its bytes add, each by how many follow it, so that all are looked up at once.
+    A CRC is linear: each byte contributes a value that depends only on the byte and its distance from the end. The
+    contributions of all bytes are looked up at once and combined by exclusive or.
     """
     count = data.shape[1]
-    unused = start[count:]  # bytes of the first value that are combined with no byte
+    unused = start[count:]  # bytes of the initial value beyond the data
     remainder = (
         int.from_bytes(unused.ljust(len(start), b"\x00"))
         if kind is _high_bit_first
@@ -84,21 +85,21 @@ def _crc(data: Bytes, kind: Kind, polynomial: int, bits: int, start: bytes) -> N
     crc = np.full(len(data), remainder, dtype=np.uint32)
     if not count:
         return crc
-    added = _added(kind, polynomial, bits, 1 << (count - 1).bit_length())  # (bytes that follow, value)
-    places = np.arange(count - 1, -1, -1) * 256
-    block = max(1, MOST_LOOKED_UP // count)
-    flat = added.ravel()
+    contributions = _contributions(kind, polynomial, bits, 1 << (count - 1).bit_length())  # (bytes that follow, value)
+    offsets = np.arange(count - 1, -1, -1) * 256
+    block = max(1, MAX_BLOCK // count)
+    flat = contributions.ravel()
     for first in range(0, len(data), block):
-        crcs = flat.take(data[first : first + block] + places)  # (frame, byte)
+        crcs = flat.take(data[first : first + block] + offsets)  # (frame, byte)
         crc[first : first + block] ^= np.bitwise_xor.reduce(crcs, axis=1)
-    for place, value in enumerate(start[:count]):
-        crc ^= added[count - 1 - place, value]
+    for position, value in enumerate(start[:count]):
+        crc ^= contributions[count - 1 - position, value]
     return crc
 
 
 @functools.lru_cache(maxsize=32)
-def _added(kind: Kind, polynomial: int, bits: int, count: int) -> NDArray[np.uint32]:
-    """Return what each value of a byte adds to a CRC (bytes that follow, value), for fewer than ``count`` that follow."""
+def _contributions(kind: CrcKind, polynomial: int, bits: int, count: int) -> NDArray[np.uint32]:
+    """Return the contribution of each byte value to a CRC (bytes that follow, value), for up to ``count`` - 1 bytes."""
     table, step = kind(polynomial, bits)
     rows = [table]
     while len(rows) < count:
@@ -107,7 +108,7 @@ def _added(kind: Kind, polynomial: int, bits: int, count: int) -> NDArray[np.uin
 
 
 def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return table and step of a CRC that takes the least significant bit first."""
+    """Return table and step of a CRC with the least significant bit first."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(polynomial), table >> 1)
@@ -115,7 +116,7 @@ def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step
 
 
 def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return table and step of a CRC that takes the most significant bit first."""
+    """Return table and step of a CRC with the most significant bit first."""
     mask = np.uint32((1 << bits) - 1)
     table = np.arange(256, dtype=np.uint32) << np.uint32(bits - 8)
     for _ in range(8):

@@ -1,8 +1,7 @@
-"""Clouds of points: what a depth camera sees, or the files that its program leaves in a folder, one cloud at a time.
+"""Point clouds from a depth camera, or from files that another program saves to a folder.
 
-A chunk is one cloud: the content of a PLY or PCD file, or a `tacpipe.clouds.cloud.DepthFrame`. Each of its points is
-a row of the stream, all with the stamp of the cloud, in the columns of the stream ``scene`` that `tacpipe segment grasps`
-reads.
+A chunk is one cloud: the content of a PLY or PCD file, or a `tacpipe.clouds.cloud.DepthFrame`. Each point is a row with the
+timestamp of its cloud. The columns are those of the stream ``scene`` that `tacpipe segment grasps` reads.
 """
 
 from __future__ import annotations
@@ -26,38 +25,38 @@ from tacpipe.sensors.sensor import Samples, Sensor
 if TYPE_CHECKING:
     import pyarrow as pa
 
-NAMED = Path("a cloud")  # name in errors, as the file name is not known any more
-AT_HAND = 4  # clouds that are kept between the framer's look at them and their decoding
+NAME = Path("a cloud")  # name in errors, because the file name is not known here
+CACHED = 4  # clouds that are cached, because the framer and the decoder parse the same clouds
 
 
 @dataclass(frozen=True)
 class Clouds(Sensor):
-    """A source of clouds. Points that were not seen (NaN, or no depth) are left out."""
+    """A source of point clouds. Points without a measurement (NaN, or no depth) are dropped."""
 
-    summary: ClassVar[str] = "Depth cameras, and folders that clouds are saved to (PLY, PCD)."
+    summary: ClassVar[str] = "Depth cameras, and folders to which clouds are saved (PLY, PCD)."
     links: ClassVar[tuple[str, ...]] = ("folder", "camera")
 
-    colour: bool = True  # clouds have colours; one without is then refused, as is one with where this is false
-    unit_m: float = 1.0  # metres a unit of the files: 0.001 where they are in millimetres
-    rate_hz: float = 0.0  # clouds a second; 0: they come when they come
+    colour: bool = True  # True if the clouds have colours; clouds that differ are refused
+    unit_m: float = 1.0  # metres per unit of the files: 0.001 for millimetres
+    rate_hz: float = 0.0  # clouds per second; 0: irregular
 
     def __post_init__(self) -> None:
         if not self.unit_m > 0:
             raise UsageError(
-                f"clouds: unit_m is {self.unit_m:g}; it must be above 0: 1 for metres, 0.001 for millimetres."
+                f"clouds: unit_m is {self.unit_m:g}; it must be above 0, such as 1 for metres or 0.001 for millimetres."
             )
 
     def fields(self) -> list[pa.Field]:
-        """Return ``x_m``, ``y_m``, ``z_m``, float32, and with ``colour`` ``red``, ``green``, ``blue``, uint8."""
+        """Return ``x_m``, ``y_m``, ``z_m`` (float32), and with ``colour`` also ``red``, ``green``, ``blue`` (uint8)."""
         colours = np.zeros((0, 3), np.uint8) if self.colour else None
         return list(Cloud(np.zeros((0, 3), np.float32), colours).table().schema)
 
     def framer(self) -> Framer:
-        """Return a framer that takes chunks which are clouds, with colours as the options state."""
-        return TextFramer(self._is_right)
+        """Return a framer for chunks that are clouds, with or without colours as in the options."""
+        return TextFramer(self._is_valid)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return a row for each point; ``rows`` states of which cloud it is."""
+        """Return one row per point; ``rows`` is the index of its cloud."""
         clouds = [self._points(frame) for frame in frames]
         points = [xyz for xyz, _ in clouds] or [np.zeros((0, 3), np.float32)]
         rows = np.repeat(np.arange(len(clouds)), [len(xyz) for xyz, _ in clouds]).astype(np.int64)
@@ -67,7 +66,7 @@ class Clouds(Sensor):
         return Samples(values, rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return the PLY files that hold these points, one for each cloud."""
+        """Return these points as PLY files, one per cloud."""
         assert samples.rows is not None
         points = (samples.values[0] / np.float32(self.unit_m)).astype(np.float32)
         edges = np.flatnonzero(np.diff(samples.rows)) + 1
@@ -75,25 +74,25 @@ class Clouds(Sensor):
         return [point_files.pack_ply(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
 
     def _points(self, content: bytes) -> tuple[Float32s, Bytes | None]:
-        """Return the points that were seen (point, xyz), metres, and their colours (point, rgb)."""
-        xyz, colours = _parsed(content)
+        """Return the measured points (point, xyz) in metres, and their colours (point, rgb)."""
+        xyz, colours = _parse(content)
         is_finite = np.isfinite(xyz).all(axis=1)
         scale = np.float32(1.0 if content.startswith(MAGIC) else self.unit_m)
         return xyz[is_finite] * scale, None if colours is None else colours[is_finite]
 
-    def _is_right(self, content: bytes) -> bool:
+    def _is_valid(self, content: bytes) -> bool:
         try:
-            _, colours = _parsed(content)
+            _, colours = _parse(content)
         except TacpipeError:
             return False
         return (colours is not None) == self.colour
 
 
-@functools.lru_cache(maxsize=AT_HAND)
-def _parsed(content: bytes) -> tuple[Float32s, Bytes | None]:
-    """Return points and colours as they stand in a chunk. Raises `TacpipeError` where it is not a cloud."""
+@functools.lru_cache(maxsize=CACHED)
+def _parse(content: bytes) -> tuple[Float32s, Bytes | None]:
+    """Return points and colours of a chunk. Raises `TacpipeError` if it is not a cloud."""
     if content.startswith(MAGIC):
-        return DepthFrame.of_bytes(content).points()
+        return DepthFrame.from_bytes(content).points()
     if content.startswith(b"ply"):
-        return point_files.parse_ply(NAMED, content)
-    return point_files.parse_pcd(NAMED, content)
+        return point_files.parse_ply(NAME, content)
+    return point_files.parse_pcd(NAME, content)

@@ -1,11 +1,11 @@
-"""Contactile PapillArray sensors behind their controller, which speaks PTS v2.0 over USB.
+"""Contactile PapillArray sensors behind their controller, which sends PTS v2.0 over USB.
 
-Each sensor has pillars with force and displacement, and a force and torque as a whole; on demand the controller watches
-for slip. The frames' layout stands in `tacpipe.sensors.pts`. Commands are lines of text: ``f1000`` sets the rate, ``z``
-takes the load for zero, ``S`` and ``s`` switch the watch for slip on and off; none is answered.
-Source: the packages papillarray_hardware and contactile-papillarray-ros2, of which the facts were read.
+Each sensor has pillars with force and displacement, and a total force and torque; the controller can also detect slip.
+`tacpipe.sensors.pts` describes the frames. Commands are lines of text: ``f1000`` sets the rate, ``z`` zeroes the load, ``S``
+and ``s`` turn slip detection on and off. They are not answered.
+Source: facts from the packages papillarray_hardware and contactile-papillarray-ros2.
 
-The controller keeps frames of its last session and sends them first; `FreshFramer` throws them away.
+The controller buffers frames of its last session and sends them first; `FreshFramer` drops them.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 RATES = (100, 250, 500, 1000)
 COUNTER = 1 << 32
-LARGEST = 8192  # bytes of a frame
-JUMP_S = 0.25  # a counter that leaps farther than this lasts is not a loss: the session changed
+MAX_SIZE = 8192  # bytes of a frame
+JUMP_S = 0.25  # a counter that jumps by more than this time is a new session, not a loss
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Contactile(Sensor):
 
     sensors: int = 2  # number of sensors on the controller
     pillars: int = 9  # number of pillars per sensor
-    slip: bool = False  # watch for slip: states and friction of pillars and sensors
-    rate_hz: float = 500.0  # 100, 250, 500 or 1000
-    baud: int = 115200  # over USB any
+    slip: bool = False  # detect slip, and record states and friction of pillars and sensors
+    rate_hz: float = 500.0  # frames per second: 100, 250, 500 or 1000
+    baud: int = 115200  # baud rate; any rate works over USB
 
     def __post_init__(self) -> None:
         if self.rate_hz not in RATES:
@@ -57,15 +57,15 @@ class Contactile(Sensor):
         if self.sensors < 1 or self.pillars < 1 or self.sensors * self.pillars > 200:
             raise UsageError(
                 f"contactile: sensors is {self.sensors} and pillars {self.pillars}; "
-                f"both must be 1 or more, all pillars 200 at most."
+                f"both must be at least 1, and their product at most 200."
             )
 
     def fields(self) -> list[pa.Field]:
-        """Return the fields block by block, sensor by sensor in each.
+        """Return the fields in the order of the blocks, and within a block in the order of the sensors.
 
-        ``sensor1_pillar1_force_x_n`` and ``…_displacement_x_mm`` of all pillars, ``sensor1_force_x_n`` and
+        ``sensor1_pillar1_force_x_n`` and ``…_displacement_x_mm`` of all pillars, then ``sensor1_force_x_n`` and
         ``…_torque_x_n_mm``, float32. With slip also ``sensor1_pillar1_slip`` (int8), ``sensor1_pillar1_friction`` (float32),
-        ``sensor1_slip`` (uint8: 0 not watched, 1 watched, 2 and the reference pillar loaded), ``sensor1_friction`` and
+        ``sensor1_slip`` (uint8: 0 detection off, 1 on, 2 on and the reference pillar is loaded), ``sensor1_friction`` and
         ``sensor1_grip_force_n`` (float32).
         """
         import pyarrow as pa
@@ -79,9 +79,15 @@ class Contactile(Sensor):
         status, newton = {"unit": "1", "quantity": "status"}, {"unit": "N", "quantity": "force"}
         friction = {"unit": "1", "quantity": "friction"}
         fields = [
-            f for owner in pillars for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "displacement", "mm"))
+            field
+            for pillar in pillars
+            for field in (*_vector_fields(*pillar, "force", "N"), *_vector_fields(*pillar, "displacement", "mm"))
         ]
-        fields += [f for owner in sensors for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "torque", "N mm"))]
+        fields += [
+            field
+            for sensor in sensors
+            for field in (*_vector_fields(*sensor, "force", "N"), *_vector_fields(*sensor, "torque", "N mm"))
+        ]
         if self.slip:
             fields += [pa.field(f"{name}_slip", pa.int8(), metadata=status | layout) for name, layout in pillars]
             fields += [
@@ -94,36 +100,36 @@ class Contactile(Sensor):
         return fields
 
     def framer(self) -> Framer:
-        """Return a framer of frames whose sum and tables hold, without those of the last session."""
-        framing = Framing(marker=pts.MARKER, tail=pts.TAIL, most=LARGEST, check=pts.are_whole)
+        """Return a framer for frames with a right sum and valid tables, without frames of the last session."""
+        framing = Framing(marker=pts.MARKER, tail=pts.TAIL, max_size=MAX_SIZE, check=pts.are_whole)
         return FreshFramer(ByteFramer(framing), self._counters, COUNTER, round(JUMP_S * self.rate_hz))
 
     @staticmethod
     def _counters(frames: Bytes) -> Int64s:
         counters = np.zeros(len(frames), dtype=np.int64)
         for rows, layout in pts.layouts(frames):
-            assert layout is not None  # the framer's check saw to it
-            counters[rows] = _gathered(frames[rows], layout.places(pts.HUB), 4).view("<u4")[:, 0, 0]
+            assert layout is not None  # checked by the framer
+            counters[rows] = _gather(frames[rows], layout.offsets(pts.HUB), 4).view("<u4")[:, 0, 0]
         return counters
 
     def decode(self, frames: Bytes) -> Samples:
         """Return the values of all blocks, with the hub's counter and time.
 
-        Frames without the blocks of slip, as they come before the watch began, are left out where ``slip`` is set.
-        Raises `DeviceError` where the controller has other sensors than the options state.
+        With ``slip``, frames without slip blocks, which the controller sends before detection starts, are skipped. Raises
+        `DeviceError` if the controller has other sensors than the options.
         """
         parts: list[tuple[Int64s, tuple[AnyArray, ...], NDArray[np.uint8]]] = []
         for rows, layout in pts.layouts(frames):
-            assert layout is not None  # the framer's check saw to it
+            assert layout is not None  # checked by the framer
             if layout.counts != (self.pillars,) * self.sensors:
                 raise DeviceError(
-                    f"The controller has sensors of {', '.join(map(str, layout.counts)) or 'no'} pillars and the options "
-                    f"state {self.sensors} of {self.pillars}; set sensors and pillars."
+                    f"The controller has sensors with {', '.join(map(str, layout.counts)) or 'no'} pillars, but the options "
+                    f"declare {self.sensors} with {self.pillars}; correct sensors and pillars."
                 )
-            if self.slip and not layout.slips:
+            if self.slip and not layout.has_slip:
                 continue
             selected = frames[rows]
-            parts.append((rows, self._values(selected, layout), _gathered(selected, layout.places(pts.HUB), 12)[:, 0]))
+            parts.append((rows, self._values(selected, layout), _gather(selected, layout.offsets(pts.HUB), 12)[:, 0]))
         if not parts:
             return self._empty_samples()
         rows = np.concatenate([part[0] for part in parts])
@@ -135,21 +141,24 @@ class Contactile(Sensor):
         return Samples(values, seq=seq, t_device_ns=t_us * 1000, rows=rows[order])
 
     def _empty_samples(self) -> Samples:
-        none = np.zeros(0, dtype=np.int64)
+        no_rows = np.zeros(0, dtype=np.int64)
         layout = pts.parse(pts.template(self.sensors, self.pillars, slip=self.slip))
         return Samples(
-            self._values(np.zeros((0, LARGEST), dtype=np.uint8), layout), seq=none, t_device_ns=none, rows=none
+            self._values(np.zeros((0, MAX_SIZE), dtype=np.uint8), layout),
+            seq=no_rows,
+            t_device_ns=no_rows,
+            rows=no_rows,
         )
 
     def _values(self, frames: Bytes, layout: pts.PtsLayout) -> tuple[AnyArray, ...]:
         forces = np.hstack(
-            [_floats(_gathered(frames, layout.places(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
+            [_floats(_gather(frames, layout.offsets(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
         )
         if not self.slip:
             return (forces,)
-        slips = _gathered(frames, layout.places(pts.PILLAR_SLIP), 5)
-        wholes = _gathered(frames, layout.places(pts.SENSOR_SLIP), 9)
-        return forces, slips[..., 0].view(np.int8), _floats(slips[..., 1:]), wholes[..., 0], _floats(wholes[..., 1:])
+        slips = _gather(frames, layout.offsets(pts.PILLAR_SLIP), 5)
+        totals = _gather(frames, layout.offsets(pts.SENSOR_SLIP), 9)
+        return forces, slips[..., 0].view(np.int8), _floats(slips[..., 1:]), totals[..., 0], _floats(totals[..., 1:])
 
     def encode(self, samples: Samples) -> Bytes:
         """Return the frames of these samples."""
@@ -160,38 +169,38 @@ class Contactile(Sensor):
         frames = np.tile(np.frombuffer(frame, np.uint8), (count, 1))
         counter = (samples.seq % COUNTER).astype("<u4")[:, None].view(np.uint8)
         t_us = (samples.t_device_ns // 1000).astype("<u8")[:, None].view(np.uint8)
-        _scatter(frames, layout.places(pts.HUB), np.hstack([counter, t_us])[:, None])
+        _scatter(frames, layout.offsets(pts.HUB), np.hstack([counter, t_us])[:, None])
         forces, *slip = samples.values
-        entries = _bytes(forces, 24)  # bytes of all pillars, then of the sensors
-        _scatter(frames, layout.places(pts.PILLARS), entries[:, : -self.sensors])
-        _scatter(frames, layout.places(pts.SENSORS), entries[:, -self.sensors :])
+        entries = _bytes(forces, 24)  # all pillars, then the sensors
+        _scatter(frames, layout.offsets(pts.PILLARS), entries[:, : -self.sensors])
+        _scatter(frames, layout.offsets(pts.SENSORS), entries[:, -self.sensors :])
         if self.slip:
             states, friction, watched, grips = slip
             entries = np.concatenate([states.view(np.uint8)[..., None], _bytes(friction, 4)], axis=2)
-            _scatter(frames, layout.places(pts.PILLAR_SLIP), entries)
+            _scatter(frames, layout.offsets(pts.PILLAR_SLIP), entries)
             _scatter(
-                frames, layout.places(pts.SENSOR_SLIP), np.concatenate([watched[..., None], _bytes(grips, 8)], axis=2)
+                frames, layout.offsets(pts.SENSOR_SLIP), np.concatenate([watched[..., None], _bytes(grips, 8)], axis=2)
             )
         start, stop = len(pts.MARKER), -len(pts.TAIL)
         frames[:, stop - 2 : stop] = sum16(frames[:, start : stop - 2]).astype("<u2")[:, None].view(np.uint8)
         return frames
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Set the rate, and whether slip is watched for."""
+        """Set the rate, and turn slip detection on or off."""
         yield Ask(f"f{self.rate_hz:.0f}\n".encode(), pause_s=0.1)
         yield Ask(b"S\n" if self.slip else b"s\n")
 
     def taring(self) -> Dialogue:
-        """Take the present load for zero: nothing may touch the pillars for the two seconds that it takes."""
+        """Zero the load. Nothing may touch the pillars for the two seconds that this takes."""
         yield Ask(b"z\n", pause_s=2.0)
 
     def device(self) -> Device:
-        """Return a controller that streams from power-on at the rate that it was last stated."""
+        """Return an emulated controller that streams from power-on at the rate that was set last."""
         return _ContactileController()
 
 
 class _ContactileController(Device):
-    """The controller's side: lines of text, none answered."""
+    """An emulated controller, which receives lines of text and does not answer."""
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
@@ -203,13 +212,13 @@ class _ContactileController(Device):
         return []
 
 
-def _vector(owner: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:
+def _vector_fields(prefix: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:
     import pyarrow as pa
 
-    ending = unit.replace(" ", "_").lower()
+    suffix = unit.replace(" ", "_").lower()
     return [
         pa.field(
-            f"{owner}_{quantity}_{axis}_{ending}",
+            f"{prefix}_{quantity}_{axis}_{suffix}",
             pa.float32(),
             metadata={"unit": unit, "quantity": quantity, **layout, "component": axis},
         )
@@ -217,21 +226,21 @@ def _vector(owner: str, layout: Mapping[str, str], quantity: str, unit: str) -> 
     ]
 
 
-def _gathered(frames: Bytes, places: Int64s, size: int) -> Bytes:
-    """Return ``size`` bytes from each place (frame, place, byte)."""
-    return np.ascontiguousarray(frames[:, places[:, None] + np.arange(size)])
+def _gather(frames: Bytes, offsets: Int64s, size: int) -> Bytes:
+    """Return ``size`` bytes at each offset, shape (frame, offset, byte)."""
+    return np.ascontiguousarray(frames[:, offsets[:, None] + np.arange(size)])
 
 
-def _scatter(frames: Bytes, places: Int64s, values: Bytes) -> None:
-    frames[:, places[:, None] + np.arange(values.shape[2])] = values
+def _scatter(frames: Bytes, offsets: Int64s, values: Bytes) -> None:
+    frames[:, offsets[:, None] + np.arange(values.shape[2])] = values
 
 
 def _floats(data: Bytes) -> Float32s:
-    """Return the floats of entries (frame, entry, byte) side by side (frame, float)."""
+    """Return the floats of entries (frame, entry, byte) as (frame, float)."""
     floats = np.ascontiguousarray(data).view("<f4").astype(np.float32)
     return floats.reshape(len(data), floats.shape[1] * floats.shape[2])
 
 
 def _bytes(values: AnyArray, size: int) -> Bytes:
-    """Return values (frame, float) as entries (frame, entry, byte) of so many bytes."""
+    """Return values (frame, float) as entries (frame, entry, byte) of ``size`` bytes."""
     return np.ascontiguousarray(values, "<f4").view(np.uint8).reshape(len(values), -1, size)

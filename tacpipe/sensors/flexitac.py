@@ -1,8 +1,8 @@
-"""FlexiTac and boards of its kind: a grid of piezoresistive taxels, read row by row by an Arduino.
+"""FlexiTac and compatible boards: a grid of piezoresistive taxels, read row by row by an Arduino.
 
-A frame is ``AA 55`` and a byte a taxel, the ADC's upper eight bits of ten, row by row; it streams from power-up and takes no
-commands. There is neither length, nor counter, nor sum, and ``AA 55`` may stand among the taxels: what states the frames
-is that the mark repeats at their size.
+A frame is ``AA 55`` and one byte per taxel (the upper 8 of the ADC's 10 bits), row by row. The board streams from power-up
+and accepts no commands. There is no length, counter or checksum, and ``AA 55`` may occur within the taxels. Frames are
+therefore recognised by marks that repeat at the frame size.
 Source: the package flexitac 0.3.1 (MIT) and the firmware that comes with it.
 """
 
@@ -23,37 +23,37 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MARKER = b"\xaa\x55"
-MOST_TAXELS = 4094  # a frame of more is longer than any board sends, and than `Framing.most`
+MAX_TAXELS = 4094  # limited by `Framing.max_size`
 
 
 @dataclass(frozen=True)
 class FlexiTac(Sensor):
-    """A FlexiTac, or another grid that speaks as it does."""
+    """A FlexiTac, or another grid with the same protocol."""
 
     summary: ClassVar[str] = (
-        "FlexiTac: a grid of piezoresistive taxels behind an Arduino, of any number of rows and columns."
+        "FlexiTac: a grid of piezoresistive taxels with any number of rows and columns, read by an Arduino."
     )
     line: ClassVar[SerialLine] = SerialLine(
         settle_s=2.0
-    )  # opening the port resets an Arduino, which takes so long to boot
+    )  # opening the port resets an Arduino, which boots for up to 2 s
 
     rows: int = 12  # rows of the grid, as in the firmware
     columns: int = 32  # columns of the grid, as in the firmware
-    rate_hz: float = 100.0  # frames a second: about 85 to 105 of 12 x 32
+    rate_hz: float = 100.0  # frames per second: about 85 to 105 with 12 x 32 taxels
     baud: int = 2_000_000  # baud rate of the firmware
 
     def __post_init__(self) -> None:
-        sensor.positive("flexitac", rows=self.rows, columns=self.columns, rate_hz=self.rate_hz, baud=self.baud)
-        sensor.within("flexitac", "rows times columns", self.rows * self.columns, 1, MOST_TAXELS)
+        sensor.check_positive("flexitac", rows=self.rows, columns=self.columns, rate_hz=self.rate_hz, baud=self.baud)
+        sensor.check_range("flexitac", "rows times columns", self.rows * self.columns, 1, MAX_TAXELS)
 
     def fields(self) -> list[pa.Field]:
-        """Return ``taxel01`` to the last, row by row: uint8 counts of an ADC, up with pressure."""
+        """Return ``taxel01``, …, row by row: uint8 counts of an ADC that increase with pressure."""
         import pyarrow as pa
 
-        return sensor.grid(self.rows, self.columns, pa.uint8(), "count")
+        return sensor.grid_fields(self.rows, self.columns, pa.uint8(), "count")
 
     def framer(self) -> Framer:
-        """Return a framer that locks once the mark has repeated three times at the frame's size."""
+        """Return a framer that locks after three marks at the distance of the frame size."""
         return ByteFramer(Framing(marker=MARKER, size=2 + self.rows * self.columns, lock=3, confirm=1))
 
     def decode(self, frames: Bytes) -> Samples:

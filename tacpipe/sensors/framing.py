@@ -1,8 +1,7 @@
-"""Define chunks of bytes, the description of frames in them, losses, and the interface of framers.
+"""Define chunks of bytes, the description of frames, losses, and the interface of framers.
 
-Every framer accounts for every byte: it ends up in a frame, in a `FramingLoss`, or in what is still pending; `Account`
-holds the sums. `ByteFramer` is for streams of bytes, `LineFramer` for lines of text, `PacketFramer` and `TextFramer`
-for links that give packets.
+A framer accounts for every byte: it is in a frame, in a `FramingLoss`, or still pending. `Account` has the totals.
+`ByteFramer` is for streams of bytes, `LineFramer` for lines of text, `PacketFramer` and `TextFramer` for links with packets.
 """
 
 from __future__ import annotations
@@ -16,59 +15,59 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Int64s, Ints, Times
 
-START = "start"  # bytes before the first frame: recording began in the middle of one
-NOISE = "noise"  # bytes between whole frames
-CUT = "cut"  # a frame that began and is not whole
-GARBLED = "garbled"  # bytes as many as frames should have, but their sum or marks are wrong
-UNCONFIRMED = "unconfirmed"  # a frame right before a disturbance or at the end, for which nothing but its marks spoke
-MALFORMED = "malformed"  # a packet that is none of this protocol
+START = "start"  # bytes before the first frame, because recording started in the middle of a frame
+NOISE = "noise"  # bytes between complete frames
+CUT = "cut"  # an incomplete frame
+GARBLED = "garbled"  # as many bytes as in complete frames, but with wrong checksum or marks
+UNCONFIRMED = "unconfirmed"  # a frame with only marks, right before a disturbance or at the end
+MALFORMED = "malformed"  # a packet that does not follow the protocol
 
 
 @dataclass(frozen=True)
 class Chunks:
-    """The bytes of a link as they arrived, with their arrivals. Each chunk of a link of packets is one packet."""
+    """The bytes of a link in chunks, with arrival times. If the link is packet-based, each chunk is one packet."""
 
-    t_ns: Times  # (chunk,), arrival
+    t_ns: Times  # (chunk,), arrival in ns
     size: Int64s  # (chunk,), bytes
     data: bytes
 
     @classmethod
-    def of(cls, chunks: Iterable[tuple[int, bytes]]) -> Chunks:
-        """Return what was read as (arrival in ns, bytes) pairs."""
+    def from_pairs(cls, chunks: Iterable[tuple[int, bytes]]) -> Chunks:
+        """Return the chunks of (arrival in ns, bytes) pairs."""
         pairs = list(chunks)
         stamps = np.array([t_ns for t_ns, _ in pairs], dtype=np.int64)
         sizes = np.array([len(data) for _, data in pairs], dtype=np.int64)
         return cls(stamps, sizes, b"".join(data for _, data in pairs))
 
     @classmethod
-    def joined(cls, parts: Sequence[Chunks]) -> Chunks:
-        """Return several as one."""
+    def concatenate(cls, parts: Sequence[Chunks]) -> Chunks:
+        """Return the chunks of all parts, in order."""
         stamps = np.concatenate([part.t_ns for part in parts]) if parts else np.zeros(0, dtype=np.int64)
         sizes = np.concatenate([part.size for part in parts]) if parts else np.zeros(0, dtype=np.int64)
         return cls(stamps, sizes, b"".join(part.data for part in parts))
 
     def since(self, t_ns: int) -> Chunks:
-        """Return the chunks that arrived at a moment or later."""
+        """Return the chunks that arrived at or after ``t_ns``. ``self.t_ns`` must be ascending."""
         first = int(np.searchsorted(self.t_ns, t_ns))
         return Chunks(self.t_ns[first:], self.size[first:], self.data[int(self.size[:first].sum()) :])
 
     def packets(self) -> list[bytes]:
-        """Return the chunks one by one."""
+        """Return the bytes of each chunk."""
         ends = np.cumsum(self.size).tolist()
         return [self.data[stop - size : stop] for stop, size in zip(ends, self.size.tolist(), strict=True)]
 
 
 @dataclass(frozen=True)
 class FrameRun:
-    """Frames of one size in the order of their arrival: bytes (frame, byte), or a list of text frames."""
+    """Frames of one size in order of arrival: bytes (frame, byte), or a list of text frames."""
 
     frames: Any
-    t_ns: Times  # (frame,), arrival of the last byte of each
+    t_ns: Times  # (frame,), arrival of each frame's last byte in ns
 
 
 @dataclass(frozen=True)
 class FramingLoss:
-    """Bytes that are not a frame, what became of them, and how many frames are lost for it as far as the bytes state."""
+    """Bytes that are not a frame, the cause, and the number of lost frames as far as the bytes show it."""
 
     t_ns: int
     cause: str
@@ -78,7 +77,7 @@ class FramingLoss:
 
 @dataclass
 class Account:
-    """Bytes that came in, that are in frames, and that were thrown away; the rest is pending."""
+    """The numbers of bytes that were received, are in frames, and were discarded. The remaining bytes are pending."""
 
     received: int = 0
     framed: int = 0
@@ -86,59 +85,59 @@ class Account:
 
     @property
     def pending(self) -> int:
-        """How many bytes are not decided yet."""
+        """The number of bytes that are neither in a frame nor discarded yet."""
         return self.received - self.framed - self.lost
 
 
 class Framer(Protocol):
-    """An object that cuts bytes into frames."""
+    """An object that splits bytes into frames."""
 
     account: Account
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Take what a link gave; return the frames that are complete now, and what was lost."""
+        """Add bytes, and return the frames that are now complete, and the losses."""
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return what is left when nothing more comes, which ends the framer's work."""
+        """Return the last frames and losses at the end of the stream."""
 
 
 @dataclass(frozen=True)
 class Framing:
-    """How frames look in a stream of bytes."""
+    """The structure of frames in a stream of bytes."""
 
     marker: bytes = b""  # first bytes of each frame
     tail: bytes = b""  # last bytes of each frame
-    size: int | None = None  # size of a frame in bytes, where all have the same
-    header: int = 0  # bytes from which ``sizes`` states the size, the marker included
-    sizes: Callable[[Bytes], Ints] | None = None  # (frame, header) to (frame,), whole sizes
-    most: int = 4096  # largest size; a frame that states more of itself is none
-    check: Callable[[Bytes], Bools] | None = None  # (frame, byte) to (frame,)
-    lock: int = 2  # good frames in a row that it takes to lock
-    confirm: int = 0  # good frames that must follow one before it is given out
+    size: int | None = None  # size of a frame in bytes, if all frames have the same size
+    header: int = 0  # number of bytes, including the marker, that ``sizes`` needs
+    sizes: Callable[[Bytes], Ints] | None = None  # returns frame sizes (frame,) from headers (frame, header)
+    max_size: int = 4096  # longer frames are invalid
+    check: Callable[[Bytes], Bools] | None = None  # returns the mask (frame,) of good frames (frame, byte)
+    lock: int = 2  # number of consecutive good frames needed to lock
+    confirm: int = 0  # number of good frames that must follow a frame before it is returned
     weak: bool = (
-        False  # ``check`` is not a sum: frames that are none may pass it again and again while a payload holds still
+        False  # ``check`` is not a checksum: with a constant payload, bytes that are not a frame may pass repeatedly
     )
 
     @property
-    def summed(self) -> bool:
-        """Return whether a single frame can be recognised."""
+    def has_checksum(self) -> bool:
+        """True if ``check`` is a checksum, so that a single frame can be verified."""
         return self.check is not None and not self.weak
 
 
-class Pending:
-    """A stretch of bytes that grows at its end and is cut off at its front. Places are counted within ``data``.
+class ByteBuffer:
+    """A queue of bytes with their arrival times. Offsets are counted within ``data``.
 
-    The chunks at hand are few as long as all is well, so they stand in lists: these are faster than arrays then.
+    Usually only a few chunks are queued, so lists are faster than arrays.
     """
 
     def __init__(self) -> None:
         self.data = b""
-        self.base = 0  # how many bytes were cut off
+        self.base = 0  # number of bytes that were removed
         self._ends: list[int] = []  # ends of chunks, counted from the first byte of the link
-        self._stamps: list[int] = []  # (chunk,), arrival
+        self._stamps: list[int] = []  # (chunk,), arrival in ns
 
     def append(self, chunks: Chunks) -> None:
-        """Take what came."""
+        """Add bytes at the end."""
         end = self.base + len(self.data)
         if len(chunks.size) == 1:
             self._ends.append(end + len(chunks.data))
@@ -148,25 +147,25 @@ class Pending:
             self._stamps += chunks.t_ns.tolist()
         self.data = self.data + chunks.data if self.data else chunks.data
 
-    def arrival(self, place: int) -> int:
-        """Return the arrival of the byte at ``place`` in ns."""
-        return self._stamps[bisect_right(self._ends, self.base + place)]
+    def arrival(self, offset: int) -> int:
+        """Return the arrival of the byte at ``offset`` in ns."""
+        return self._stamps[bisect_right(self._ends, self.base + offset)]
 
-    def arrivals(self, places: Times | range) -> Times:
-        """Return the arrival (byte,) of the bytes at ``places`` (byte,), one or more in rising order."""
-        first = bisect_right(self._ends, self.base + int(places[0]))
-        last = bisect_right(self._ends, self.base + int(places[-1]), first)
+    def arrivals(self, offsets: Times | range) -> Times:
+        """Return the arrivals (byte,) in ns of the bytes at ``offsets`` (byte,), which must be ascending and not empty."""
+        first = bisect_right(self._ends, self.base + int(offsets[0]))
+        last = bisect_right(self._ends, self.base + int(offsets[-1]), first)
         if first == last:  # all in one chunk
-            arrivals_ns = np.empty(len(places), dtype=np.int64)
+            arrivals_ns = np.empty(len(offsets), dtype=np.int64)
             arrivals_ns.fill(self._stamps[first])
             return arrivals_ns
-        if isinstance(places, range):
-            places = np.arange(places.start, places.stop, places.step)
-        chunks = np.array(self._ends[first:last]).searchsorted(self.base + places, side="right")
+        if isinstance(offsets, range):
+            offsets = np.arange(offsets.start, offsets.stop, offsets.step)
+        chunks = np.array(self._ends[first:last]).searchsorted(self.base + offsets, side="right")
         return np.array(self._stamps[first : last + 1], dtype=np.int64)[chunks]
 
     def cut(self, count: int) -> None:
-        """Cut the first ``count`` bytes off."""
+        """Remove the first ``count`` bytes."""
         self.data = self.data[count:]
         self.base += count
         removed = bisect_right(self._ends, self.base)
@@ -174,14 +173,14 @@ class Pending:
 
 
 class PacketFramer:
-    """Takes each packet of a link for a frame: those of a known size whose check is right."""
+    """Treat each packet of a link as a frame if it has one of the sizes and passes the check."""
 
     def __init__(self, sizes: Sequence[int], check: Callable[[Bytes], Bools] | None = None) -> None:
         self.sizes, self.check = frozenset(sizes), check
         self.account = Account()
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the packets that are frames, those of one size together, and the others as losses."""
+        """Return the accepted packets in runs of equal size, and the others as losses."""
         self.account.received += len(chunks.data)
         runs, losses = [], []
         starts = np.cumsum(chunks.size) - chunks.size
@@ -202,5 +201,5 @@ class PacketFramer:
         return runs, losses
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return nothing: a packet is whole or it is none."""
+        """Return nothing: packets are never incomplete."""
         return [], []

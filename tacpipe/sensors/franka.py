@@ -1,8 +1,8 @@
-"""Franka Research 3 arms by the Franka Control Interface (FCI), version 10: the whole state of the robot every millisecond.
+"""Franka Research 3 arms with the Franka Control Interface (FCI), version 10: the robot's state every millisecond.
 
-A TCP connection to port 1337 asks for the state, which then comes by UDP as long as the connection stays: a u64 count of
-milliseconds and 1369 bytes, packed, little-endian, numbers as float32. Reading takes no right to move the arm. The Panda
-(FER) speaks FCI 5, whose layout differs. Source: the layout that libfranka publishes, as franky-sim 1.0.4 sends it.
+A TCP connection to port 1337 requests the state, which is sent by UDP while the connection is open: a u64 count of
+milliseconds and 1369 bytes, packed, little-endian, with numbers as float32. Reading does not need control of the arm. The
+Panda (FER) uses FCI 5, whose layout differs. Source: the layout published by libfranka, as sent by franky-sim 1.0.4.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 10
-HEADER = struct.Struct("<III")  # command, number of the message, its size in bytes with this header
-CONNECT = struct.Struct("<IIIHH")  # header, version, UDP port that the state is sent to
+HEADER = struct.Struct("<III")  # command, number of the message, size in bytes including this header
+CONNECT = struct.Struct("<IIIHH")  # header, version, UDP port for the state
 CONNECTED = struct.Struct("<IIIHH4x")  # header, status, version of the robot
 CONNECT_COMMAND, DONE, OTHER_VERSION = 0, 0, 1
-LARGEST = 1 << 20  # bytes of a message; more is none
-RATE_HZ = 1000.0  # fixed
+MAX_MESSAGE = 1 << 20  # bytes
+RATE_HZ = 1000.0  # fixed by the device
 JOINTS = 7
 FLAGS = 41  # kinds of errors
 AFFINE = 1e-3  # tolerance of the last row of a pose to (0, 0, 0, 1)
 
-POSE, INERTIA = 16, 9  # matrices, column after column
-FLOATS = {  # names and counts of numbers, in their order
+POSE, INERTIA = 16, 9  # number of matrix elements, in column-major order
+FLOATS = {  # number of floats by name, in order
     **dict.fromkeys(("O_T_EE", "O_T_EE_d", "F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE"), POSE),
     **{"m_ee": 1, "I_ee": INERTIA, "F_x_Cee": 3, "m_load": 1, "I_load": INERTIA, "F_x_Cload": 3},
     **{"elbow": 2, "elbow_d": 2},
@@ -52,8 +52,16 @@ STATE = np.dtype(
     + [("motion_mode", "u1"), ("control_mode", "u1"), ("errors", "u1", FLAGS), ("last_errors", "u1", FLAGS)]
     + [("robot_mode", "u1"), ("success_rate", "<f4")]
 )
-MEASURED, AIMED = "O_T_EE", "O_T_EE_d"  # poses
-READ = (MEASURED, "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")  # floats that are read
+MEASURED, TARGET = "O_T_EE", "O_T_EE_d"  # poses
+READ = (
+    MEASURED,
+    "q",
+    "dq",
+    "tau_J",
+    "tau_ext_hat_filtered",
+    "O_F_ext_hat_K",
+    "success_rate",
+)  # floats that become channels
 MODES = ("robot_mode", "motion_mode", "control_mode")
 ERRORS = ("errors", "last_errors")
 
@@ -62,28 +70,26 @@ ERRORS = ("errors", "last_errors")
 class Franka(Sensor):
     """The arm of a Franka Research 3, without its hand."""
 
-    summary: ClassVar[str] = "Franka Research 3 arms by the Franka Control Interface (FCI), version 10."
+    summary: ClassVar[str] = "Franka Research 3 arms with the Franka Control Interface (FCI), version 10."
     links: ClassVar[tuple[str, ...]] = ("tcp+udp",)
-    counter: ClassVar[int | None] = 1 << 62  # u64 milliseconds, of which none was ever sent beyond
+    counter: ClassVar[int | None] = 1 << 62  # u64 milliseconds, which never reach this value
     exclusive: ClassVar[str] = (
-        "The arm serves one FCI connection: while this one reads, no other program can move it by FCI, nor can Desk; a "
-        "program that moves it must send its state to a tap itself."
+        "The arm accepts one FCI connection: while it is recorded, neither Desk nor another program can move it by FCI. A "
+        "program that moves it must send its state to a tap."
     )
 
-    targets: bool = False  # the pose that the controller aims at (O_T_EE_d) is recorded too
-    rate_hz: float = RATE_HZ  # fixed
+    targets: bool = False  # record the controller's target pose (O_T_EE_d), too
+    rate_hz: float = RATE_HZ  # states per second, fixed by the device
 
     def __post_init__(self) -> None:
         if self.rate_hz != RATE_HZ:
-            raise UsageError(f"franka: rate_hz is {self.rate_hz:g}; the arm always sends {RATE_HZ:g} states a second.")
+            raise UsageError(f"franka: rate_hz is {self.rate_hz:g}; it must be {RATE_HZ:g}, the fixed rate of the arm.")
 
     def fields(self) -> list[pa.Field]:
-        """Return pose of the end effector, angles, velocities, torques, external torques, external load, modes, errors.
+        """Return end-effector pose, joint angles, velocities, torques, external torques, external load, modes, errors.
 
-        With ``targets`` the pose that the controller aims at stands behind the load.
-
-        Floats are widened to the float64 that arms have elsewhere; the load is that on the stiffness frame, in the frame
-        of the base; errors are a bit each, in the order of the interface.
+        With ``targets``, the target pose follows the load. Floats are converted to float64, as for other arms. The load acts
+        on the stiffness frame and is in the base frame. Each error is one bit, in the order of the interface.
         """
         import pyarrow as pa
 
@@ -109,40 +115,40 @@ class Franka(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer that takes packets of a state's size whose numbers are finite, and whose pose is one."""
-        poses = (MEASURED, AIMED) if self.targets else (MEASURED,)
+        """Return a framer for packets with the size of a state, finite numbers and a valid pose."""
+        poses = (MEASURED, TARGET) if self.targets else (MEASURED,)
         return PacketFramer([STATE.itemsize], lambda packets: _are_states(packets, *poses))
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the samples of states, with their count of milliseconds for time and counter."""
+        """Return the samples of states. The count of milliseconds is both time and counter."""
         states = np.ascontiguousarray(frames).view(STATE)[:, 0]
         floats = [states[name].astype(np.float64) for name in READ[1:-1]]
-        floats += [_poses(states, AIMED)] if self.targets else []
+        floats += [_poses(states, TARGET)] if self.targets else []
         count_ms = states["message_id"].astype(np.int64)
         return Samples(
             (
                 np.hstack([_poses(states, MEASURED), *floats]),
                 states["success_rate"][:, None].astype(np.float32),
                 np.column_stack([states[name] for name in MODES]),
-                np.column_stack([_packed(states[name]) for name in ERRORS]),
+                np.column_stack([_pack_flags(states[name]) for name in ERRORS]),
             ),
             seq=count_ms,
             t_device_ns=count_ms * 1_000_000,
         )
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return states that hold these samples, their other fields zero; the pose is exact to a float32."""
+        """Return states with these samples and zeros in all other fields. The pose has float32 precision."""
         floats, success_rate, modes, errors = samples.values
         assert samples.seq is not None
         states = np.zeros(len(samples), STATE)
         states["message_id"] = samples.seq
         states[MEASURED] = _flat(floats[:, :7])
         if self.targets:
-            states[AIMED] = _flat(floats[:, -7:])
-        place = 7
+            states[TARGET] = _flat(floats[:, -7:])
+        column = 7
         for name in READ[1:-1]:
-            states[name] = floats[:, place : place + FLOATS[name]]
-            place += FLOATS[name]
+            states[name] = floats[:, column : column + FLOATS[name]]
+            column += FLOATS[name]
         states["success_rate"] = success_rate[:, 0]
         for number, name in enumerate(MODES):
             states[name] = modes[:, number]
@@ -151,18 +157,18 @@ class Franka(Sensor):
         return states.view(np.uint8).reshape(len(samples), STATE.itemsize)
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Ask for the state at the port that the link listens on. Raises `DeviceError` if the arm refuses."""
+        """Request the state at the port on which the link listens. Raises `DeviceError` if the arm refuses."""
         request = CONNECT.pack(CONNECT_COMMAND, 1, CONNECT.size, VERSION, local["port"])
-        reply = yield Ask(request, whole, what="the arm's reply to a connection (FCI must be activated in Desk)")
+        reply = yield Ask(request, message_size, what="the arm's reply to a connection (FCI must be activated in Desk)")
         if len(reply) < CONNECTED.size:
             raise DeviceError(
-                f"The arm's reply has {len(reply)} bytes; it should have {CONNECTED.size}. Is this an FCI?"
+                f"The arm's reply has {len(reply)} bytes; it should have {CONNECTED.size}. Check the address."
             )
         _, _, _, status, version = CONNECTED.unpack(reply[: CONNECTED.size])
         if status == OTHER_VERSION or version != VERSION:
             raise DeviceError(
-                f"The arm speaks FCI version {version}, and {VERSION} can be read, that of the Franka Research 3. Update "
-                f"its system, or record its state through a tap."
+                f"The arm uses FCI version {version}; only version {VERSION} (Franka Research 3) is supported. Update its "
+                f"system, or record its state through a tap."
             )
         if status != DONE:
             raise DeviceError(f"The arm refused the connection with status {status}. Activate FCI in Desk.")
@@ -173,9 +179,9 @@ class Franka(Sensor):
 
 
 class _Arm(Device):
-    """The arm's side of a connection.
+    """An emulated arm.
 
-    It sends its state to ``port`` once that was given, and answers no other command.
+    It sends its state to ``port`` once a connection has set it, and answers no other command.
     """
 
     port: int | None = None
@@ -183,7 +189,7 @@ class _Arm(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         replies = []
-        while (size := whole(bytes(self.heard))) > 0:
+        while (size := message_size(bytes(self.heard))) > 0:
             message = bytes(self.heard[:size])
             del self.heard[:size]
             command, number, _ = HEADER.unpack_from(message)
@@ -196,51 +202,53 @@ class _Arm(Device):
         return replies
 
 
-def whole(data: bytes) -> int:
-    """Return how many bytes the message at the front of ``data`` takes, 0 while it is not whole.
+def message_size(data: bytes) -> int:
+    """Return the size of the message at the front of ``data``, or 0 if it is incomplete.
 
-    Raises `DeviceError` where none can begin there.
+    Raises `DeviceError` if the size in its header is invalid.
     """
     if len(data) < HEADER.size:
         return 0
     size = int(HEADER.unpack_from(data)[2])
-    if not HEADER.size <= size <= LARGEST:
-        raise DeviceError(f"A message of {size} bytes came where one of FCI should be. Is this the arm's address?")
+    if not HEADER.size <= size <= MAX_MESSAGE:
+        raise DeviceError(
+            f"The device sent a message of {size} bytes, which is not FCI. Check that this is the arm's address."
+        )
     return size if len(data) >= size else 0
 
 
 def _matrices(states: NDArray[np.void], name: str) -> Float32s:
-    """Return a pose of the end effector in the base's frame as matrices (frame, 4, 4)."""
+    """Return an end-effector pose in the base frame as matrices (frame, 4, 4)."""
     poses: Float32s = states[name].reshape(-1, 4, 4).transpose(0, 2, 1)
     return poses
 
 
 def _poses(states: NDArray[np.void], name: str) -> Floats:
-    """Return a pose of the end effector as position and quaternion (frame, 7)."""
+    """Return an end-effector pose as position and quaternion (frame, 7)."""
     pose = _matrices(states, name).astype(np.float64)
     return np.hstack([pose[:, :3, 3], kinematics.quaternions_of(pose[:, :3, :3])])
 
 
 def _flat(poses: Floats) -> Floats:
-    """Return positions with quaternions (frame, 7) as matrices, column after column (frame, 16)."""
+    """Return positions with quaternions (frame, 7) as column-major matrices (frame, 16)."""
     matrices = np.zeros((len(poses), 4, 4))
     matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = kinematics.matrices_of(poses[:, 3:]), poses[:, :3], 1
     return matrices.transpose(0, 2, 1).reshape(-1, POSE)
 
 
-def _packed(flags: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Return flags (frame, flag) as a bit each of one number (frame,), the first the lowest."""
+def _pack_flags(flags: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Return flags (frame, flag) as bits of one number (frame,). The first flag is the lowest bit."""
     packed: NDArray[np.uint64] = ((flags != 0).astype(np.uint64) << np.arange(FLAGS, dtype=np.uint64)).sum(axis=1)
     return packed
 
 
 def _are_states(frames: Bytes, *poses: str) -> Bools:
-    """Return which packets (frame,) hold finite numbers, and poses that are such in these fields."""
+    """Return a mask (frame,) of the packets with finite numbers and valid poses in the fields ``poses``."""
     states = np.ascontiguousarray(frames).view(STATE)[:, 0]
     good = np.ones(len(states), dtype=bool)
     for name in {*READ, *poses}:
         good &= np.isfinite(states[name]).reshape(len(states), -1).all(axis=1)
     for name in poses:
-        last = np.where(good[:, None], _matrices(states, name)[:, 3], 0)
-        good &= (np.abs(last - (0, 0, 0, 1)) <= AFFINE).all(axis=1)
+        last_row = np.where(good[:, None], _matrices(states, name)[:, 3], 0)
+        good &= (np.abs(last_row - (0, 0, 0, 1)) <= AFFINE).all(axis=1)
     return good

@@ -1,4 +1,4 @@
-"""A lab's own board, described in the rig file and nowhere else: its frame, number by number, and what they are for.
+"""A board with binary frames that the rig file describes: the numbers of a frame, and their roles.
 
 [stream.options]
 rate_hz = 500
@@ -27,63 +27,78 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing, PacketFramer
-from tacpipe.sensors.layout import Board, Clock, DescribedSensor, Length, Number, Order, Place, Sequence, Sum, device_ns
+from tacpipe.sensors.layout import (
+    Board,
+    Clock,
+    DescribedSensor,
+    Length,
+    Number,
+    NumberSpan,
+    Order,
+    Sequence,
+    Sum,
+    device_ns,
+)
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-MOST = 4096  # bytes of a frame
+MAX_SIZE = 4096  # bytes of a frame
 
 
 @dataclass(frozen=True, kw_only=True)
 class Generic(DescribedSensor):
-    """A board that the rig file describes."""
+    """A board whose binary frames the rig file describes."""
 
-    summary: ClassVar[str] = "A lab's own board: binary frames as the rig file describes them."
+    summary: ClassVar[str] = "Custom boards with binary frames that the rig file describes."
     links: ClassVar[tuple[str, ...]] = ("serial", "tcp", "udp", "hid")
 
-    rate_hz: float  # frames a second
-    numbers: tuple[Number, ...]  # the numbers between marker and tail, in their order, without gaps
-    marker: str = ""  # bytes that each frame begins with, in hexadecimal: "AA 55"
-    tail: str = ""  # bytes that each frame ends with, in hexadecimal: "0D 0A"
-    order: Order = "little"  # byte order of numbers: little or big, the end that comes first
-    sum: Sum | None = None  # how a frame is summed, and which number holds that
+    rate_hz: float  # frames per second
+    numbers: tuple[Number, ...]  # the numbers between marker and tail, in order, without gaps
+    marker: str = ""  # first bytes of each frame, in hexadecimal: "AA 55"
+    tail: str = ""  # last bytes of each frame, in hexadecimal: "0D 0A"
+    order: Order = "little"  # byte order of numbers
+    sum: Sum | None = None  # the checksum of a frame, and the number that contains it
     sequence: Sequence | None = None  # the number that counts the frames
-    clock: Clock | None = None  # the number that is the device's time
-    length: Length | None = None  # the number that states the size of a frame; none: all have the same
-    packets: bool = False  # each packet of the link is a frame (udp, hid), which then needs no marker
-    start: str = ""  # bytes that start the stream, in hexadecimal; none: the board streams by itself
+    clock: Clock | None = None  # the number that contains the device's time
+    length: Length | None = (
+        None  # the number that contains the size of a frame; if absent, all frames have the same size
+    )
+    packets: bool = False  # each packet of the link is one frame (udp, hid), so no marker is needed
+    start: str = ""  # bytes that start the stream, in hexadecimal; empty: the board streams by itself
     stop: str = ""  # bytes that stop the stream, in hexadecimal
     baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
-        sensor.positive("generic", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.check_positive("generic", rate_hz=self.rate_hz, baud=self.baud)
         for name in ("marker", "tail", "start", "stop"):
             _bytes(name, getattr(self, name))
         if not (self.marker or self.tail or self.packets):
             raise UsageError(
-                'generic: no option marks where a frame begins; give marker or tail, such as marker = "AA 55", or '
-                "packets = true where each packet of the link is a frame."
+                'generic: no option defines where a frame starts; give marker or tail, such as marker = "AA 55", or '
+                "packets = true if each packet of the link is a frame."
             )
-        if self.size > MOST:
-            raise UsageError(f"generic: a frame has {self.size} bytes; it must be {MOST} at most.")
+        if self.size > MAX_SIZE:
+            raise UsageError(f"generic: a frame has {self.size} bytes; it must have at most {MAX_SIZE}.")
         if not self._channels:
-            raise UsageError("generic: no number is a channel; list in numbers what the board measures.")
+            raise UsageError("generic: no number is a channel; list the measured values in numbers.")
         self._check_names()
         self._check_roles()
-        place = self._places[self.clock.number] if self.clock is not None else None
-        if self.clock is not None and place is not None and place.kind.kind in "ui" and place.width < 8:
-            wrap_ns = place.range * layout.UNITS_NS[self.clock.unit]  # a u32 of microseconds wraps after 71.6 minutes
+        span = self._spans[self.clock.number] if self.clock is not None else None
+        if self.clock is not None and span is not None and span.dtype.kind in "ui" and span.width < 8:
+            wrap_ns = (
+                span.value_count * layout.UNITS_NS[self.clock.unit]
+            )  # a u32 in microseconds wraps after 71.6 minutes
             object.__setattr__(self, "device_wrap_ns", wrap_ns)
 
     def _check_names(self) -> None:
-        names = [name for place in self._channels for name, _ in _names(place.number)]
+        names = [name for span in self._channels for name, _ in _names(span.number)]
         if repeated := next((name for name in names if names.count(name) > 1), None):
             raise UsageError(f"generic: two channels are named {repeated}; give the numbers other names.")
 
     def _check_roles(self) -> None:
-        """Raise `UsageError` unless sum, sequence, clock and length each have a number of their own that can hold it."""
+        """Raise `UsageError` unless sum, sequence, clock and length each have their own number of a suitable type."""
         roles = [role for role in (self.sum, self.sequence, self.clock, self.length) if role is not None]
         numbers = [role.number for role in roles]
         if repeated := next((name for name in numbers if numbers.count(name) > 1), None):
@@ -91,173 +106,174 @@ class Generic(DescribedSensor):
                 f"generic: the number {repeated} has two roles; each of sum, sequence, clock, length needs its own."
             )
         if self.sum is not None:
-            layout.summed(self.sum, layout.referred(self._places, "sum", self.sum.number), self.size)
+            layout.summed_bytes(self.sum, layout.span_of_role(self._spans, "sum", self.sum.number), self.size)
         if self.sequence is not None:
-            place = layout.referred(self._places, "sequence", self.sequence.number)
-            sensor.within("generic", "width of the sequence in bits", 8 * place.width, 8, 32)
-            if not (self.sequence.modulus == 0 or 2 <= self.sequence.modulus <= place.range):
+            span = layout.span_of_role(self._spans, "sequence", self.sequence.number)
+            sensor.check_range("generic", "width of the sequence in bits", 8 * span.width, 8, 32)
+            if not (self.sequence.modulus == 0 or 2 <= self.sequence.modulus <= span.value_count):
                 raise UsageError(
-                    f"generic: the sequence has modulus = {self.sequence.modulus}; its number is {place.number.type}, so it "
-                    f"must be between 2 and {place.range}, or 0 for that."
+                    f"generic: the sequence has modulus = {self.sequence.modulus}; its number is {span.number.type}, so it "
+                    f"must be between 2 and {span.value_count}, or 0 for {span.value_count}."
                 )
-            sensor.within("generic", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
+            sensor.check_range("generic", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
         if self.clock is not None:
-            layout.referred(self._places, "clock", self.clock.number, "uif")
+            layout.span_of_role(self._spans, "clock", self.clock.number, "uif")
         if self.length is not None:
-            place = layout.referred(self._places, "length", self.length.number)
-            if not 0 <= self.size - self.length.plus < place.range:
+            span = layout.span_of_role(self._spans, "length", self.length.number)
+            if not 0 <= self.size - self.length.plus < span.value_count:
                 raise UsageError(
-                    f"generic: the length would be {self.size - self.length.plus} for a frame of {self.size} bytes, of "
-                    f"which it does not count {self.length.plus}, as plus states; it must be between 0 and "
-                    f"{place.range - 1}."
+                    f"generic: the length would be {self.size - self.length.plus} for a frame of {self.size} bytes with "
+                    f"plus = {self.length.plus}; it must be between 0 and {span.value_count - 1}."
                 )
 
     @functools.cached_property
-    def _places(self) -> dict[str, Place]:
-        return layout.places(self.numbers, len(_bytes("marker", self.marker)), self.order)
+    def _spans(self) -> dict[str, NumberSpan]:
+        return layout.number_spans(self.numbers, len(_bytes("marker", self.marker)), self.order)
 
     @functools.cached_property
     def size(self) -> int:
-        """How many bytes a frame with a sample has."""
-        last = max((place.stop for place in self._places.values()), default=len(_bytes("marker", self.marker)))
+        """Bytes of a frame with a sample."""
+        last = max((span.stop for span in self._spans.values()), default=len(_bytes("marker", self.marker)))
         return last + len(_bytes("tail", self.tail))
 
     @functools.cached_property
-    def _channels(self) -> list[Place]:
+    def _channels(self) -> list[NumberSpan]:
         roles = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
         return [
-            place
-            for name, place in self._places.items()
-            if name not in roles and not place.number.skip and place.number.equals is None
+            span
+            for name, span in self._spans.items()
+            if name not in roles and not span.number.skip and span.number.equals is None
         ]
 
-    def _counting(self) -> tuple[Sequence, int] | None:
-        return None if self.sequence is None else (self.sequence, self._places[self.sequence.number].range)
+    def _counter_option(self) -> tuple[Sequence, int] | None:
+        return None if self.sequence is None else (self.sequence, self._spans[self.sequence.number].value_count)
 
     def fields(self) -> list[pa.Field]:
-        """Return a field a channel, in the order of the numbers, with unit, quantity, taxel and axis."""
+        """Return one field per channel, in the order of the numbers, with unit, quantity, taxel and axis."""
         import pyarrow as pa
 
         return [
-            pa.field(name, pa.from_numpy_dtype(place.kind), metadata=metadata)
-            for place in self._channels
-            for name, metadata in _names(place.number)
+            pa.field(name, pa.from_numpy_dtype(span.dtype), metadata=metadata)
+            for span in self._channels
+            for name, metadata in _names(span.number)
         ]
 
     def framer(self) -> Framer:
-        """Return a framer of frames with marker, tail, sum and what is always the same."""
-        fixed = [place for place in self._places.values() if place.number.equals is not None]
-        check = self._is_right if self.sum or fixed else None
+        """Return a framer for frames with marker, tail, checksum and constant numbers."""
+        fixed = [span for span in self._spans.values() if span.number.equals is not None]
+        check = self._are_valid if self.sum or fixed else None
         if self.packets:
             return PacketFramer([self.size], self._has_marks)
         marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
         weak = self.sum is None
         confirm = int(layout.SUMS[self.sum.kind][1] == 1) if self.sum else int(bool(marker))
-        framing = Framing(marker, tail, check=check, lock=3 if weak else 2, confirm=confirm, most=MOST, weak=weak)
+        framing = Framing(
+            marker, tail, check=check, lock=3 if weak else 2, confirm=confirm, max_size=MAX_SIZE, weak=weak
+        )
         if self.length is None:
             return ByteFramer(replace(framing, size=self.size))
-        header = max(self._places[self.length.number].stop, len(marker) + 1)
+        header = max(self._spans[self.length.number].stop, len(marker) + 1)
         return ByteFramer(replace(framing, header=header, sizes=self._sizes))
 
     def _sizes(self, heads: Bytes) -> Int64s:
         assert self.length is not None
-        declared = self._places[self.length.number].take(heads)[:, 0]
-        sizes: Int64s = np.minimum(declared.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
+        declared = self._spans[self.length.number].read(heads)[:, 0]
+        sizes: Int64s = np.minimum(declared.astype(np.uint64), MAX_SIZE + 1).astype(np.int64) + self.length.plus
         return sizes
 
-    def _is_right(self, frames: Bytes) -> Bools:
-        """Return which frames (frame, byte) of one size have their sum, and what is always the same.
+    def _are_valid(self, frames: Bytes) -> Bools:
+        """Return a mask (frame,) of the frames (frame, byte) with the right checksum and constant numbers.
 
-        In a frame of another size than a sample's the sum is as far from the end, and nothing else is known.
+        In frames of another size than those with samples, only the checksum is tested, at the same distance from the end.
         """
         good = np.ones(len(frames), dtype=bool)
-        longer = frames.shape[1] - self.size
-        for place in self._places.values():
-            if place.number.equals is not None and not longer:
-                good &= (place.take(frames) == place.number.equals).all(axis=1)
+        extra = frames.shape[1] - self.size
+        for span in self._spans.values():
+            if span.number.equals is not None and not extra:
+                good &= (span.read(frames) == span.number.equals).all(axis=1)
         if self.sum is not None:
-            place = self._places[self.sum.number]
-            span = layout.summed(self.sum, place, self.size)
-            moved = Place(place.number, place.at + longer, place.order)
-            stop = span.stop + longer
-            if moved.at < 0 or stop <= span.start:
+            span = self._spans[self.sum.number]
+            summed = layout.summed_bytes(self.sum, span, self.size)
+            moved = NumberSpan(span.number, span.start + extra, span.order)
+            stop = summed.stop + extra
+            if moved.start < 0 or stop <= summed.start:
                 return np.zeros(len(frames), dtype=bool)
-            good &= layout.SUMS[self.sum.kind][0](frames[:, span.start : stop]) == moved.take(frames)[:, 0]
+            good &= layout.SUMS[self.sum.kind][0](frames[:, summed.start : stop]) == moved.read(frames)[:, 0]
         return good
 
     def _has_marks(self, packets: Bytes) -> Bools:
-        """Return which packets (packet, byte) have marker and tail, and are right otherwise."""
-        good = self._is_right(packets)
+        """Return a mask (packet,) of the valid packets (packet, byte) with marker and tail."""
+        good = self._are_valid(packets)
         marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
         good &= (packets[:, : len(marker)] == np.frombuffer(marker, np.uint8)).all(axis=1)
         good &= (packets[:, self.size - len(tail) :] == np.frombuffer(tail, np.uint8)).all(axis=1)
         return good
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the channels (frame, channel), side by side by their type, with sequence and clock.
+        """Return the channels (frame, channel) in one block per type, with sequence and clock.
 
-        Frames of another size than the numbers have together hold no sample.
+        Frames whose size differs from that of the numbers contain no sample.
         """
         if frames.shape[1] != self.size:
             frames, rows = np.zeros((0, self.size), dtype=np.uint8), np.zeros(0, dtype=np.int64)
         else:
             rows = None
         values = tuple(
-            np.hstack([place.take(frames) for place in block]) if len(block) > 1 else block[0].take(frames)
+            np.hstack([span.read(frames) for span in block]) if len(block) > 1 else block[0].read(frames)
             for block in self._blocks
         )
         seq = t_device_ns = None
         if self.sequence is not None:
-            seq = self._places[self.sequence.number].take(frames)[:, 0].astype(np.int64)
+            seq = self._spans[self.sequence.number].read(frames)[:, 0].astype(np.int64)
         if self.clock is not None:
-            ticks = self._places[self.clock.number].take(frames)[:, 0]
+            ticks = self._spans[self.clock.number].read(frames)[:, 0]
             t_device_ns = device_ns(ticks, self.clock.unit)
         return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
 
     @functools.cached_property
-    def _blocks(self) -> list[list[Place]]:
-        """Neighbouring channels of one type."""
-        blocks: list[list[Place]] = []
-        for place in self._channels:
-            if blocks and blocks[-1][0].kind == place.kind:
-                blocks[-1].append(place)
+    def _blocks(self) -> list[list[NumberSpan]]:
+        """Groups of adjacent channels of one type."""
+        blocks: list[list[NumberSpan]] = []
+        for span in self._channels:
+            if blocks and blocks[-1][0].dtype == span.dtype:
+                blocks[-1].append(span)
             else:
-                blocks.append([place])
+                blocks.append([span])
         return blocks
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the frames of these samples, 0 in what is skipped."""
+        """Return the frames of these samples, with 0 in skipped numbers."""
         frames = np.zeros((len(samples), self.size), dtype=np.uint8)
         marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
         frames[:, : len(marker)] = np.frombuffer(marker, np.uint8)
         frames[:, self.size - len(tail) :] = np.frombuffer(tail, np.uint8)
         for block, values in zip(self._blocks, samples.values, strict=True):
             first = 0
-            for place in block:
-                place.put(frames, values[:, first : first + place.many])
-                first += place.many
-        for place in self._places.values():
-            if place.number.equals is not None:
-                place.put(frames, np.full((len(frames), place.many), place.number.equals, dtype=place.kind))
+            for span in block:
+                span.write(frames, values[:, first : first + span.length])
+                first += span.length
+        for span in self._spans.values():
+            if span.number.equals is not None:
+                span.write(frames, np.full((len(frames), span.length), span.number.equals, dtype=span.dtype))
         if self.length is not None:
-            self._put(self.length.number, frames, np.full(len(frames), self.size - self.length.plus))
+            self._write(self.length.number, frames, np.full(len(frames), self.size - self.length.plus))
         if self.sequence is not None and samples.seq is not None:
-            self._put(self.sequence.number, frames, samples.seq % self.counter_modulus)
+            self._write(self.sequence.number, frames, samples.seq % self.counter_modulus)
         if self.clock is not None and samples.t_device_ns is not None:
-            place, unit_ns = self._places[self.clock.number], layout.UNITS_NS[self.clock.unit]
+            span, unit_ns = self._spans[self.clock.number], layout.UNITS_NS[self.clock.unit]
             ticks: AnyArray = samples.t_device_ns / unit_ns
-            if place.kind.kind != "f":
+            if span.dtype.kind != "f":
                 ticks = (samples.t_device_ns + unit_ns // 2) // unit_ns
-                ticks = ticks % place.range if place.kind.kind == "u" and place.width < 8 else ticks
-            self._put(self.clock.number, frames, ticks)
+                ticks = ticks % span.value_count if span.dtype.kind == "u" and span.width < 8 else ticks
+            self._write(self.clock.number, frames, ticks)
         if self.sum is not None:
-            span = layout.summed(self.sum, self._places[self.sum.number], self.size)
-            self._put(self.sum.number, frames, layout.SUMS[self.sum.kind][0](frames[:, span]))
+            summed = layout.summed_bytes(self.sum, self._spans[self.sum.number], self.size)
+            self._write(self.sum.number, frames, layout.SUMS[self.sum.kind][0](frames[:, summed]))
         return frames
 
-    def _put(self, name: str, frames: Bytes, numbers: AnyArray) -> None:
-        place = self._places[name]
-        place.put(frames, numbers[:, None].astype(place.kind))
+    def _write(self, name: str, frames: Bytes, numbers: AnyArray) -> None:
+        span = self._spans[name]
+        span.write(frames, numbers[:, None].astype(span.dtype))
 
     def opening(self, local: LocalAddress) -> Dialogue:
         """Write ``start``."""
@@ -269,20 +285,20 @@ class Generic(DescribedSensor):
         return _bytes("stop", self.stop)
 
     def device(self) -> Device:
-        """Return a board that streams from the start, or from when it hears ``start`` until it hears ``stop``."""
+        """Return an emulated board that streams from the start, or between the commands ``start`` and ``stop``."""
         start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
         return Board(streaming=not start, start=start, stop=stop)
 
 
 def _names(number: Number) -> list[tuple[str, dict[str, str]]]:
-    """Return name and metadata of each channel that a number is."""
+    """Return (name, metadata) of each channel of a number."""
     metadata = {"unit": number.unit, "quantity": number.quantity}
     channels: list[tuple[str, dict[str, str]]] = []
-    names = [number.name] if number.count == 1 else sensor.numbered(number.name, number.count)
-    for place, name in enumerate(names, start=1):
-        mine = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(place)}
+    names = [number.name] if number.count == 1 else sensor.numbered_names(number.name, number.count)
+    for taxel, name in enumerate(names, start=1):
+        own = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(taxel)}
         key = "axis" if number.quantity == "tactile" else "component"
-        channels += [(f"{name}_{axis}", {**mine, key: axis}) for axis in number.axes] or [(name, mine)]
+        channels += [(f"{name}_{axis}", {**own, key: axis}) for axis in number.axes] or [(name, own)]
     return channels
 
 
@@ -296,31 +312,32 @@ def _bytes(name: str, text: str) -> bytes:
 MARKER = b"\xab\xcd"
 SIZE = 64
 READINGS = 12
-BEHIND = len(MARKER) + 2 * READINGS  # place of the first zero
-FASTEST_HZ = 1000.0  # one report in each 1 ms frame of full-speed USB
+PADDING = len(MARKER) + 2 * READINGS  # offset of the first zero
+MAX_HZ = 1000.0  # one report per 1 ms frame of full-speed USB
 
 
 @dataclass(frozen=True)
 class RawHid(Sensor):
-    """A self-made board on raw HID, as Teensy's RawHID: reports of 64 bytes in the layout of the published example.
+    """A custom board on raw HID, such as Teensy's RawHID: reports of 64 bytes in the layout of the published example.
 
-    A report is ``AB CD``, twelve analog readings as big-endian uint16, zeros, and in the last two bytes a big-endian packet
-    counter. There is no sum: USB guards each report with a CRC. A board with another layout is described with ``generic``.
-    Source: TeensyRawHid.ino of hidapitester (public domain); 16C0:0486 is the product id of Teensy's RawHID.
+    A report is ``AB CD``, twelve analog readings as big-endian uint16, zeros, and a big-endian packet counter in the
+    last two bytes. There is no checksum, because USB protects each report with a CRC. Use ``generic`` for boards with
+    other layouts. Source: TeensyRawHid.ino of hidapitester (public domain); 16C0:0486 is the product id of Teensy's
+    RawHID.
     """
 
-    summary: ClassVar[str] = "Self-made boards on raw HID (Teensy RawHID): twelve analog readings and a counter."
+    summary: ClassVar[str] = "Custom boards on raw HID (Teensy RawHID): twelve analog readings and a counter."
     links: ClassVar[tuple[str, ...]] = ("hid",)
     counter: ClassVar[int | None] = 1 << 16
     usb_ids: ClassVar[tuple[str, ...]] = ("16c0:0486",)
-    usage_page: ClassVar[int | None] = 0xFFAB  # another interface of a Teensy is its console
+    usage_page: ClassVar[int | None] = 0xFFAB  # a Teensy has another interface for its console
 
-    rate_hz: float = 1000.0  # reports a second, at most 1000
+    rate_hz: float = 1000.0  # reports per second, at most 1000
 
     def __post_init__(self) -> None:
-        if not 0 < self.rate_hz <= FASTEST_HZ:
+        if not 0 < self.rate_hz <= MAX_HZ:
             raise UsageError(
-                f"rawhid: rate_hz is {self.rate_hz:g}; full-speed USB carries more than 0 and at most 1000 reports a second."
+                f"rawhid: rate_hz is {self.rate_hz:g}; it must be above 0 and at most 1000, the limit of full-speed USB."
             )
 
     def fields(self) -> list[pa.Field]:
@@ -333,7 +350,7 @@ class RawHid(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer of reports that have their marker and zeros."""
+        """Return a framer for reports with marker and zeros."""
         return PacketFramer([SIZE], _is_report)
 
     def decode(self, frames: Bytes) -> Samples:
@@ -347,12 +364,12 @@ class RawHid(Sensor):
         assert samples.seq is not None
         reports = np.zeros((len(readings), SIZE), dtype=np.uint8)
         reports[:, :2] = np.frombuffer(MARKER, np.uint8)
-        reports[:, 2:BEHIND] = np.ascontiguousarray(readings, ">u2").view(np.uint8)
+        reports[:, 2:PADDING] = np.ascontiguousarray(readings, ">u2").view(np.uint8)
         reports[:, -2:] = (samples.seq % (1 << 16)).astype(">u2")[:, None].view(np.uint8)
         return reports
 
 
 def _is_report(frames: Bytes) -> Bools:
-    marked = (frames[:, :2] == np.frombuffer(MARKER, np.uint8)).all(axis=1)
-    zero: Bools = marked & ~frames[:, BEHIND:-2].any(axis=1)
-    return zero
+    has_marker = (frames[:, :2] == np.frombuffer(MARKER, np.uint8)).all(axis=1)
+    is_report: Bools = has_marker & ~frames[:, PADDING:-2].any(axis=1)
+    return is_report

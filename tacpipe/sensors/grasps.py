@@ -1,13 +1,13 @@
-"""Candidate grasps on a cloud, which `tacpipe live` ranks with a model of touch: sent as JSON, a request a packet or file.
+"""Candidate grasps on a cloud, which `tacpipe live` ranks with a touch model. Each packet or file is one request in JSON.
 
 A request::
 
     {"version": 1, "request": 7, "cloud": "cup.ply" | [[X, Y, Z], …] | [[X, Y, Z, R, G, B], …] | null,
      "grasps": [{"g1": [X, Y, Z], "g2": [X, Y, Z], "wrist": [[…], […], […]] | null}, …]}
 
-Lengths are in metres and one frame, colours 0 to 255. A path is of a PLY or PCD file, or of an NPZ file with ``points_m``
-and ``colours``, within the option ``folder``; ``null`` is the cloud of the request before. ``wrist`` is the rotation whose
-columns are approach, closing and third axis. The recording holds the grasps; clouds are not kept.
+Positions are in metres in one coordinate frame; colours are 0 to 255. A path refers to a PLY or PCD file, or an NPZ file
+with ``points_m`` and ``colours``, within the option ``folder``; ``null`` is the cloud of the previous request. ``wrist``
+is a rotation matrix with the columns approach, closing and third axis. Grasps are recorded; clouds are not.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-MOST_GRASPS, MOST_POINTS = 1000, 1_000_000  # limits of a request
-LARGEST = 1 << 62
+MAX_GRASPS, MAX_POINTS = 1000, 1_000_000  # per request
+MAX_NUMBER = 1 << 62
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{row}_{column}" for row in range(3) for column in range(3))
-AT_HAND = 4  # requests that are kept between the framer's look at them and their decoding
+CACHED = 4  # requests that are cached, because the framer and the decoder parse the same requests
 
 
 @dataclass(frozen=True)
 class GraspRequests(Sensor):
-    """Requests of a planner of grasps; a sample is one candidate, those of one request have the same arrival."""
+    """Requests of a grasp planner. A sample is one candidate; candidates of one request have the same arrival."""
 
-    summary: ClassVar[str] = "Candidate grasps on a cloud, to be ranked by `tacpipe live`."
+    summary: ClassVar[str] = "Candidate grasps on a cloud, which `tacpipe live` ranks."
     links: ClassVar[tuple[str, ...]] = ("udp", "ws", "folder")
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False
 
-    folder: str = ""  # folder of the files of clouds that requests name; empty: requests must contain their clouds
-    rate_hz: float = 0.0  # requests a second; 0: they come when they come
+    folder: str = ""  # folder with the cloud files of requests; empty: requests must contain their clouds
+    rate_hz: float = 0.0  # requests per second; 0: irregular
 
     def fields(self) -> list[pa.Field]:
-        """Return number of the request and of the grasp in it, both points, and the wrist's rotation row by row."""
+        """Return the request number, the grasp number, both contact points, and the wrist's rotation row by row."""
         import pyarrow as pa
 
         def number(name: str) -> pa.Field:
@@ -63,19 +63,19 @@ class GraspRequests(Sensor):
         return [*numbers, *map(number, (*POINTS, *WRIST))]
 
     def accepts(self, packet: bytes) -> bool:
-        """Return whether a packet is a request: any program that reaches the port may send there."""
+        """Return whether a packet is a request. Any program may send packets to the port."""
         return is_request(packet)
 
     def framer(self) -> Framer:
-        """Return a framer that takes packets that are requests."""
+        """Return a framer for packets that are requests."""
         return TextFramer(is_request)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return a sample for each grasp of each request; the wrist is NaN where it is not given."""
-        requests = [parsed(frame) for frame in frames]
+        """Return one sample per grasp of each request. A missing wrist is NaN."""
+        requests = [parse_request(frame) for frame in frames]
         rows = [len(request["grasps"]) for request in requests]
-        numbers = [[request["request"], place] for request in requests for place in range(len(request["grasps"]))]
-        places = [
+        numbers = [[request["request"], grasp] for request in requests for grasp in range(len(request["grasps"]))]
+        positions = [
             [*grasp["g1"], *grasp["g2"], *itertools.chain.from_iterable(grasp.get("wrist") or [[math.nan] * 3] * 3)]
             for request in requests
             for grasp in request["grasps"]
@@ -83,20 +83,20 @@ class GraspRequests(Sensor):
         return Samples(
             (
                 np.array(numbers, dtype=np.int64).reshape(-1, 2),
-                np.array(places, dtype=np.float64).reshape(-1, len(POINTS) + len(WRIST)),
+                np.array(positions, dtype=np.float64).reshape(-1, len(POINTS) + len(WRIST)),
             ),
             rows=np.repeat(np.arange(len(requests)), rows).astype(np.int64),
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return a request without a cloud for each run of samples whose grasps are counted from 0."""
-        numbers, places = samples.values
+        """Return one request without a cloud for each run of samples whose grasp numbers start with 0."""
+        numbers, positions = samples.values
         requests: list[GraspRequest] = []
-        for (request, grasp), place in zip(numbers.tolist(), places, strict=True):
+        for (request, grasp), position in zip(numbers.tolist(), positions, strict=True):
             if not grasp or not requests:
                 requests.append({"version": VERSION, "request": request, "cloud": None, "grasps": []})
-            wrist = place[6:].reshape(3, 3).tolist() if np.isfinite(place[6:]).all() else None
-            requests[-1]["grasps"].append({"g1": place[:3].tolist(), "g2": place[3:6].tolist(), "wrist": wrist})
+            wrist = position[6:].reshape(3, 3).tolist() if np.isfinite(position[6:]).all() else None
+            requests[-1]["grasps"].append({"g1": position[:3].tolist(), "g2": position[3:6].tolist(), "wrist": wrist})
         return [json.dumps(request).encode() for request in requests]
 
 
@@ -118,22 +118,25 @@ class GraspRequest(TypedDict):
 
 
 def is_request(text: bytes) -> bool:
-    """Return whether a packet is a request: its version, 1 to 1000 grasps of finite numbers, a cloud of a known form."""
-    return parsed(text) is not None
+    """Return whether a packet is a valid request."""
+    return parse_request(text) is not None
 
 
-@functools.lru_cache(maxsize=AT_HAND)
-def parsed(text: bytes) -> Any:
-    """Return the request in a packet, None where it is none."""
+@functools.lru_cache(maxsize=CACHED)
+def parse_request(text: bytes) -> Any:
+    """Return the request in a packet, or None if it is invalid.
+
+    A request has the right version, 1 to 1000 grasps with finite numbers, and a cloud, a path, or null.
+    """
     try:
         record = json.loads(text.decode())
         grasps, cloud, request = record["grasps"], record.get("cloud"), record["request"]
-        if record["version"] != VERSION or type(request) is not int or abs(request) > LARGEST:
+        if record["version"] != VERSION or type(request) is not int or abs(request) > MAX_NUMBER:
             return None
-        good = 0 < len(grasps) <= MOST_GRASPS and all(map(_is_grasp, grasps)) and _is_cloud(cloud)
+        is_valid = 0 < len(grasps) <= MAX_GRASPS and all(map(_is_grasp, grasps)) and _is_cloud(cloud)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
         return None
-    return record if good else None
+    return record if is_valid else None
 
 
 def _is_grasp(grasp: Any) -> bool:
@@ -146,7 +149,7 @@ def _is_cloud(cloud: Any) -> bool:
     if cloud is None or isinstance(cloud, str):
         return True
     widths = {len(point) for point in cloud}
-    return 0 < len(cloud) <= MOST_POINTS and widths in ({3}, {6}) and all(_are_numbers(row, len(row)) for row in cloud)
+    return 0 < len(cloud) <= MAX_POINTS and widths in ({3}, {6}) and all(_are_numbers(row, len(row)) for row in cloud)
 
 
 def _are_numbers(row: Any, count: int) -> bool:

@@ -1,8 +1,8 @@
-"""Boards that send JustFloat, the binary format of the plotter VOFA+; fulai tactile skins are some of them.
+"""Boards that send JustFloat, the binary format of the plotter VOFA+, such as fulai tactile skins.
 
-A frame is any number of little-endian float32 and then ``00 00 80 7F``, which read as a float is infinite: no finite
-number holds it, though two together can. There is neither counter nor sum.
-Source: VOFA+'s description of its protocols; for fulai the wire of the package fulai-tactile 1.0.5.
+A frame is any number of little-endian float32 followed by ``00 00 80 7F``, which is infinity as a float: it does not occur
+within a finite number, but may occur across two of them. There is no counter and no checksum.
+Source: VOFA+'s description of its protocols; for fulai, the protocol of the package fulai-tactile 1.0.5.
 """
 
 from __future__ import annotations
@@ -27,57 +27,59 @@ if TYPE_CHECKING:
 TAIL = b"\x00\x00\x80\x7f"
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 FULAI = {"fulai-3.0": 415, "fulai-3.1": 401, "fulai-3.2": 615}  # floats in a frame, by hardware
-RESERVED = {"fulai-3.2": (*range(82, 90), *range(530, 537))}  # floats that mean nothing, counted from 0
+RESERVED = {"fulai-3.2": (*range(82, 90), *range(530, 537))}  # unused floats, counted from 0
 ON, OFF, INFO = b"vofa on\r\n", b"vofa off\r\n", b"bridge info get\r\n"
-MOST_CHANNELS = 1000
+MAX_CHANNELS = 1000
 
 
 @dataclass(frozen=True)
 class JustFloat(Sensor):
     """A board that sends JustFloat."""
 
-    summary: ClassVar[str] = "Boards that send JustFloat, the format of VOFA+, among them fulai tactile skins."
+    summary: ClassVar[str] = "Boards that send JustFloat, the format of VOFA+, such as fulai tactile skins."
     line: ClassVar[SerialLine] = SerialLine(dtr=True, rts=False)
 
-    model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = "any"  # a fulai's hardware version, or any board
-    channels: int = 0  # floats in a frame, of any board; 0: as many as names
-    names: tuple[str, ...] = ()  # names of the channels of another board; none: taxel01, taxel02, …
-    unit: str = "1"  # unit of the channels of another board
-    quantity: str = "tactile"  # quantity of the channels of another board
-    rate_hz: float = 100.0  # frames a second
+    model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = (
+        "any"  # hardware version of a fulai skin, or "any" for other boards
+    )
+    channels: int = 0  # number of floats in a frame, for model any; 0: the number of names
+    names: tuple[str, ...] = ()  # channel names for model any; if empty, taxel01, taxel02, …
+    unit: str = "1"  # unit of the channels, for model any
+    quantity: str = "tactile"  # quantity of the channels, for model any
+    rate_hz: float = 100.0  # frames per second
     baud: int = 2_000_000  # baud rate of the port
 
     def __post_init__(self) -> None:
-        sensor.known("justfloat", "model", self.model, ("any", *FULAI))
-        sensor.positive("justfloat", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.check_choice("justfloat", "model", self.model, ("any", *FULAI))
+        sensor.check_positive("justfloat", rate_hz=self.rate_hz, baud=self.baud)
         if self.model != "any":
             if self.channels or self.names:
-                raise UsageError(f"justfloat: the channels of a {self.model} are known; leave out channels and names.")
+                raise UsageError(f"justfloat: the channels of {self.model} are fixed; omit channels and names.")
             return
         for name in self.names:
             if not NAME.fullmatch(name) or self.names.count(name) > 1:
                 raise UsageError(
-                    f"justfloat: {name!r} cannot name a channel; use lower-case letters, digits and _, and each name once."
+                    f"justfloat: {name!r} is not a valid channel name; use unique names of lower-case letters, digits and _."
                 )
         if self.names and self.channels not in (0, len(self.names)):
             raise UsageError(
-                f"justfloat: there are {len(self.names)} names for {self.channels} channels; give one a channel."
+                f"justfloat: there are {len(self.names)} names for {self.channels} channels; give one name per channel."
             )
         if not self.names:
-            sensor.within("justfloat", "channels", self.channels, 1, MOST_CHANNELS)
+            sensor.check_range("justfloat", "channels", self.channels, 1, MAX_CHANNELS)
 
     @property
     def floats(self) -> int:
-        """How many floats are in a frame."""
+        """The number of floats in a frame."""
         return FULAI.get(self.model, self.channels or len(self.names))
 
     @functools.cached_property
-    def channel_places(self) -> Indices:
+    def channel_positions(self) -> Indices:
         """The positions of channels among the floats of a frame (channel,)."""
         return np.setdiff1d(np.arange(self.floats), RESERVED.get(self.model, ()))
 
     def fields(self) -> list[pa.Field]:
-        """Return a float32 field a channel: as named, or ``taxel01`` to the last."""
+        """Return one float32 field per channel, with the option's names or ``taxel01``, …."""
         import pyarrow as pa
 
         metadata = {"unit": self.unit, "quantity": self.quantity}
@@ -85,42 +87,42 @@ class JustFloat(Sensor):
             return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]
         return [
             field.with_metadata({**field.metadata, b"quantity": self.quantity.encode()})
-            for field in sensor.fields(len(self.channel_places), pa.float32(), self.unit)
+            for field in sensor.taxel_fields(len(self.channel_positions), pa.float32(), self.unit)
         ]
 
     def framer(self) -> Framer:
-        """Return a framer of finite floats with their end."""
+        """Return a framer for finite floats with their tail."""
         return ByteFramer(Framing(tail=TAIL, size=4 * self.floats + len(TAIL), check=_is_finite, lock=3, weak=True))
 
     def decode(self, frames: Bytes) -> Samples:
         """Return the floats (frame, channel)."""
         floats = _floats(frames)
-        return Samples((floats[:, self.channel_places] if self.model in RESERVED else floats,))
+        return Samples((floats[:, self.channel_positions] if self.model in RESERVED else floats,))
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the frames of these samples, with zeros for what is reserved."""
+        """Return the frames of these samples, with zeros in reserved floats."""
         floats = np.zeros((len(samples), self.floats), dtype="<f4")
-        floats[:, self.channel_places] = samples.values[0]
+        floats[:, self.channel_positions] = samples.values[0]
         tails = np.broadcast_to(np.frombuffer(TAIL, np.uint8), (len(floats), len(TAIL)))
         return np.hstack([floats.view(np.uint8), tails])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Have a fulai stream; any other board streams by itself."""
+        """Start the stream of a fulai. Other boards stream by themselves."""
         if self.model != "any":
             yield Ask(ON)
 
     def closing(self) -> bytes:
-        """Stop a fulai's stream."""
+        """Stop the stream of a fulai."""
         return OFF if self.model != "any" else b""
 
     def device(self) -> Device:
-        """Return a board that streams from the start, or a fulai, which takes its three commands."""
+        """Return an emulated board that streams from the start, or a fulai that accepts its three commands."""
         return Device() if self.model == "any" else _Bridge(model=self.model, streaming=False)
 
 
 @dataclass
 class _Bridge(Device):
-    """A fulai's side: its commands are lines of text."""
+    """An emulated fulai, whose commands are lines of text."""
 
     model: str = ""
 

@@ -1,9 +1,9 @@
-"""KUKA arms by the Robot Sensor Interface (RSI): an XML text by UDP every 4 or 12 ms.
+"""KUKA arms with the Robot Sensor Interface (RSI): an XML message by UDP every 4 or 12 ms.
 
 The controller sends ``<Rob Type="KUKA"><RIst X="…" …/>…<IPOC>n</IPOC></Rob>`` to the address in its configuration file, in
-mm and degrees; IPOC is its clock in milliseconds. Unless that file states ONLYSEND, each text must be answered in time with
-the same IPOC, or the controller stops; the answer here holds no correction, so the arm is not moved by it. Source: KUKA,
-RobotSensorInterface 3.x, as read in the package rsipi 0.3.0.
+mm and degrees; IPOC is its clock in milliseconds. Unless that file sets ONLYSEND, each message must be answered in time with
+the same IPOC, or the controller stops. The answers of this driver contain no correction, so they do not move the arm.
+Source: KUKA, RobotSensorInterface 3.x, from the package rsipi 0.3.0.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-CYCLES_MS = (4, 12)  # cycles of the controller
+CYCLES_MS = (4, 12)
 FRAME, AXES = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{axis}" for axis in range(1, 7))
 ATTRIBUTES = {
     "RIst": FRAME,
@@ -38,47 +38,50 @@ ATTRIBUTES = {
     "AIPos": AXES,
     "ASPos": AXES,
     "MACur": AXES,
-}  # those with columns of their own
+}  # elements whose attributes become columns
 POSES, ANGLES = ("RIst", "RSol"), ("AIPos", "ASPos")
-OTHER = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)?")  # an element, or an attribute of one
+OUTPUT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)?")  # an element, or ELEMENT.ATTRIBUTE
 TRUTH = {"true": "1", "false": "0"}
-AT_HAND = 1024  # texts whose numbers are kept between the framer's look at them and their decoding
-BATCHES_AT_HAND = 4  # likewise, of texts that were looked at together
+CACHED = 1024  # messages whose numbers are cached, because the framer and the decoder parse the same messages
+CACHED_BATCHES = 4  # the same for batches of messages
 IPOC = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
 
 
 @dataclass(frozen=True)
 class KukaRsi(Sensor):
-    """The arm of a KUKA controller with RSI."""
+    """An arm of a KUKA controller with RSI."""
 
-    summary: ClassVar[str] = "KUKA arms by the Robot Sensor Interface (RSI)."
+    summary: ClassVar[str] = "KUKA arms with the Robot Sensor Interface (RSI)."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
     counter: ClassVar[int | None] = 1 << 32
     exclusive: ClassVar[str] = (
-        "The controller sends to the one address in its RSI configuration: a program that corrects the arm and this one "
-        "cannot both be there; let that program send what it gets to a tap."
+        "The controller sends to the one address in its RSI configuration, so it cannot serve a program that corrects the "
+        "arm at the same time. Let that program forward the messages to a tap."
     )
 
-    outputs: tuple[str, ...] = ("RIst", "AIPos")  # elements that the controller sends, or their attributes, as Tech.C11
-    only_send: bool = False  # the configuration states ONLYSEND TRUE: nothing is answered, which is best for recording
+    outputs: tuple[str, ...] = (
+        "RIst",
+        "AIPos",
+    )  # elements that the controller sends, or their attributes, such as Tech.C11
+    only_send: bool = False  # the configuration sets ONLYSEND TRUE: no answers are sent, which is best for recording
     sen_type: str = "ImFree"  # SENTYPE of the configuration
-    rate_hz: float = 250.0  # 250 for a cycle of 4 ms, 83.33 for 12 ms
+    rate_hz: float = 250.0  # messages per second: 250 for a cycle of 4 ms, 83.33 for 12 ms
 
     def __post_init__(self) -> None:
         if self.cycle_ms not in CYCLES_MS:
             raise UsageError(
-                f"kuka-rsi: rate_hz is {self.rate_hz:g}; the controller sends 250 a second, or 83.33 at a cycle of 12 ms."
+                f"kuka-rsi: rate_hz is {self.rate_hz:g}; it must be 250 for a cycle of 4 ms, or 83.33 for 12 ms."
             )
-        wrong = [name for name in self.outputs if not OTHER.fullmatch(name) or name == "IPOC"]
-        if wrong or not self.outputs or len(set(self.outputs)) < len(self.outputs):
+        invalid = [name for name in self.outputs if not OUTPUT.fullmatch(name) or name == "IPOC"]
+        if invalid or not self.outputs or len(set(self.outputs)) < len(self.outputs):
             raise UsageError(
-                f"kuka-rsi: outputs are {', '.join(self.outputs) or 'none'}; name each element or attribute of the SEND "
-                f"part of the controller's configuration once, as RIst or Tech.C11; IPOC comes by itself."
+                f"kuka-rsi: outputs are {', '.join(self.outputs) or 'none'}; list elements or attributes of the SEND "
+                f"part of the controller's configuration, each once, such as RIst or Tech.C11; IPOC is always included."
             )
         if not re.fullmatch(r"\w+", self.sen_type):
             raise UsageError(f"kuka-rsi: sen_type is {self.sen_type!r}; it must be the SENTYPE of the configuration.")
-        object.__setattr__(self, "step", self.cycle_ms)  # increment of IPOC, which an option sets
+        object.__setattr__(self, "step", self.cycle_ms)  # increment of IPOC
 
     @property
     def cycle_ms(self) -> int:
@@ -86,52 +89,52 @@ class KukaRsi(Sensor):
         return round(1000 / self.rate_hz) if self.rate_hz > 0 else 0
 
     def fields(self) -> list[pa.Field]:
-        """Return the fields of the outputs, float64: pose and angles of the arm in m and rad, others as they are sent."""
+        """Return the fields of the outputs, float64: pose and joint angles in m and rad, other values as sent."""
         return [field for name in self.outputs for field in _fields(name)]
 
     def framer(self) -> Framer:
-        """Return a framer that takes whole texts with an IPOC and every output."""
+        """Return a framer for complete messages with an IPOC and all outputs."""
         return TextFramer(
             lambda packet: _numbers(self.outputs, packet) is not None,
             check_all=lambda packets: _table(self.outputs, tuple(packets)) is not None,
         )
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return the outputs, with the controller's clock for counter and time."""
+        """Return the outputs. The controller's clock is both counter and time."""
         table = _table(self.outputs, tuple(frames))
         if table is None:
             numbers = [_numbers(self.outputs, frame) or () for frame in frames]
             table = np.array(numbers, dtype=np.float64).reshape(len(frames), 1 + sum(map(_width, self.outputs)))
-        blocks, place = [], 1
+        blocks, column = [], 1
         for name in self.outputs:
-            blocks.append(_columns(name, table[:, place : place + _width(name)]))
-            place += _width(name)
+            blocks.append(_columns(name, table[:, column : column + _width(name)]))
+            column += _width(name)
         ipoc_ms = table[:, 0].astype(np.int64)
         return Samples(tuple(blocks), seq=ipoc_ms, t_device_ns=ipoc_ms * 1_000_000)
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return the texts that hold these samples, numbers with four digits as the controller writes them."""
+        """Return the messages of these samples, with four decimals like the controller's."""
         assert samples.seq is not None
-        blocks = [_sent(name, block).tolist() for name, block in zip(self.outputs, samples.values, strict=True)]
+        blocks = [_to_wire(name, block).tolist() for name, block in zip(self.outputs, samples.values, strict=True)]
         return [
             _text(self.outputs, [block[row] for block in blocks], ipoc) for row, ipoc in enumerate(samples.seq.tolist())
         ]
 
     def answer(self, chunk: bytes) -> bytes:
-        """Return the reply to a text: its IPOC and no correction; nothing if the controller only sends."""
+        """Return the reply to a message, with its IPOC and no correction. Returns b"" if the controller only sends."""
         match = None if self.only_send else IPOC.search(chunk)
         if match is None:
             return b""
         return b'<Sen Type="%b"><IPOC>%b</IPOC></Sen>' % (self.sen_type.encode(), match[1])
 
     def device(self) -> Device:
-        """Return a controller, which sends from the start; it minds no answers."""
+        """Return an emulated controller that sends from the start and ignores answers."""
         return Device()
 
 
-@functools.lru_cache(maxsize=AT_HAND)
+@functools.lru_cache(maxsize=CACHED)
 def _numbers(outputs: tuple[str, ...], packet: bytes) -> tuple[float, ...] | None:
-    """Return IPOC and the numbers of the outputs, None where the text is none of the controller's."""
+    """Return IPOC and the numbers of the outputs, or None if the message is invalid."""
     try:
         root = ElementTree.fromstring(packet)
         ipoc = int(root.findtext("IPOC", ""))
@@ -142,29 +145,32 @@ def _numbers(outputs: tuple[str, ...], packet: bytes) -> tuple[float, ...] | Non
     return tuple(numbers) if root.tag == "Rob" and is_valid and all(map(math.isfinite, numbers)) else None
 
 
-@functools.lru_cache(maxsize=BATCHES_AT_HAND)
+@functools.lru_cache(maxsize=CACHED_BATCHES)
 def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | None:
-    """Return IPOC and the numbers of the outputs (packet, number); None where packets differ in more than their numbers."""
-    layout = _pattern(outputs, number_texts.numbered(packets[0])) if packets else None
+    """Return IPOC and the outputs (packet, number), or None if the packets differ in more than their numbers."""
+    layout = _pattern(outputs, number_texts.replace_by_index(packets[0])) if packets else None
     if layout is None:
         return None
     pattern, columns = layout
-    parsed = pattern.written(packets)
+    parsed = pattern.extract(packets)
     numbers = None if parsed is None else number_texts.floats(parsed)
     if parsed is None or numbers is None or not np.isfinite(numbers).all():
         return None
-    wide = len(pattern.before)
-    clock = number_texts.wholes(number_texts.taken(parsed, range(columns[0], len(parsed), wide)))
+    width = len(pattern.before)
+    clock = number_texts.integers(number_texts.select_range(parsed, range(columns[0], len(parsed), width)))
     if clock is None or clock.min() < 0 or clock.max() >= 1 << 32:
         return None
-    table = numbers.reshape(len(packets), wide)[:, columns]
-    table.flags.writeable = False  # it is kept
+    table = numbers.reshape(len(packets), width)[:, columns]
+    table.flags.writeable = False  # the table is cached
     return table
 
 
-@functools.lru_cache(maxsize=BATCHES_AT_HAND)
+@functools.lru_cache(maxsize=CACHED_BATCHES)
 def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, Indices] | None:
-    """Return the pattern of a text in which each number represents itself, and which ones are IPOC and the outputs."""
+    """Return the pattern of a message, and the positions of IPOC and the outputs among its numbers, or None.
+
+    In ``text``, each number has been replaced by its index.
+    """
     pattern, content = number_texts.pattern(text), _numbers(outputs, text)
     if pattern is None or content is None:
         return None
@@ -178,7 +184,7 @@ def _width(name: str) -> int:
 
 
 def _texts(root: ElementTree.Element, name: str) -> list[str]:
-    """Return what a text states of an output, number by number; what is missing is left out."""
+    """Return the texts of an output's numbers. Missing attributes are skipped."""
     tag, _, attribute = name.partition(".")
     element = root.find(tag)
     if element is None:
@@ -207,14 +213,14 @@ def _fields(name: str) -> list[pa.Field]:
 
 
 def _columns(name: str, numbers: Floats) -> Floats:
-    """Return what an output's numbers (sample, number) are in m, rad and quaternions."""
+    """Convert an output's numbers (sample, number) to m, rad and quaternions."""
     if name in POSES:
         return np.hstack([numbers[:, :3] / 1000, kinematics.quaternions_of_angles(np.radians(numbers[:, 3:]))])
     return np.radians(numbers) if name in ANGLES else numbers
 
 
-def _sent(name: str, columns: Floats) -> Floats:
-    """Return the numbers (sample, number) that the controller sends for columns, in mm and degrees."""
+def _to_wire(name: str, columns: Floats) -> Floats:
+    """Convert columns to the numbers (sample, number) that the controller sends, in mm and degrees."""
     if name in POSES:
         return np.hstack([columns[:, :3] * 1000, np.degrees(kinematics.angles_of(columns[:, 3:]))])
     return np.degrees(columns) if name in ANGLES else columns

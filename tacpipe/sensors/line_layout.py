@@ -1,8 +1,8 @@
-"""Describe how a line of text is laid out, by its cells in their order, and parse lines of that layout.
+"""Describe the layout of a line of text by its cells, and parse lines of that layout.
 
-A number is written in digits, a float also with a decimal mark and an exponent; signs, and spaces around a cell, are
-allowed. Any other line, or a value beyond the type of its column, is refused. Many lines are parsed at once, odd ones one by
-one, by the same rules.
+Integers have digits; floats may also have a decimal mark and an exponent. Signs, and spaces around a cell, are allowed. All
+other lines, and values outside of the range of their column, are rejected. Many lines are parsed at once, and unusual lines
+one by one by the same rules.
 """
 
 from __future__ import annotations
@@ -27,52 +27,52 @@ if TYPE_CHECKING:
 Type = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 BRACES = re.compile(r"\{(?:(\d{1,6})\.\.(\d{1,6})|([A-Za-z0-9_]+(?:,[A-Za-z0-9_]+)*))\}")
-MOST_CELLS = 4096
+MAX_CELLS = 4096
 
 
 @dataclass(frozen=True)
 class LineColumn:
-    """One column of the lines, or several of a kind."""
+    """One column of the lines, or an array of columns."""
 
-    name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are several, the last braces count fastest
-    type: Type = "f32"  # u unsigned, i signed, f floating point, and the bits
+    name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are arrays, the last braces vary fastest
+    type: Type = "f32"  # u unsigned, i signed, f floating point, followed by the number of bits
     unit: str = "1"  # unit of the channel
     quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md
-    label: str = ""  # text right before each number, as "x:"; with the braces of the name
-    skip: bool = False  # it is not a channel, and may hold any text
+    label: str = ""  # text before each number, such as "x:"; it may contain the braces of the name
+    skip: bool = False  # True if the column is not a channel; it may then contain any text
 
 
 @dataclass(frozen=True)
 class LineSequence:
     """The column that counts the lines."""
 
-    column: str  # the name of the column that holds it
-    modulus: int = 0  # modulus of the counter; 0: that of its type
-    step: int = 1  # increment of the counter
+    column: str  # name of the column that contains it
+    modulus: int = 0  # modulus of the counter; 0: the range of its type
+    step: int = 1  # increment per line
 
 
 @dataclass(frozen=True)
 class LineClock:
-    """The device's time of a line."""
+    """The column that contains the device's time."""
 
-    column: str  # the name of the column that holds it
+    column: str  # name of the column that contains it
     unit: Literal["ns", "us", "ms", "s"]  # unit of that column
-    modulus: int = 0  # modulus of the clock in its unit; 0: that of its type
+    modulus: int = 0  # modulus of the clock in its unit; 0: the range of its type
 
 
 @dataclass(frozen=True)
 class LineSum:
-    """The check sum that ends a line."""
+    """The checksum at the end of a line."""
 
-    kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # how it is computed
-    mark: str = "*"  # text right before it, the last such text of a line
-    digits: Literal["hex", "decimal"] = "hex"  # notation of the check sum
-    begin: str = ""  # start of lines that is not summed: the $ of NMEA 0183
-    mark_summed: bool = False  # True where the mark is summed too
+    kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # algorithm
+    mark: str = "*"  # text before the checksum; its last occurrence in the line counts
+    digits: Literal["hex", "decimal"] = "hex"  # notation of the checksum
+    begin: str = ""  # text at the start of lines that is not summed, such as the $ of NMEA 0183
+    mark_summed: bool = False  # True if the mark is summed, too
 
     @property
     def width(self) -> int:
-        """Bytes of the sum."""
+        """Bytes of the checksum."""
         return layout.SUMS[self.kind][1]
 
 
@@ -88,12 +88,12 @@ class LineCell:
 
     @property
     def kind(self) -> np.dtype[Any]:
-        """The type as which it is kept."""
+        """The numpy type of the channel."""
         return dtype(self.type)
 
 
 def dtype(kind: str) -> np.dtype[Any]:
-    """Return the type that a letter and a number of bits name.
+    """Return the numpy type for a letter and a number of bits.
 
     >>> dtype("u16")
     dtype('uint16')
@@ -102,39 +102,39 @@ def dtype(kind: str) -> np.dtype[Any]:
 
 
 def layout_cells(columns: tuple[LineColumn, ...]) -> tuple[LineCell, ...]:
-    """Return the cells of a line in their order.
+    """Return the cells of a line in order.
 
-    Raises `UsageError` for a name that cannot be a channel's or is there twice, and for braces that name nothing.
+    Raises `UsageError` for invalid or repeated names, invalid braces, and if no column is a channel.
 
     >>> [cell.name for cell in layout_cells((LineColumn("t", "u32"), LineColumn("taxel{1..2}_{x,y}", "u16")))]
     ['t', 'taxel01_x', 'taxel01_y', 'taxel02_x', 'taxel02_y']
     """
     by_name: dict[str, LineCell] = {}
     for column in columns:
-        for cell in _expanded(column):
+        for cell in _expand(column):
             if not NAME.fullmatch(cell.name):
                 _refuse(
-                    f"{cell.name!r} cannot name a column; use lower-case letters, digits and _, as in taxel{{1..16}}"
+                    f"{cell.name!r} is not a valid name; use lower-case letters, digits and _, such as taxel{{1..16}}"
                 )
             if cell.name in by_name:
                 _refuse(f"two columns are named {cell.name}; names must be unique")
             by_name[cell.name] = cell
-            sensor.within("lines", "count of columns", len(by_name), 1, MOST_CELLS)
+            sensor.check_range("lines", "count of columns", len(by_name), 1, MAX_CELLS)
     if not any(not cell.skip for cell in by_name.values()):
-        _refuse("no column is a channel; list in columns what stands in a line, in its order")
+        _refuse("no column is a channel; list all columns of a line, in order, in columns")
     return tuple(by_name.values())
 
 
-def _expanded(column: LineColumn) -> Iterator[LineCell]:
-    """Yield the cells of a column, the last braces counting fastest."""
+def _expand(column: LineColumn) -> Iterator[LineCell]:
+    """Yield the cells of a column. The last braces vary fastest."""
     braces = _braces(column.name)
     if _braces(column.label) not in ([], braces):
-        _refuse(f"the label {column.label!r} must have the braces of the name {column.name!r}, or none")
+        _refuse(f"the label {column.label!r} must contain the braces of the name {column.name!r}, or none")
     for values in itertools.product(*(brace.values for brace in braces)):
         pairs = list(zip(braces, values, strict=True))
-        name = _filled(column.name, [value.zfill(brace.width) for brace, value in pairs])
-        label = _filled(column.label, list(values))
-        metadata = {"unit": column.unit, "quantity": column.quantity, **_places(column.quantity, pairs)}
+        name = _fill(column.name, [value.zfill(brace.width) for brace, value in pairs])
+        label = _fill(column.label, list(values))
+        metadata = {"unit": column.unit, "quantity": column.quantity, **_position_metadata(column.quantity, pairs)}
         yield LineCell(name, column.type, label, column.skip, metadata)
 
 
@@ -143,12 +143,12 @@ class _Braces:
     """The values of braces in a pattern."""
 
     values: tuple[str, ...]
-    numbered: bool
+    is_range: bool
 
     @property
     def width(self) -> int:
-        """Digits that a number is written with, as in the names of other tactile arrays."""
-        return max(2, len(self.values[-1])) if self.numbered else 0
+        """Digits of numbers, as in the names of other tactile arrays; 0 for words."""
+        return max(2, len(self.values[-1])) if self.is_range else 0
 
 
 def _braces(pattern: str) -> list[_Braces]:
@@ -156,70 +156,70 @@ def _braces(pattern: str) -> list[_Braces]:
     braces = []
     for first, last, words in BRACES.findall(pattern):
         if words:
-            braces.append(_Braces(tuple(words.split(",")), numbered=False))
+            braces.append(_Braces(tuple(words.split(",")), is_range=False))
             continue
         if int(first) > int(last):
-            _refuse(f"the braces {{{first}..{last}}} count down; write {{{last}..{first}}}")
-        sensor.within("lines", "count of columns", int(last) - int(first) + 1, 1, MOST_CELLS)
-        braces.append(_Braces(tuple(map(str, range(int(first), int(last) + 1))), numbered=True))
+            _refuse(f"the braces {{{first}..{last}}} are descending; write {{{last}..{first}}}")
+        sensor.check_range("lines", "count of columns", int(last) - int(first) + 1, 1, MAX_CELLS)
+        braces.append(_Braces(tuple(map(str, range(int(first), int(last) + 1))), is_range=True))
     return braces
 
 
-def _filled(pattern: str, values: list[str]) -> str:
-    """Return a pattern with a value for each of its braces."""
+def _fill(pattern: str, values: list[str]) -> str:
+    """Replace each pair of braces in a pattern by a value."""
     remaining = iter(values)
     return BRACES.sub(lambda _: next(remaining), pattern)
 
 
-def _places(quantity: str, pairs: list[tuple[_Braces, str]]) -> dict[str, str]:
-    """Return which taxel and axis a cell is: of one range of numbers the taxel, of two also the row and the column."""
-    by_taxel, taxel, places = {}, 0, []
+def _position_metadata(quantity: str, pairs: list[tuple[_Braces, str]]) -> dict[str, str]:
+    """Return the metadata ``taxel`` and ``axis`` of a cell, and with two ranges of numbers also ``row`` and ``column``."""
+    metadata, taxel, indices = {}, 0, []
     for braces, value in pairs:
-        if braces.numbered:
-            places.append(braces.values.index(value))
-            taxel = taxel * len(braces.values) + places[-1]
+        if braces.is_range:
+            indices.append(braces.values.index(value))
+            taxel = taxel * len(braces.values) + indices[-1]
         else:
-            by_taxel["axis" if quantity == "tactile" else "component"] = value
-    if quantity == "tactile" and places:
-        by_taxel["taxel"] = str(taxel + 1)
-        if len(places) == 2:
-            by_taxel |= {"row": str(places[0] + 1), "column": str(places[1] + 1)}
-    return by_taxel
+            metadata["axis" if quantity == "tactile" else "component"] = value
+    if quantity == "tactile" and indices:
+        metadata["taxel"] = str(taxel + 1)
+        if len(indices) == 2:
+            metadata |= {"row": str(indices[0] + 1), "column": str(indices[1] + 1)}
+    return metadata
 
 
-def _refuse(what: str) -> None:
-    raise UsageError(f"lines: {what}.")
+def _refuse(problem: str) -> None:
+    raise UsageError(f"lines: {problem}.")
 
 
-WHOLE = re.compile(rb"[+-]?\d{1,20}")
+INTEGER = re.compile(rb"[+-]?\d{1,20}")
 FLOAT = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
-WRITTEN = b"0123456789+-.eE"  # characters of numbers
+NUMBER_CHARACTERS = b"0123456789+-.eE"
 LETTER = re.compile(rb"[A-Za-z]")
 
 
 @dataclass(frozen=True)
 class LineNumbers:
-    """The numbers of lines: those of each type side by side (line, cell), in the order of the cells."""
+    """The numbers of lines by type: arrays (line, cell), in the order of the cells."""
 
     numbers: Mapping[str, AnyArray]
     cells: tuple[LineCell, ...]
 
-    def block(self, places: Sequence[int]) -> AnyArray:
-        """Return the numbers (line, cell) of some cells of one type."""
-        kind = self.cells[places[0]].type
-        mine = [place for place, cell in enumerate(self.cells) if cell.type == kind and not cell.skip]
-        columns = [mine.index(place) for place in places]
+    def block(self, positions: Sequence[int]) -> AnyArray:
+        """Return the numbers (line, cell) of the cells at ``positions``, which must have one type."""
+        kind = self.cells[positions[0]].type
+        cells_of_type = [position for position, cell in enumerate(self.cells) if cell.type == kind and not cell.skip]
+        columns = [cells_of_type.index(position) for position in positions]
         span = slice(columns[0], columns[-1] + 1)
         numbers = self.numbers[kind]
         return numbers[:, span] if columns[-1] - columns[0] + 1 == len(columns) else numbers[:, columns]
 
 
-@dataclass(frozen=True, eq=False)  # one a sensor: batches of lines are remembered by it
+@dataclass(frozen=True, eq=False)  # hashed by identity: the cache of parsed batches uses it as a key
 class Parser:
-    """How lines read; the texts are those of the rig file in bytes."""
+    """A parser of lines. Its texts are those of the rig file as bytes."""
 
     cells: tuple[LineCell, ...]
-    separator: bytes = b""  # one byte; empty: spaces
+    separator: bytes = b""  # one byte; empty: spaces or tabs
     decimal: bytes = b"."
     missing: tuple[bytes, ...] = ()
     prefix: bytes = b""
@@ -227,55 +227,55 @@ class Parser:
     comments: tuple[bytes, ...] = ()
     sum: LineSum | None = None
 
-    def is_chatter(self, line: bytes) -> bool:
-        """Return whether a line is empty or a comment: it holds no sample, and none is lost with it.
+    def is_comment(self, line: bytes) -> bool:
+        """Return whether a line is empty or a comment, which contains no sample.
 
-        A comment has a letter, so that a bit that flips in a line of numbers makes none of it.
+        A comment must contain a letter, so that a line of numbers with a flipped bit does not count as one.
         """
         return not line or bool(self.comments and line.startswith(self.comments) and LETTER.search(line))
 
     def table(self, lines: Sequence[bytes]) -> LineNumbers | None:
-        """Return the numbers of lines; None where a line is not well-formed."""
-        bodies = self._bodies(lines)
+        """Return the numbers of lines, or None if a line is invalid."""
+        bodies = self._strip_affixes(lines)
         if bodies is None:
             return None
-        numbers_at_once = None if self._labelled else self._at_once(bodies)
-        if numbers_at_once is None:
-            numbers_at_once = self._one_by_one(bodies)
-        if numbers_at_once is None:
+        parsed = None if self._has_labels else self._parse_batch(bodies)
+        if parsed is None:
+            parsed = self._parse_one_by_one(bodies)
+        if parsed is None:
             return None
-        numbers = {kind: _fitted(values, kind) for kind, values in numbers_at_once.items()}
+        numbers = {kind: _cast_checked(values, kind) for kind, values in parsed.items()}
         complete = {kind: values for kind, values in numbers.items() if values is not None}
         return LineNumbers(complete, self.cells) if len(complete) == len(numbers) else None
 
     @cached_property
-    def _requested(self) -> list[int]:
-        return [place for place, cell in enumerate(self.cells) if not cell.skip]
+    def _channels(self) -> list[int]:
+        return [position for position, cell in enumerate(self.cells) if not cell.skip]
 
     @cached_property
-    def _of_type(self) -> dict[str, list[int]]:
-        """The positions of the requested cells of each type."""
-        types = [self.cells[place].type for place in self._requested]
+    def _channels_by_type(self) -> dict[str, list[int]]:
+        """The positions among the channels, by type."""
+        types = [self.cells[position].type for position in self._channels]
         return {
             kind: [row for row, kind_of_cell in enumerate(types) if kind_of_cell == kind]
             for kind in dict.fromkeys(types)
         }
 
     @cached_property
-    def _labelled(self) -> bool:
+    def _has_labels(self) -> bool:
         return any(cell.label for cell in self.cells)
 
     @cached_property
     def _labels(self) -> list[bytes]:
         return [cell.label.encode() for cell in self.cells]
 
-    def _bodies(self, lines: Sequence[bytes]) -> list[bytes] | None:
-        """Return what stands between prefix and suffix, where every line has both and its sum is right."""
+    def _strip_affixes(self, lines: Sequence[bytes]) -> list[bytes] | None:
+        """Return the lines without checksum, prefix and suffix, or None if a line lacks one or its checksum is wrong."""
         if self.sum is not None:
-            summed = _without_sum(lines, self.sum)
-            if summed is None:
+            bodies = _without_sum(lines, self.sum)
+            if bodies is None:
                 return None
-            lines = summed
+            lines = bodies
         if not (self.prefix or self.suffix):
             return list(lines)
         smallest, stop = len(self.prefix) + len(self.suffix), -len(self.suffix) or None
@@ -285,68 +285,69 @@ class Parser:
             return None
         return [line[len(self.prefix) : stop] for line in lines]
 
-    def _at_once(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
-        """Return the numbers of each type of lines that are written plainly; None where one is not, or is none."""
+    def _parse_batch(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
+        """Return the numbers by type, or None if a line is invalid or needs `_parse_one_by_one`."""
         texts = number_texts.cells(lines, len(self.cells), self.separator)
         if texts is None:
             return None
-        if len(self._requested) < len(self.cells):
-            texts = number_texts.at(texts, _placed(len(lines), len(self.cells), self._requested))
+        if len(self._channels) < len(self.cells):
+            texts = number_texts.select(texts, _cell_indices(len(lines), len(self.cells), self._channels))
         absent = None
         if self.missing:
             texts, absent = _without_missing(texts, self.missing)
-        joined = number_texts.joined(texts)
-        if joined.translate(None, WRITTEN.replace(b".", self.decimal)):
+        joined = number_texts.concatenate(texts)
+        if joined.translate(None, NUMBER_CHARACTERS.replace(b".", self.decimal)):
             return None
         if self.decimal != b".":
-            texts = number_texts.replaced(texts, joined.replace(self.decimal, b"."))
+            texts = number_texts.with_content(texts, joined.replace(self.decimal, b"."))
         columns = {}
-        for kind, mine in self._of_type.items():
-            numbers = self._cast(texts, absent, kind, mine, len(lines))
+        for kind, positions in self._channels_by_type.items():
+            numbers = self._cast(texts, absent, kind, positions, len(lines))
             if numbers is None:
                 return None
             columns[kind] = numbers
         return columns
 
     def _cast(
-        self, texts: pa.Array, absent: Bools | None, kind: str, mine: Sequence[int], count: int
+        self, texts: pa.Array, absent: Bools | None, kind: str, positions: Sequence[int], count: int
     ) -> AnyArray | None:
-        """Return texts (line times cell) as the numbers of one type (line, cell), NaN where ``absent``."""
-        is_single_type = len(mine) == len(self._requested)
-        chosen = texts if is_single_type else number_texts.at(texts, _placed(count, len(self._requested), mine))
-        numbers = number_texts.cast(chosen, _wide(kind))
+        """Return the numbers (line, cell) of one type from texts (line × cell), with NaN for ``absent`` ones."""
+        is_single_type = len(positions) == len(self._channels)
+        if not is_single_type:
+            texts = number_texts.select(texts, _cell_indices(count, len(self._channels), positions))
+        numbers = number_texts.cast(texts, _parsed_type(kind))
         if numbers is None:
             return None
-        numbers = numbers.reshape(count, len(mine))
-        lacking = None if absent is None else absent.reshape(count, len(self._requested))[:, mine]
-        if lacking is None or not lacking.any():
+        numbers = numbers.reshape(count, len(positions))
+        is_missing = None if absent is None else absent.reshape(count, len(self._channels))[:, positions]
+        if is_missing is None or not is_missing.any():
             return numbers
-        return np.where(lacking, np.nan, numbers) if kind[0] == "f" else None
+        return np.where(is_missing, np.nan, numbers) if kind[0] == "f" else None
 
-    def _one_by_one(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
+    def _parse_one_by_one(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
         rows = []
         for line in lines:
-            row = self._row(line, self._requested)
+            row = self._parse_line(line)
             if row is None:
                 return None
             rows.append(row)
         try:
             return {
-                kind: np.array([[row[place] for place in mine] for row in rows], dtype=_wide(kind)).reshape(
-                    -1, len(mine)
+                kind: np.array([[row[column] for column in columns] for row in rows], dtype=_parsed_type(kind)).reshape(
+                    -1, len(columns)
                 )
-                for kind, mine in self._of_type.items()
+                for kind, columns in self._channels_by_type.items()
             }
         except OverflowError:
             return None
 
-    def _row(self, line: bytes, requested: Sequence[int]) -> list[float | int] | None:
+    def _parse_line(self, line: bytes) -> list[float | int] | None:
         words = [word.strip(b" \t") for word in line.split(self.separator)] if self.separator else line.split()
         if len(words) != len(self.cells):
             return None
         numbers: list[float | int] = []
-        for place in requested:
-            cell, label, word = self.cells[place], self._labels[place], words[place]
+        for position in self._channels:
+            cell, label, word = self.cells[position], self._labels[position], words[position]
             if not word.startswith(label):
                 return None
             word = word[len(label) :].strip(b" \t") if label else word
@@ -359,7 +360,7 @@ class Parser:
                 if not FLOAT.fullmatch(word):
                     return None
                 numbers.append(float(word))
-            elif WHOLE.fullmatch(word):
+            elif INTEGER.fullmatch(word):
                 numbers.append(int(word))
             else:
                 return None
@@ -367,7 +368,7 @@ class Parser:
 
 
 def _without_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Array, Bools | None]:
-    """Return texts with 0 for those that mean that there is no value, and which these are (text,); None: none."""
+    """Replace the texts of missing values by 0, and return a mask (text,) of them, or None if there are none."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -376,34 +377,34 @@ def _without_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Arra
     return (pc.if_else(flags, "0", texts), absent) if absent.any() else (texts, None)
 
 
-def _placed(count: int, width: int, chosen: Sequence[int]) -> Int64s:
-    """Return the places of some cells of lines (line times cell)."""
-    places: Int64s = np.arange(count)[:, None] * width + np.array(chosen)
-    return places.ravel()
+def _cell_indices(count: int, width: int, columns: Sequence[int]) -> Int64s:
+    """Return the indices (line × column) of some columns in the flat cells of ``count`` lines of ``width`` cells."""
+    indices: Int64s = np.arange(count)[:, None] * width + np.array(columns)
+    return indices.ravel()
 
 
-def _wide(kind: str) -> np.dtype[np.generic]:
-    """Return the type as which a cell's text is read, before it is looked at whether its own type holds it."""
+def _parsed_type(kind: str) -> np.dtype[np.generic]:
+    """Return the type with which a text is parsed before the range of its own type is checked."""
     if kind[0] == "f":
         return np.dtype(np.float64)
     return np.dtype(np.uint64 if kind == "u64" else np.int64)
 
 
-def _fitted(numbers: AnyArray, kind: str) -> AnyArray | None:
-    """Return numbers (line, cell) in their type; None where one is beyond it. NaN is a value that is missing."""
+def _cast_checked(numbers: AnyArray, kind: str) -> AnyArray | None:
+    """Convert numbers (line, cell) to their type. Returns None if one is out of range. NaN means a missing value."""
     target = dtype(kind)
     if target.kind == "f":
-        beyond = bool((np.abs(numbers) > np.finfo(target).max).any())  # infinite too
+        out_of_range = bool((np.abs(numbers) > np.finfo(target).max).any())  # also True for infinity
     elif target.itemsize == 8 or not len(numbers):
-        beyond = False
+        out_of_range = False
     else:
         limits = np.iinfo(target)
-        beyond = int(numbers.min()) < limits.min or int(numbers.max()) > limits.max
-    return None if beyond else numbers.astype(target)
+        out_of_range = int(numbers.min()) < limits.min or int(numbers.max()) > limits.max
+    return None if out_of_range else numbers.astype(target)
 
 
 def _without_sum(lines: Sequence[bytes], total: LineSum) -> list[bytes] | None:
-    """Return the lines up to the mark of their sum; None where one has none or a wrong one."""
+    """Return the lines up to the mark of their checksum, or None if a checksum is missing or wrong."""
     mark, begin = total.mark.encode(), total.begin.encode()
     digits = re.compile(
         rb"[0-9A-Fa-f]{1,%d}" % (2 * total.width) if total.digits == "hex" else rb"\d{1,%d}" % (3 * total.width)
@@ -421,11 +422,11 @@ def _without_sum(lines: Sequence[bytes], total: LineSum) -> list[bytes] | None:
 
 
 def line_sums(texts: Sequence[bytes], total: LineSum) -> AnyArray:
-    """Return the sum of each text (text,), those of one length at once."""
+    """Return the checksum of each text (text,). Texts of one length are processed at once."""
     totals = np.zeros(len(texts), dtype=np.int64)
     rows = sorted(range(len(texts)), key=lambda row: len(texts[row]))
     for size, group in groupby(rows, key=lambda row: len(texts[row])):
-        mine = list(group)
-        data = np.frombuffer(b"".join(texts[row] for row in mine), np.uint8).reshape(len(mine), size)
-        totals[mine] = layout.SUMS[total.kind][0](data).astype(np.int64)
+        same_size = list(group)
+        data = np.frombuffer(b"".join(texts[row] for row in same_size), np.uint8).reshape(len(same_size), size)
+        totals[same_size] = layout.SUMS[total.kind][0](data).astype(np.int64)
     return totals

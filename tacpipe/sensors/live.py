@@ -1,10 +1,10 @@
-"""Record what `tacpipe live` publishes, as streams of a rig.
+"""Record the messages that `tacpipe live` publishes, as streams of a rig.
 
-A task declares each value of its messages once (`Value`): name, type, unit and meaning. The JSON, the packets, the columns
-of the recorded streams and the reference page follow from the declaration (`Declaration`).
+A task declares each value of its messages once (`Value`): name, type, unit and meaning. JSON, packets, columns of values_of
+streams and the reference page are derived from the declaration (`Declaration`).
 
-A packet is ``tacL``, a version, the number of its stream, a counter of 32 bits and the time of the message in UTC ns. The
-declared values follow, in their order. All numbers are little-endian.
+A packet is ``tacL``, a version, the number of its stream, a 32-bit counter and the time of the message in UTC ns,
+followed by the declared values in order. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 MAGIC, VERSION = b"tacL", 1
 HEAD = np.dtype([("magic", "S4"), ("version", "u1"), ("kind", "u1"), ("rest", "<u2"), ("seq", "<u4"), ("t_ns", "<i8")])
 UNKNOWN, OFF, ON = -1, 0, 1  # states of an alarm
-LARGEST_PACKET = 60_000  # bytes
+MAX_PACKET = 60_000  # bytes
 LATENCY = "latency"  # stream that every session records
-LATENCY_NUMBER = 2  # its number in packets
-LSL = "lsl"  # channels of the published LSL stream; not recorded
+LATENCY_NUMBER = 2  # number of this stream in packets
+LSL = "lsl"  # channels of the published LSL stream, which is not values_of
 
 
 class MessageSizes(Protocol):
-    """Lists over which the values of a message repeat; the sensor `Live` and a task's `Description` have them."""
+    """The lists whose lengths determine the columns of a message, as in `Live` and a task's `Description`."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -45,11 +45,11 @@ class MessageSizes(Protocol):
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Rows ahead that are predicted."""
+        """Prediction horizons in rows."""
 
     @property
     def quantiles(self) -> tuple[int, ...]:
-        """Levels of quantiles, percent."""
+        """Quantile levels in percent."""
 
     @property
     def unit(self) -> str:
@@ -61,51 +61,50 @@ class MessageSizes(Protocol):
 
 
 class LiveColumn(NamedTuple):
-    """One number of a recorded stream."""
+    """One number of a values_of stream."""
 
     name: str
     unit: str = "1"
-    metadata: Mapping[str, str] = {}  # further metadata of the recorded column
+    metadata: Mapping[str, str] = {}  # further metadata of the values_of column
 
 
 @dataclass(frozen=True)
 class Value:
-    """One declared value of a message: a field of its JSON, columns of recorded streams, or both."""
+    """One declared value of a message: a field of its JSON, columns of values_of streams, or both."""
 
     name: str
     meaning: str
-    json: str = ""  # its JSON type; empty: it is recorded only
-    digits: int | None = None  # digits of a number in JSON, which is null where it is not finite
-    # streams whose columns it gives: recorded ones, and `LSL`
-    streams: tuple[str, ...] = ()
-    type: str = "<f4"  # type of each column, as numpy names it
+    json: str = ""  # JSON type; empty if the value is only values_of
+    digits: int | None = None  # decimals of a number in JSON; a number that is not finite becomes null
+    streams: tuple[str, ...] = ()  # streams with columns of this value: values_of streams, and `LSL`
+    type: str = "<f4"  # numpy type of each column
     unit: str = ""
-    quantity: str = ""  # metadata of the recorded columns
-    columns: Callable[[MessageSizes], list[LiveColumn]] | None = None  # None: one column with the value's name
-    schema: Callable[[MessageSizes], dict[str, Any]] | None = None  # its JSON schema; None: that of its type
-    attribute: str = ""  # attribute of the message that holds it; empty: its name
+    quantity: str = ""  # metadata of the values_of columns
+    columns: Callable[[MessageSizes], list[LiveColumn]] | None = None  # None: one column with the name of the value
+    schema: Callable[[MessageSizes], dict[str, Any]] | None = None  # JSON schema; None: the schema of its type
+    attribute: str = ""  # attribute of the message that contains it; empty: the name of the value
 
     def columns_for(self, sizes: MessageSizes) -> list[LiveColumn]:
-        """Return its columns in a message of these sizes."""
+        """Return the columns of the value in a message of these sizes."""
         return [LiveColumn(self.name, self.unit or "1")] if self.columns is None else self.columns(sizes)
 
     def read(self, message: object) -> Any:
-        """Return the value that a message holds."""
+        """Return the value in a message."""
         return getattr(message, self.attribute or self.name)
 
 
 LATENCIES = {
-    "latency_ms": "time from the arrival of the newest sample that was read to publishing",
+    "latency_ms": "time from the arrival of the newest used sample to publishing",
     "age_ms": "time from the arrival of the newest sample of the master stream to publishing",
-    "compute_ms": "part of the latency that decoding and the model took",
-    "cause": "flags that state why there is no answer, or what it was made without; 0: none",
-    "skipped": "answers so far that were left out under overload",
-    "late": "samples so far that came too late to be read",
+    "compute_ms": "part of the latency spent on decoding and the model",
+    "cause": "flags: why there is no answer, or which input was missing; 0: none",
+    "skipped": "answers skipped so far because of overload",
+    "late": "samples so far that arrived too late to be used",
 }  # meaning of the columns of the stream `LATENCY`
 
 
 def latency_values(*in_json: str) -> tuple[Value, ...]:
-    """Return the values of the stream `LATENCY`, with those that JSON holds as well."""
+    """Return the values of the stream `LATENCY`. ``in_json`` are those that the JSON messages contain, too."""
     values = []
     for name, meaning in LATENCIES.items():
         is_time = name.endswith("_ms")
@@ -127,31 +126,31 @@ def latency_values(*in_json: str) -> tuple[Value, ...]:
 
 @dataclass(frozen=True)
 class Declaration:
-    """The messages of one task: their values in order, and the recorded streams that hold them."""
+    """The messages of one task: their values in order, and the values_of streams that contain them."""
 
-    kind: str  # kind of the messages, as JSON names it
+    kind: str  # ``kind`` in JSON
     values: tuple[Value, ...]
-    numbers: Mapping[str, int] = field(default_factory=dict)  # number in packets of each stream but `LATENCY`
+    numbers: Mapping[str, int] = field(default_factory=dict)  # number in packets by stream, without `LATENCY`
 
     @property
     def streams(self) -> dict[str, int]:
-        """The number in packets of each recorded stream."""
+        """The number in packets, by values_of stream."""
         return {**self.numbers, LATENCY: LATENCY_NUMBER}
 
-    def recorded(self, stream: str) -> list[Value]:
+    def values_of(self, stream: str) -> list[Value]:
         """Return the values of a stream, in the order of its columns."""
         return [value for value in self.values if stream in value.streams]
 
     def columns(self, stream: str, sizes: MessageSizes) -> list[tuple[Value, LiveColumn]]:
         """Return the columns of a stream in messages of these sizes, each with its value."""
-        return [(value, column) for value in self.recorded(stream) for column in value.columns_for(sizes)]
+        return [(value, column) for value in self.values_of(stream) for column in value.columns_for(sizes)]
 
 
-COMMON = Declaration("", latency_values())  # declares the stream that every session records
+COMMON = Declaration("", latency_values())  # the stream that every session records
 
 
 def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:
-    """Return arrays (row, column) joined to one block per run of equal types; ``values`` are types and arrays."""
+    """Join arrays (row, column) to one block per run of equal types. ``values`` are (type, array) pairs."""
     return tuple(
         np.hstack([array.astype(kind) for _, array in run])
         for kind, run in itertools.groupby(values, key=lambda typed: typed[0])
@@ -160,19 +159,19 @@ def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Live(Sensor):
-    """One of the streams of a live session."""
+    """One stream of a live session."""
 
-    summary: ClassVar[str] = "What `tacpipe live` publishes by UDP: answers of a model, alarms or latencies."
+    summary: ClassVar[str] = "Messages that `tacpipe live` publishes by UDP: answers of a model, alarms or latencies."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False
     counter: ClassVar[int | None] = 1 << 32
 
-    task: str = ""  # the task whose messages the packets hold; needed for any output but latency
+    task: str = ""  # task of the messages; required for all outputs except latency
     output: str = LATENCY  # the stream of that task's messages
-    channels: tuple[str, ...] = ()  # names of what is predicted
-    steps: tuple[int, ...] = ()  # rows ahead that are predicted
-    quantiles: tuple[int, ...] = ()  # levels of quantiles, percent
+    channels: tuple[str, ...] = ()  # names of the predicted channels or classes
+    steps: tuple[int, ...] = ()  # prediction horizons in rows
+    quantiles: tuple[int, ...] = ()  # quantile levels in percent
     unit: str = "count"  # unit of the channels
     alarms: tuple[str, ...] = ()  # names of the alarms
     rate_hz: float = 0.0  # packets per second; 0: irregular
@@ -180,10 +179,10 @@ class Live(Sensor):
     def __post_init__(self) -> None:
         if not self._columns:
             raise UsageError(f"live: a stream of the output {self.output} needs channels and steps, or alarms.")
-        if self.size > LARGEST_PACKET:
+        if self.size > MAX_PACKET:
             raise UsageError(
-                f"live: {len(self.channels)} channels at {len(self.steps)} steps with {len(self.quantiles)} quantiles make "
-                f"packets of {self.size} bytes, and UDP carries {LARGEST_PACKET}. Give fewer --steps."
+                f"live: {len(self.channels)} channels at {len(self.steps)} steps with {len(self.quantiles)} quantiles need "
+                f"packets of {self.size} bytes; UDP allows {MAX_PACKET}. Give fewer --steps."
             )
 
     @functools.cached_property
@@ -193,7 +192,7 @@ class Live(Sensor):
         if self.output not in declaration.streams:
             owner = f"messages of the task {plain(self.task)}" if self.task else "a session without a task"
             raise UsageError(
-                f"live: there is no output {plain(self.output)} of {owner}; there are {listed(declaration.streams)}."
+                f"live: there is no output {plain(self.output)} in {owner}; there are {listed(declaration.streams)}."
             )
         return declaration
 
@@ -203,9 +202,9 @@ class Live(Sensor):
 
     @functools.cached_property
     def _row(self) -> np.dtype[Any]:
-        """The numbers of a packet: one field per run of columns of one type."""
+        """The structured type of a packet's values: one field per run of columns of one type."""
         runs = itertools.groupby(value.type for value, _ in self._columns)
-        return np.dtype([(f"block{place}", kind, (len(list(run)),)) for place, (kind, run) in enumerate(runs)])
+        return np.dtype([(f"block{number}", kind, (len(list(run)),)) for number, (kind, run) in enumerate(runs)])
 
     @property
     def size(self) -> int:
@@ -213,7 +212,7 @@ class Live(Sensor):
         return HEAD.itemsize + self._row.itemsize
 
     def fields(self) -> list[pa.Field]:
-        """Return a field for each declared column, with its unit and quantity."""
+        """Return one field per declared column, with its unit and quantity."""
         import pyarrow as pa
 
         return [
@@ -226,28 +225,28 @@ class Live(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer that takes packets of this output and size."""
-        return PacketFramer([self.size], self._is_right)
+        """Return a framer for packets of this output and size."""
+        return PacketFramer([self.size], self._are_valid)
 
-    def _is_right(self, packets: Bytes) -> Bools:
+    def _are_valid(self, packets: Bytes) -> Bools:
         heads = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)[:, 0]
-        right: Bools = (
+        is_valid: Bools = (
             (heads["magic"] == MAGIC)
             & (heads["version"] == VERSION)
             & (heads["kind"] == self._declaration.streams[self.output])
             & (heads["rest"] == 0)
         )
-        return right
+        return is_valid
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return one sample per packet; the time of the message is the device's time."""
+        """Return one sample per packet. The time of the message is the device's time."""
         heads = np.ascontiguousarray(frames[:, : HEAD.itemsize]).view(HEAD)[:, 0]
         rows = np.ascontiguousarray(frames[:, HEAD.itemsize :]).view(self._row)[:, 0]
         values = tuple(rows[name] for name in rows.dtype.names or ())
         return Samples(values, heads["seq"].astype(np.int64), heads["t_ns"].astype(np.int64))
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the packets of samples."""
+        """Return the packets of these samples."""
         heads = np.zeros(len(samples), dtype=HEAD)
         heads["magic"], heads["version"], heads["kind"] = MAGIC, VERSION, self._declaration.streams[self.output]
         heads["seq"], heads["t_ns"] = samples.seq, samples.t_device_ns

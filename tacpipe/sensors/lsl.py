@@ -1,8 +1,9 @@
-"""A stream of Lab Streaming Layer (LSL), whose outlet states what its channels are.
+"""A stream of Lab Streaming Layer (LSL), whose outlet describes its channels.
 
-The link (`tacpipe.links.lsl`) gives packets of three kinds: ``D`` and the stream's description in XML, once when it opens;
-``S`` and samples of numbers; ``T`` and markers as JSON. Each packet of samples holds the stamps as the outlet sent them, on
-the sender's clock, and the correction that LSL itself measured last: what it adds to such a stamp for this computer's clock.
+The link (`tacpipe.links.lsl`) returns three kinds of packets: ``D`` with the stream's description in XML, once after
+opening; ``S`` with samples of numbers; ``T`` with markers as JSON. Each packet of samples contains the timestamps on the
+sender's clock, and the correction that LSL measured last: the value to add to a timestamp to convert it to this
+computer's clock.
 """
 
 from __future__ import annotations
@@ -27,42 +28,41 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 DESCRIPTION, NUMBERS, TEXTS = b"D", b"S", b"T"
-HEAD = struct.Struct("<cdI")  # kind, correction in seconds (NaN: none yet), samples
+HEAD = struct.Struct("<cdI")  # kind, correction in s (NaN before the first measurement), number of samples
 CORRECTION = "lsl_correction_s"
-TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "t_uncertain_ns", CORRECTION)
+RESERVED = ("t_ns", "t_device_ns", "seq", "device_seq", "t_uncertain_ns", CORRECTION)
 Format = Literal["float32", "double64", "int8", "int16", "int32", "int64", "string"]
 
 
 @dataclass(frozen=True)
 class Lsl(Sensor):
-    """A stream of LSL. What is left out is as the outlet states it when `tacpipe acquire` begins."""
+    """An LSL stream. Omitted options are taken from the outlet when `tacpipe acquire` starts."""
 
-    summary: ClassVar[str] = "A stream of Lab Streaming Layer (LSL): numbers or markers."
+    summary: ClassVar[str] = "A Lab Streaming Layer (LSL) stream of numbers or markers."
     links: ClassVar[tuple[str, ...]] = ("lsl",)
     described: ClassVar[bool] = True
     guesses: ClassVar[Mapping[str, str]] = {
-        "channels": "as the outlet states; leave out to take what it states when a recording begins",
+        "channels": "from the outlet; omit them to use those that it declares when a recording starts",
     }
 
-    channels: tuple[LslChannel, ...] = ()  # channels of the stream, in their order; none: as the outlet states
-    format: Format = "float32"  # type of values, as LSL names it; comes from the outlet with the channels
-    rate_hz: float = 0.0  # samples a second; 0: they come when they come
+    channels: tuple[LslChannel, ...] = ()  # channels of the stream, in order; if empty, those of the outlet
+    format: Format = "float32"  # LSL's name of the value type; taken from the outlet together with the channels
+    rate_hz: float = 0.0  # samples per second; 0: irregular
 
     def __post_init__(self) -> None:
         names = [channel.name for channel in self.channels]
         for name in names:
-            if lsl.identifiers([name]) != [name] or name in TAKEN or names.count(name) > 1:
+            if lsl.identifiers([name]) != [name] or name in RESERVED or names.count(name) > 1:
                 raise UsageError(
-                    f"lsl: {name!r} cannot name a channel; use lower-case letters, digits and _, each name once, "
-                    f"and none of "
-                    f"{', '.join(TAKEN)}."
+                    f"lsl: {name!r} is not a valid channel name; use unique names of lower-case letters, digits and _, "
+                    f"and none of {', '.join(RESERVED)}."
                 )
         if not 0 <= self.rate_hz < float("inf"):
             raise UsageError(f"lsl: rate_hz is {self.rate_hz:g}; it must be 0 or above.")
 
     @property
     def incomplete(self) -> bool:  # type: ignore[override]
-        """True where the channels come from the outlet."""
+        """True if the channels come from the outlet."""
         return not self.channels
 
     @property
@@ -74,7 +74,7 @@ class Lsl(Sensor):
         return np.dtype(lsl.FORMATS[self.format]).newbyteorder("<")
 
     def fields(self) -> list[pa.Field]:
-        """Return a field a channel, and ``lsl_correction_s``: what LSL adds to a stamp for this computer's clock."""
+        """Return one field per channel, and ``lsl_correction_s``, the offset from the sender's to this computer's clock."""
         import pyarrow as pa
 
         kind = pa.string() if self._is_text else pa.from_numpy_dtype(self._dtype.newbyteorder("="))
@@ -87,17 +87,17 @@ class Lsl(Sensor):
         return [*fields, pa.field(CORRECTION, pa.float64(), metadata={"unit": "s", "quantity": "time"})]
 
     def framer(self) -> Framer:
-        """Return a framer of the link's packets."""
-        return TextFramer(self._is_right)
+        """Return a framer for the link's packets."""
+        return TextFramer(self._is_valid)
 
-    def _is_right(self, packet: bytes) -> bool:
+    def _is_valid(self, packet: bytes) -> bool:
         if packet[:1] == DESCRIPTION:
-            return _described(packet) is not None
-        opened = self._opened(packet)
-        return opened is not None and bool((np.abs(opened[1]) < lsl.MAX_TIME_S).all())
+            return _parse_description(packet) is not None
+        unpacked = self._unpack(packet)
+        return unpacked is not None and bool((np.abs(unpacked[1]) < lsl.MAX_TIME_S).all())
 
-    def _opened(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
-        """Return correction, stamps (sample,) in seconds and values (sample, channel); None: no samples of this stream."""
+    def _unpack(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
+        """Return correction, timestamps (sample,) in s and values (sample, channel), or None if there are no samples."""
         if packet[:1] == (TEXTS if self._is_text else NUMBERS) and len(packet) >= HEAD.size:
             _, correction, count = HEAD.unpack_from(packet)
             stop = HEAD.size + 8 * count
@@ -112,9 +112,9 @@ class Lsl(Sensor):
         return None
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return the samples of packets, several each: channels and corrections, and the stamps as they were sent."""
-        opened = [(row, self._opened(frame)) for row, frame in enumerate(frames)]
-        parts = [(row, packet) for row, packet in opened if packet is not None]
+        """Return the samples of packets: channels, corrections, and the timestamps as sent."""
+        unpacked = [(row, self._unpack(frame)) for row, frame in enumerate(frames)]
+        parts = [(row, packet) for row, packet in unpacked if packet is not None]
         counts = [len(block[1]) for _, block in parts]
         corrections = np.repeat([block[0] for _, block in parts], counts).astype(np.float64)[:, None]
         kind = object if self._is_text else self._dtype.newbyteorder("=")
@@ -129,7 +129,7 @@ class Lsl(Sensor):
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return a packet for each sample."""
+        """Return one packet per sample."""
         assert samples.t_device_ns is not None
         corrections = samples.values[-1][:, -1].tolist()
         stamps: Times = samples.t_device_ns
@@ -142,7 +142,7 @@ class Lsl(Sensor):
 
 
 def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
-    """Return the packet of samples (sample, channel), texts where they are objects, with their stamps in seconds."""
+    """Return a packet of samples (sample, channel) with timestamps (sample,) in s. Values of type object are texts."""
     is_text = values.dtype.kind == "O"
     head = HEAD.pack(TEXTS if is_text else NUMBERS, correction, len(stamps)) + stamps.astype("<f8").tobytes()
     if is_text:
@@ -150,10 +150,10 @@ def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
     return head + np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
 
 
-def options(data: Chunks) -> list[Options]:
-    """Return the options of the stream whose description is among packets; none where none is."""
+def guess_options(data: Chunks) -> list[Options]:
+    """Return the options of the stream whose description is among the packets, or an empty list without a description."""
     for packet in data.packets():
-        description = _described(packet) if packet[:1] == DESCRIPTION else None
+        description = _parse_description(packet) if packet[:1] == DESCRIPTION else None
         if description is not None:
             channels = [_entry(channel, text=description.is_text) for channel in description.channels]
             return [{"channels": channels, "format": description.format, "rate_hz": description.rate_hz}]
@@ -161,12 +161,12 @@ def options(data: Chunks) -> list[Options]:
 
 
 def _entry(channel: LslChannel, *, text: bool) -> dict[str, str]:
-    """Return a channel as a rig file has it; what is the same for every text is left out."""
-    name = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
+    """Return a channel as in a rig file. Metadata that is the same for all text channels is omitted."""
+    name = f"{channel.name}_channel" if channel.name in RESERVED else channel.name
     return {"name": name, **({} if text else channel.metadata)}
 
 
-def _described(data: bytes) -> lsl.LslDescription | None:
+def _parse_description(data: bytes) -> lsl.LslDescription | None:
     try:
         return lsl.parse(data[1:])
     except TacpipeError:
@@ -182,12 +182,12 @@ def _texts(data: bytes, count: int, channels: int) -> AnyArray | None:
         return None
     if not all(isinstance(row, list) and len(row) == channels for row in rows):
         return None
-    if not all(isinstance(word, str) and _encodes(word) for row in rows for word in row):
+    if not all(isinstance(word, str) and _is_encodable(word) for row in rows for word in row):
         return None
     return np.array(rows, dtype=object).reshape(count, channels)
 
 
-def _encodes(word: str) -> bool:
+def _is_encodable(word: str) -> bool:
     try:
         word.encode()
     except UnicodeEncodeError:

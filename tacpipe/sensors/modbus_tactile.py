@@ -1,8 +1,8 @@
-"""Synria tactile pressure modules: an array of taxels on Modbus RTU, asked for each frame.
+"""Synria tactile pressure modules: an array of taxels on Modbus RTU, polled for each frame.
 
-The function 0x42 has a reply with all taxels, uint16 and little-endian, unlike the big-endian registers of Modbus. A module
-can also send by itself, in a form that is not published: that is switched off.
-Source: the package tactile-pressure-sdk 2.0.0 (MIT); MODBUS over Serial Line V1.02 for what is standard.
+The reply to function 0x42 contains all taxels as little-endian uint16, unlike Modbus registers, which are big-endian. A
+module can also send by itself, in an unpublished format; the driver turns this off.
+Source: the package tactile-pressure-sdk 2.0.0 (MIT); MODBUS over Serial Line V1.02 for the standard functions.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 READ_REGISTERS, WRITE_REGISTER, INFO, PRESSURES = 0x03, 0x06, 0x41, 0x42  # functions
-REFUSED = 0x80  # bit of the function in a reply that means no
+REFUSED = 0x80  # bit of the function in a reply that reports an error
 ADDRESS, SENDING, SENDING_HZ, UNIT, COUNT, ZERO = 0x01, 0x0B, 0x0C, 0x0D, 0x0F, 0x12  # registers
-REFUSALS = {1: "it does not know the function", 2: "it has no such register", 3: "the value is out of its range"}
+REFUSALS = {1: "unknown function", 2: "unknown register", 3: "value out of range"}
 BROADCAST, HEADER = 0, 4
 INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # texts of the emulated device
 REGISTERS = {
@@ -43,35 +43,35 @@ REGISTERS = {
 
 @dataclass(frozen=True)
 class ModbusTactile(Sensor):
-    """A tactile pressure module of Synria."""
+    """A tactile pressure module by Synria."""
 
-    summary: ClassVar[str] = "Synria tactile pressure modules on Modbus RTU, asked for each frame."
+    summary: ClassVar[str] = "Synria tactile pressure modules on Modbus RTU, polled for each frame."
 
     address: int = 1  # address of the module on its bus, 1 to 247
-    points: int = 60  # taxels of the module
-    unit: Literal["mN", "count"] = "mN"  # unit that the module sends: calibrated forces, or counts of its ADC
-    rate_hz: float = 200.0  # how often it is asked
+    points: int = 60  # number of taxels of the module
+    unit: Literal["mN", "count"] = "mN"  # unit of the values: calibrated forces, or ADC counts
+    rate_hz: float = 200.0  # polling rate
     baud: int = 4_000_000  # baud rate of the bus
 
     def __post_init__(self) -> None:
-        sensor.within("modbus-tactile", "address", self.address, 1, 247)
-        sensor.within("modbus-tactile", "points", self.points, 1, 2000)
-        sensor.known("modbus-tactile", "unit", self.unit, ("mN", "count"))
-        sensor.positive("modbus-tactile", rate_hz=self.rate_hz, baud=self.baud)
+        sensor.check_range("modbus-tactile", "address", self.address, 1, 247)
+        sensor.check_range("modbus-tactile", "points", self.points, 1, 2000)
+        sensor.check_choice("modbus-tactile", "unit", self.unit, ("mN", "count"))
+        sensor.check_positive("modbus-tactile", rate_hz=self.rate_hz, baud=self.baud)
 
     def fields(self) -> list[pa.Field]:
-        """Return ``taxel01`` to the last, uint16, millinewtons or counts."""
+        """Return ``taxel01``, …, uint16, in mN or counts."""
         import pyarrow as pa
 
-        return sensor.fields(self.points, pa.uint16(), self.unit)
+        return sensor.taxel_fields(self.points, pa.uint16(), self.unit)
 
     @property
     def header(self) -> bytes:
-        """The four bytes that every frame begins with."""
+        """The first four bytes of every frame."""
         return bytes([self.address, PRESSURES]) + (2 * self.points).to_bytes(2, "little")
 
     def framer(self) -> Framer:
-        """Return a framer of replies with all taxels; other replies, with their own sums, are not frames."""
+        """Return a framer for replies with all taxels; other replies are not frames."""
         return ByteFramer(Framing(marker=self.header, size=HEADER + 2 * self.points + 2, check=_crc_is_right))
 
     def decode(self, frames: Bytes) -> Samples:
@@ -80,56 +80,58 @@ class ModbusTactile(Sensor):
         return Samples((counts,))
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the replies that hold these samples."""
+        """Return the replies with these samples."""
         (counts,) = samples.values
         head = np.broadcast_to(np.frombuffer(self.header, np.uint8), (len(counts), HEADER))
         body = np.hstack([head, np.ascontiguousarray(counts, dtype="<u2").view(np.uint8)])
         return np.hstack([body, crc16_modbus(body).astype("<u2")[:, None].view(np.uint8)])
 
     def request(self) -> bytes:
-        """Return what asks for all taxels."""
+        """Return the request for all taxels."""
         return with_crc(bytes([self.address, PRESSURES]))
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Have the module wait to be asked, see that it has so many taxels, and set their unit.
+        """Turn off automatic sending, check the number of taxels, and set their unit.
 
-        Raises `DeviceError` if it has more or fewer, or refuses.
+        Raises `DeviceError` if the number of taxels differs, or the module refuses.
         """
-        yield self._writing(SENDING, 0, "that it waits to be asked")
-        message = yield self._asking(
-            READ_REGISTERS, COUNT.to_bytes(2, "big") + b"\x00\x01", 7, "how many taxels it has"
+        yield self._write_register(SENDING, 0, "the reply to turning off automatic sending")
+        message = yield self._request_reply(
+            READ_REGISTERS, COUNT.to_bytes(2, "big") + b"\x00\x01", 7, "the number of taxels"
         )
         points = int.from_bytes(message[-4:-2], "big")
         if points != self.points:
             raise DeviceError(
-                f"The module has {points} taxels, not {self.points}; write points = {points} in the rig file."
+                f"The module has {points} taxels, not {self.points}; set points = {points} in the rig file."
             )
-        yield self._writing(UNIT, int(self.unit == "mN"), "in what unit it measures")
+        yield self._write_register(UNIT, int(self.unit == "mN"), "the reply to setting the unit")
 
     def taring(self) -> Dialogue:
-        """Take the present load for zero. Raises `DeviceError` if the module refuses."""
-        yield self._writing(ZERO, 1, "that it takes zero anew")
+        """Zero the load. Raises `DeviceError` if the module refuses."""
+        yield self._write_register(ZERO, 1, "the reply to zeroing")
 
-    def _writing(self, register: int, value: int, description: str) -> Ask:
-        return self._asking(WRITE_REGISTER, register.to_bytes(2, "big") + value.to_bytes(2, "big"), 8, description)
+    def _write_register(self, register: int, value: int, description: str) -> Ask:
+        return self._request_reply(
+            WRITE_REGISTER, register.to_bytes(2, "big") + value.to_bytes(2, "big"), 8, description
+        )
 
-    def _asking(self, function: int, data: bytes, size: int, description: str) -> Ask:
-        """Return a request and what finds its reply of ``size`` bytes."""
+    def _request_reply(self, function: int, data: bytes, size: int, description: str) -> Ask:
+        """Return a request with a reply of ``size`` bytes."""
         return Ask(
             with_crc(bytes([self.address, function]) + data),
-            until=_reply(self.address, function, size),
+            until=_reply_finder(self.address, function, size),
             what=description,
         )
 
     def device(self) -> Device:
-        """Return a module that waits to be asked."""
+        """Return an emulated module that waits for requests."""
         registers = {**REGISTERS, ADDRESS: self.address, COUNT: self.points}
         return _Module(streaming=False, registers=registers)
 
 
 @dataclass
 class _Module(Device):
-    """The module's side: counts what it is asked for, reads and writes registers, states what it is."""
+    """An emulated module: it counts requests for taxels, reads and writes registers, and returns its identity."""
 
     registers: dict[int, int] = field(default_factory=dict)
     requests: int = 0
@@ -155,7 +157,7 @@ class _Module(Device):
         return replies
 
     def _answer(self, function: int, data: bytes) -> bytes | None:
-        """Return function and data of a reply, or None for taxels, which `polled` counts."""
+        """Return function and data of a reply, or None for a request for taxels, which `polled` counts."""
         if function == PRESSURES:
             self.requests += 1
             return None
@@ -182,7 +184,7 @@ class _Module(Device):
 
 
 def with_crc(body: bytes) -> bytes:
-    r"""Return a message with its CRC behind it, low byte first.
+    r"""Return a message with its CRC appended, low byte first.
 
     >>> with_crc(b"\x01\x42").hex(" ")
     '01 42 80 11'
@@ -190,10 +192,10 @@ def with_crc(body: bytes) -> bytes:
     return body + int(crc16_modbus(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")
 
 
-def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return what finds a reply of ``size`` bytes, or a refusal of five, which raises `DeviceError`, among what came."""
+def _reply_finder(address: int, function: int, size: int) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return a function that finds a reply of ``size`` bytes. It raises `DeviceError` for an error reply of five bytes."""
 
-    def until(received: bytes) -> int | tuple[int, int]:
+    def find(received: bytes) -> int | tuple[int, int]:
         for code, length in ((function, size), (function | REFUSED, 5)):
             head = bytes([address, code])
             start = received.find(head)
@@ -207,9 +209,9 @@ def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tu
                 start = received.find(head, start + 1)
         return 0
 
-    return until
+    return find
 
 
 def _crc_is_right(frames: Bytes) -> Bools:
-    right: Bools = crc16_modbus(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
-    return right
+    is_right: Bools = crc16_modbus(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+    return is_right

@@ -1,6 +1,7 @@
-"""Numbers in texts, read from many texts at once: from lines, and from texts that differ in nothing but their numbers.
+"""Parse numbers in many texts at once: in lines, and in XML messages that differ only in their numbers.
 
-A text that only a look at it by itself can read makes all of them unread (None): what is read here is what `float` reads.
+Functions return None if any text is unusual, so that the caller must parse the texts one by one. Results equal those of
+`float`.
 """
 
 from __future__ import annotations
@@ -20,26 +21,27 @@ if TYPE_CHECKING:
 
 
 SPACES = b" \t\r\n"
-BLANKS = b" \t"  # characters that may be around a separator
+BLANKS = b" \t"  # characters allowed around a separator
 NEWLINE = 0x0A
-MOST_BYTES = (1 << 31) - 1  # limit of 32-bit places in a text
-NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # numbers between the marks of an XML text
-FIRST = 1_000_000  # first identifier of a stored text
-ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # marks of an XML text other than quotes and tags
-APART = b"\0"  # separator of texts, which no XML contains
+MAX_BYTES = (1 << 31) - 1  # limit of 32-bit offsets in a text
+NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # numbers between quotes or tags of an XML text
+FIRST = 1_000_000  # index of the first number in `replace_by_index`
+UNSUPPORTED = (b"<?", b"<!", b"&", b"'", b"\0")  # XML syntax that patterns do not support
+TEXT_END = b"\0"  # separator of texts, which XML cannot contain
 
 
-def of_lines(lines: Sequence[bytes], width: int) -> Floats | None:
-    """Return the numbers (line, number) of lines that hold ``width`` each, with space between; None where one does not."""
+def parse_lines(lines: Sequence[bytes], width: int) -> Floats | None:
+    """Return the numbers (line, number) of lines with ``width`` numbers separated by spaces, or None if a line differs."""
     texts = cells(lines, width)
     numbers = None if texts is None else floats(texts)
     return None if numbers is None else numbers.reshape(len(lines), width)
 
 
 def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Array | None:
-    """Return the cells of lines (line times cell), one after another; None where a line has not ``width`` of them.
+    """Return the cells of lines as a flat array (line × cell), or None if a line does not have ``width`` cells.
 
-    ``separator`` is the byte between cells, which may have spaces around it; without one it is space of any length.
+    ``separator`` is the byte between cells, which may have spaces around it. If it is empty, spaces of any length separate
+    cells.
 
     >>> cells([b"1, 2", b",-3"], 2, b",").to_pylist()
     ['1', '2', '', '-3']
@@ -50,7 +52,7 @@ def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Arra
     blanks = BLANKS.replace(separator, b"")
     if any(blank in text for blank in (b" ", b"\t") if blank in blanks):
         if re.search(rb"[^\s%b][%b]+[^\s%b]" % (re.escape(separator), blanks, re.escape(separator)), text):
-            return None  # space within a cell
+            return None  # spaces within a cell
         text = text.translate(None, blanks)
     data = np.frombuffer(text, np.uint8)
     marks = np.flatnonzero((data == separator[0]) | (data == NEWLINE))
@@ -63,48 +65,48 @@ def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Arra
 def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
     data = np.frombuffer(text, np.uint8)
     spaces = np.flatnonzero(data <= SPACES[0])
-    solid = text.translate(None, SPACES)
-    if len(solid) + len(spaces) != len(text):
-        return None  # another character below the space
-    ends = spaces - np.arange(len(spaces))  # ends of cells in ``solid``, repeated where spaces are adjacent
+    without_spaces = text.translate(None, SPACES)
+    if len(without_spaces) + len(spaces) != len(text):
+        return None  # another control character
+    ends = spaces - np.arange(len(spaces))  # ends of cells in ``without_spaces``, repeated for adjacent spaces
     last = np.flatnonzero(ends != np.concatenate([[0], ends[:-1]]))
     if len(last) != count * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
         return None
-    return _texts(solid, np.concatenate([[0], ends[last]]))
+    return _texts(without_spaces, np.concatenate([[0], ends[last]]))
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """An XML text but for its numbers."""
+    """The parts of an XML text other than its numbers."""
 
-    marks: int  # quotes and angle brackets in it
-    before: Int64s  # (number,), which of these each follows; the next one ends it
-    rest: bytes  # the text without its numbers, and what parts it from the next
+    marks: int  # number of quotes and angle brackets
+    before: Int64s  # (number,), index of the mark before each number; the next mark ends the number
+    fixed_text: bytes  # the text without its numbers, and `TEXT_END`
 
-    def written(self, texts: Sequence[bytes]) -> pa.Array | None:
-        """Return the numbers of texts as they are written (text times number,); None where a text has another pattern.
+    def extract(self, texts: Sequence[bytes]) -> pa.Array | None:
+        """Return the texts of the numbers (text × number,), or None if a text has another pattern.
 
-        They stand between the right marks, but may be no numbers.
+        The returned texts are between the right marks, but may not be numbers.
         """
-        text = APART.join(texts) + APART
-        marks = _marks(text)
+        text = TEXT_END.join(texts) + TEXT_END
+        marks = _mark_offsets(text)
         if len(marks) != len(texts) * self.marks:
             return None
-        places = marks.reshape(len(texts), self.marks)
+        mark_offsets = marks.reshape(len(texts), self.marks)
         edges = np.empty((len(texts), len(self.before), 2), dtype=np.int64)  # (text, number, start and end)
-        edges[:, :, 0] = places[:, self.before] + 1
-        edges[:, :, 1] = places[:, self.before + 1]
+        edges[:, :, 0] = mark_offsets[:, self.before] + 1
+        edges[:, :, 1] = mark_offsets[:, self.before + 1]
         pieces = _texts(text, np.concatenate([[0], edges.ravel(), [len(text)]]))
         if pieces is None:
             return None
-        between, numbers = (taken(pieces, range(first, len(pieces), 2)) for first in (0, 1))
-        return numbers if between.buffers()[2].to_pybytes() == self.rest * len(texts) else None
+        between, numbers = (select_range(pieces, range(first, len(pieces), 2)) for first in (0, 1))
+        return numbers if between.buffers()[2].to_pybytes() == self.fixed_text * len(texts) else None
 
 
-def numbered(text: bytes) -> bytes:
-    """Return an XML text with the number of each number in its place, from `FIRST` on.
+def replace_by_index(text: bytes) -> bytes:
+    """Replace each number in an XML text by its index, counted from `FIRST`.
 
-    >>> numbered(b'<a x="-1.5" y="yes">7</a>')
+    >>> replace_by_index(b'<a x="-1.5" y="yes">7</a>')
     b'<a x="1000000" y="yes">1000001</a>'
     """
     count = itertools.count(FIRST)
@@ -112,49 +114,49 @@ def numbered(text: bytes) -> bytes:
 
 
 def pattern(text: bytes) -> Pattern | None:
-    """Return the pattern of a text; None where it has no numbers, or parts that need more than a look at its marks."""
+    """Return the pattern of a text, or None if it has no numbers or unsupported XML syntax."""
     starts = np.array([match.start() for match in NUMBERS.finditer(text)])
-    if not len(starts) or any(odd in text for odd in ODD):
+    if not len(starts) or any(syntax in text for syntax in UNSUPPORTED):
         return None
-    marks = _marks(text)
-    return Pattern(len(marks), np.searchsorted(marks, starts) - 1, NUMBERS.sub(b"", text) + APART)
+    marks = _mark_offsets(text)
+    return Pattern(len(marks), np.searchsorted(marks, starts) - 1, NUMBERS.sub(b"", text) + TEXT_END)
 
 
-def _marks(text: bytes) -> Int64s:
+def _mark_offsets(text: bytes) -> Int64s:
     data = np.frombuffer(text, np.uint8)
     return np.flatnonzero((data == ord('"')) | (data == ord("<")) | (data == ord(">")))
 
 
 def _texts(text: bytes, edges: Int64s) -> pa.Array | None:
-    """Return the pieces of a text between ``edges``; None where it is too long to state them."""
+    """Return the parts of a text between ``edges``, or None if it is too long for 32-bit offsets."""
     import pyarrow as pa
 
-    if len(text) > MOST_BYTES:
+    if len(text) > MAX_BYTES:
         return None
     return pa.StringArray.from_buffers(len(edges) - 1, pa.py_buffer(edges.astype(np.int32)), pa.py_buffer(text))
 
 
-def taken(texts: pa.Array, rows: range) -> pa.Array:
-    """Return some of the texts."""
-    return at(texts, np.arange(rows.start, rows.stop, rows.step))
+def select_range(texts: pa.Array, rows: range) -> pa.Array:
+    """Return the texts in a range of rows."""
+    return select(texts, np.arange(rows.start, rows.stop, rows.step))
 
 
-def at(texts: pa.Array, places: Int64s) -> pa.Array:
-    """Return the texts at some places."""
+def select(texts: pa.Array, rows: Int64s) -> pa.Array:
+    """Return the texts in these rows."""
     import pyarrow as pa
 
-    return texts.take(pa.Array.from_buffers(pa.int64(), len(places), [None, pa.py_buffer(places)]))
+    return texts.take(pa.Array.from_buffers(pa.int64(), len(rows), [None, pa.py_buffer(rows)]))
 
 
-def joined(texts: pa.Array) -> bytes:
-    """Return all texts as one, without anything between them."""
+def concatenate(texts: pa.Array) -> bytes:
+    """Return the concatenation of all texts."""
     _, offsets, data = texts.buffers()
     ends = np.frombuffer(offsets, np.int32)[texts.offset : texts.offset + len(texts) + 1]
     return data.to_pybytes()[int(ends[0]) : int(ends[-1])] if data is not None else b""
 
 
-def replaced(texts: pa.Array, text: bytes) -> pa.Array:
-    """Return texts as long as these, cut from one that is as long as all of them."""
+def with_content(texts: pa.Array, text: bytes) -> pa.Array:
+    """Return texts of the same lengths with the content of ``text``, whose length is the total."""
     import pyarrow as pa
 
     _, offsets, _ = texts.buffers()
@@ -163,17 +165,20 @@ def replaced(texts: pa.Array, text: bytes) -> pa.Array:
 
 
 def floats(texts: pa.Array) -> Floats | None:
-    """Return the numbers (text,) of texts; None where one is none."""
+    """Return the texts as floats (text,), or None if one is not a number."""
     return cast(texts, np.dtype(np.float64))
 
 
-def wholes(texts: pa.Array) -> Int64s | None:
-    """Return the whole numbers (text,) of texts; None where one is none."""
+def integers(texts: pa.Array) -> Int64s | None:
+    """Return the texts as integers (text,), or None if one is not an integer."""
     return cast(texts, np.dtype(np.int64))
 
 
 def cast(texts: pa.Array, kind: np.dtype[Any]) -> AnyArray | None:
-    """Return the numbers (text,) in the buffer that holds them: pyarrow would import pandas to make an array of them."""
+    """Return the texts as numbers (text,), or None if one is invalid.
+
+    The result is a view of pyarrow's buffer, because its own conversion would import pandas.
+    """
     import pyarrow as pa
 
     try:

@@ -1,8 +1,8 @@
-"""OptoForce (OnRobot) force sensors behind their USB DAQ: 3-axis, 6-axis and four 3-axis.
+"""OptoForce (OnRobot) force sensors behind their USB DAQ: 3-axis, 6-axis and four 3-axis sensors.
 
-Frames of 16, 22 or 34 bytes: header ``AA 07 08`` and the length of what follows, then big-endian a counter, a status, int16
-axes and the 16-bit sum of all bytes before. The unit is the count; how many make a newton stands on each sensor's sheet.
-Source: DAQ communication protocol, as read by the package optoforce 0.3.0 (MIT).
+Frames have 16, 22 or 34 bytes: the header ``AA 07 08`` and the length of the payload, then, big-endian, a counter, a
+status, int16 axes, and the 16-bit sum of all preceding bytes. The unit is counts; each sensor's data sheet has the
+counts per newton. Source: DAQ communication protocol, from the package optoforce 0.3.0 (MIT).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples,
 if TYPE_CHECKING:
     import pyarrow as pa
 
-LENGTHS = {3: 0x0A, 6: 0x10, 12: 0x1C}  # axes to the header's last byte
-SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # samples a second to the byte that asks for them
-FILTERS = {0.0: 0, 500.0: 1, 150.0: 2, 50.0: 3, 15.0: 4, 5.0: 5, 1.5: 6}  # cut-off in hertz to its byte; 0: none
+LENGTHS = {3: 0x0A, 6: 0x10, 12: 0x1C}  # last byte of the header by number of axes
+SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # command byte by rate in Hz
+FILTERS = {0.0: 0, 500.0: 1, 150.0: 2, 50.0: 3, 15.0: 4, 5.0: 5, 1.5: 6}  # command byte by cut-off in Hz; 0: no filter
 CONFIGURE = b"\xaa\x00\x32\x03"
 STOP, TARE = 0, 0xFF
 
@@ -36,9 +36,9 @@ class OptoForce(Sensor):
     summary: ClassVar[str] = "OptoForce 3-axis, 6-axis and 4 x 3-axis force sensors behind their USB DAQ."
     counter: ClassVar[int | None] = 1 << 16
 
-    axes: int = 6  # 3, 6, or 12 of four 3-axis sensors
-    rate_hz: float = 1000.0  # 1000, 333, 100, 30 or 10
-    filter_hz: float = 15.0  # cut-off of the DAQ's low-pass filter: 500, 150, 50, 15, 5 or 1.5; 0: none
+    axes: int = 6  # number of axes: 3, 6, or 12 for four 3-axis sensors
+    rate_hz: float = 1000.0  # samples per second: 1000, 333, 100, 30 or 10
+    filter_hz: float = 15.0  # cut-off of the DAQ's low-pass filter: 500, 150, 50, 15, 5 or 1.5; 0: no filter
     baud: int = 1_000_000  # baud rate of the DAQ
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class OptoForce(Sensor):
                 )
 
     def fields(self) -> list[pa.Field]:
-        """Return ``status`` (uint16, bits as in the DAQ's manual) and the axes, int16 counts."""
+        """Return ``status`` (uint16, bits as in the DAQ's manual) and the axes (int16 counts)."""
         import pyarrow as pa
 
         status = pa.field("status", pa.uint16(), metadata={"unit": "1", "quantity": "status"})
@@ -70,11 +70,11 @@ class OptoForce(Sensor):
 
     @property
     def header(self) -> bytes:
-        """The four bytes that every frame begins with."""
+        """The first four bytes of every frame."""
         return bytes([0xAA, 0x07, 0x08, LENGTHS[self.axes]])
 
     def framer(self) -> Framer:
-        """Return a framer of frames with their sum."""
+        """Return a framer for frames with the right sum."""
         return ByteFramer(Framing(marker=self.header, size=2 * self.axes + 10, check=_sum_is_right))
 
     def decode(self, frames: Bytes) -> Samples:
@@ -93,7 +93,7 @@ class OptoForce(Sensor):
         return np.hstack([body, sum16(body).astype(">u2")[:, None].view(np.uint8)])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Set rate and filter; what the sensor showed before counts as load, see `taring`."""
+        """Set rate and filter. The load is not zeroed; see `taring`."""
         yield Ask(self._configure(SPEEDS[int(self.rate_hz)]))
 
     def closing(self) -> bytes:
@@ -101,19 +101,19 @@ class OptoForce(Sensor):
         return self._configure(STOP)
 
     def taring(self) -> Dialogue:
-        """Take the present load for zero."""
+        """Zero the load."""
         yield Ask(self._configure(SPEEDS[int(self.rate_hz)], zero=TARE), pause_s=0.1)
 
     def _configure(self, speed: int, zero: int = 0) -> bytes:
         return with_sum(CONFIGURE + bytes([speed, FILTERS[self.filter_hz], zero]))
 
     def device(self) -> Device:
-        """Return a DAQ that waits to be configured."""
+        """Return an emulated DAQ that waits for its configuration."""
         return _Daq(streaming=False)
 
 
 class _Daq(Device):
-    """The DAQ's side: streams at the rate that it was last stated, not at all after a stop."""
+    """An emulated DAQ: it streams at the rate that was set last, and not after a stop."""
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
@@ -127,7 +127,7 @@ class _Daq(Device):
 
 
 def with_sum(body: bytes) -> bytes:
-    """Return a message to the DAQ with its sum behind it.
+    """Return a message to the DAQ with its sum appended.
 
     >>> with_sum(bytes.fromhex("AA 00 32 03 01 04 00")).hex(" ")
     'aa 00 32 03 01 04 00 00 e4'
@@ -136,5 +136,5 @@ def with_sum(body: bytes) -> bytes:
 
 
 def _sum_is_right(frames: Bytes) -> Bools:
-    right: Bools = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view(">u2")[:, 0]
-    return right
+    is_right: Bools = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view(">u2")[:, 0]
+    return is_right

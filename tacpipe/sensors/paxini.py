@@ -1,11 +1,10 @@
-"""Paxini PX-6AX GEN3 tactile modules behind the high-speed board of a robot hand, which pushes their forces.
+"""Paxini PX-6AX GEN3 tactile modules behind the high-speed board of a robot hand, which sends their forces by itself.
 
-A message is ``55 AA 00``, a function, a register and a length, little-endian, data, and a sum (LRC) with which all bytes
-add up to 0. Replies begin with ``AA 55 00``. What the board pushes by itself begins with ``AA 56 00``, the length of what
-follows but for the sum, and an error code; then for each module that is plugged in, in order, its whole force, six bytes
-of which every other one counts, and three bytes a point: x and y int8, z uint8, in tenths of a newton; then the sum. It
-neither counts its frames nor states the time.
-Source: the package paxini-sdk 0.1.0 (MIT), which cites the vendor's manual and its programs.
+A message is ``55 AA 00``, a function, a register and a length, little-endian, data, and a sum (LRC) with which all bytes add
+up to 0. Replies start with ``AA 55 00``. Frames start with ``AA 56 00``, the length of the remaining frame without the sum,
+and an error code. For each connected module, in order, follow its total force (six bytes, every second of which is used),
+and three bytes per point: x and y as int8, z as uint8, in 0.1 N. The sum is last. There is no counter and no time.
+Source: the package paxini-sdk 0.1.0 (MIT), which cites the vendor's manual and programs.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ REPLY_HEADER, PUSH_HEADER = 8, 6
 
 
 def with_sum(body: bytes) -> bytes:
-    """Return a message with its sum behind it, with which all bytes add up to 0.
+    """Return a message with its sum appended, so that all bytes add up to 0.
 
     >>> with_sum(bytes.fromhex("55 AA 00 17 02 00 01 00 01")).hex(" ")
     '55 aa 00 17 02 00 01 00 01 e6'
@@ -46,8 +45,8 @@ def with_sum(body: bytes) -> bytes:
 
 
 def message(function: int, register: int, data: bytes, head: bytes = REQUEST) -> bytes:
-    """Return a message with data: a write to the board, or a reply of it."""
-    return with_sum(head + bytes([function]) + two(register) + two(len(data)) + data)
+    """Return a message with data: a write to the board, or its reply."""
+    return with_sum(head + bytes([function]) + pack_uint16(register) + pack_uint16(len(data)) + data)
 
 
 def write(register: int, data: bytes) -> bytes:
@@ -56,47 +55,47 @@ def write(register: int, data: bytes) -> bytes:
 
 
 def read(register: int, length: int) -> bytes:
-    """Return the message that reads ``length`` bytes from a register on.
+    """Return the message that reads ``length`` bytes, starting at a register.
 
     >>> read(0x0010, 4).hex(" ")
     '55 aa 00 03 10 00 04 00 ea'
     """
-    return with_sum(REQUEST + bytes([READ_FUNCTION]) + two(register) + two(length))
+    return with_sum(REQUEST + bytes([READ_FUNCTION]) + pack_uint16(register) + pack_uint16(length))
 
 
-def two(value: int) -> bytes:
-    """Return a number as the two bytes of a message."""
+def pack_uint16(value: int) -> bytes:
+    """Encode a number as two bytes."""
     return value.to_bytes(2, "little")
 
 
-def number(data: bytes | bytearray) -> int:
-    """Return the number that bytes of a message are."""
+def unpack_uint(data: bytes | bytearray) -> int:
+    """Decode an unsigned number of any size."""
     return int.from_bytes(data, "little")
 
 
-def sums(frame: bytes) -> bool:
-    """Return whether a message with its sum adds up."""
+def has_valid_sum(frame: bytes) -> bool:
+    """Return whether all bytes of a message add up to 0."""
     return sum(frame) & 0xFF == 0
 
 
 @dataclass
 class RegisterBoard(Device):
-    """The board's side: registers that can be read and written, and the stream that one of them switches."""
+    """An emulated board with registers. One of them starts and stops the stream."""
 
     memory: dict[int, bytes] = field(default_factory=dict)
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to what was written; what is not a message is passed over."""
+        """Return the replies to messages. Invalid bytes are skipped."""
         self.heard += data
         replies = []
         while (start := self.heard.find(REQUEST)) >= 0 and len(self.heard) >= start + REPLY_HEADER:
-            function, register = self.heard[start + 3], number(self.heard[start + 4 : start + 6])
-            length = number(self.heard[start + 6 : start + 8])
+            function, register = self.heard[start + 3], unpack_uint(self.heard[start + 4 : start + 6])
+            length = unpack_uint(self.heard[start + 6 : start + 8])
             size = REPLY_HEADER + 1 + (0 if function == READ_FUNCTION else length)
             if len(self.heard) < start + size:
                 break
             request = bytes(self.heard[start : start + size])
-            if not sums(request):
+            if not has_valid_sum(request):
                 del self.heard[: start + 1]
                 continue
             del self.heard[: start + size]
@@ -117,7 +116,9 @@ class RegisterBoard(Device):
         if (function, register) == (WRITE_FUNCTION, PUSHING):
             self.streaming = data == b"\x01"
             return (
-                [with_sum(PUSH + two(1) + b"\x00")] if self.streaming else [message(function, register, b"\x00", REPLY)]
+                [with_sum(PUSH + pack_uint16(1) + b"\x00")]
+                if self.streaming
+                else [message(function, register, b"\x00", REPLY)]
             )
         if (function, register) == (WRITE_FUNCTION, RESET):
             self.streaming = False
@@ -129,7 +130,7 @@ class RegisterBoard(Device):
 
 FINGERS, PHALANGES = ("thumb", "index", "middle", "ring", "little"), ("proximal", "middle", "tip", "nail")
 SLOTS = tuple(f"{finger}_{part}" for finger in FINGERS for part in PHALANGES) + tuple(f"palm{n}" for n in range(1, 9))
-VARIANTS = {  # product to its points, no two alike, which is how the board's count distinguishes them
+VARIANTS = {  # number of points by product; all differ, so that the board's count identifies the product
     "MC-M2020-Elite": 9,
     "IP-S1610-Elite": 25,
     "DP-S1813-Elite": 31,
@@ -144,50 +145,54 @@ VARIANTS = {  # product to its points, no two alike, which is how the board's co
     "CP-L5325-Omega": 239,
 }
 DATA_TYPES = {"both": 3, "resultant": 1, "distributed": 2}
-UNIT = "dN"  # a count is a tenth of a newton
-STALE_S = 0.15  # time in which the stream of an earlier session ends
+UNIT = "dN"  # a count is 0.1 N
+STALE_S = 0.15  # time after which the stream of an earlier session has ended
 
 
 @dataclass(frozen=True)
 class Paxini(Sensor):
     """PX-6AX GEN3 modules behind a high-speed board."""
 
-    summary: ClassVar[str] = "Paxini PX-6AX GEN3 tactile modules of a hand, behind their high-speed board."
+    summary: ClassVar[str] = "Paxini PX-6AX GEN3 tactile modules of a hand behind their high-speed board."
 
-    modules: tuple[str, ...] = ("thumb_tip",)  # slots with a module: thumb_proximal … little_nail, palm1 … palm8
-    variants: tuple[str, ...] = ("DP-S2015-Elite",)  # the product in each of these slots, or the one in all of them
-    data: Literal["both", "resultant", "distributed"] = "both"  # a module's whole force, that of its points, or both
-    rate_hz: float = 91.0  # frames a second, as the board pushes them
+    modules: tuple[str, ...] = (
+        "thumb_tip",
+    )  # slots with a module, from thumb_proximal to little_nail and palm1 to palm8
+    variants: tuple[str, ...] = ("DP-S2015-Elite",)  # the product in each of these slots, or one product for all
+    data: Literal["both", "resultant", "distributed"] = (
+        "both"  # resultant: each module's total force; distributed: the forces of its points; or both
+    )
+    rate_hz: float = 91.0  # frames per second, fixed by the board
     baud: int = 921_600  # baud rate of the board
 
     def __post_init__(self) -> None:
         for module in self.modules:
-            sensor.known("paxini", "modules", module, SLOTS)
+            sensor.check_choice("paxini", "modules", module, SLOTS)
         for variant in self.variants:
-            sensor.known("paxini", "variants", variant, VARIANTS)
-        sensor.known("paxini", "data", self.data, DATA_TYPES)
-        sensor.positive("paxini", rate_hz=self.rate_hz, baud=self.baud)
+            sensor.check_choice("paxini", "variants", variant, VARIANTS)
+        sensor.check_choice("paxini", "data", self.data, DATA_TYPES)
+        sensor.check_positive("paxini", rate_hz=self.rate_hz, baud=self.baud)
         if not self.modules or list(self.modules) != [slot for slot in SLOTS if slot in self.modules]:
             raise UsageError(
-                f"paxini: modules are {', '.join(self.modules) or 'none'}; name each once, in this order: "
+                f"paxini: modules are {', '.join(self.modules) or 'none'}; list each once, in this order: "
                 f"{', '.join(SLOTS)}."
             )
         if len(self.variants) not in (1, len(self.modules)):
             raise UsageError(
                 f"paxini: there are {len(self.variants)} variants for {len(self.modules)} modules; "
-                "give one each, or one for all."
+                "give one per module, or one for all."
             )
 
     @functools.cached_property
     def points(self) -> dict[str, int]:
-        """How many points each module has."""
+        """The number of points of each module."""
         variants = self.variants * (len(self.modules) if len(self.variants) == 1 else 1)
         return {module: VARIANTS[variant] for module, variant in zip(self.modules, variants, strict=True)}
 
     def fields(self) -> list[pa.Field]:
-        """Return ``status``, the board's error code, then all that is signed, and then all along z, module by module.
+        """Return ``status``, the board's error code, then all x and y channels, then all z channels, by module.
 
-        ``thumb_tip_force_x``, … and ``thumb_tip_taxel01_x``, … are int8, ``thumb_tip_force_z``, … uint8: tenths of a newton.
+        ``thumb_tip_force_x``, … and ``thumb_tip_taxel01_x``, … are int8, ``thumb_tip_force_z``, … uint8, in 0.1 N.
         """
         import pyarrow as pa
 
@@ -199,121 +204,125 @@ class Paxini(Sensor):
                         metadata = {"unit": UNIT, "quantity": "force", "module": module, "component": axis}
                         fields.append(pa.field(f"{module}_force_{axis}", kind, metadata=metadata))
                 if self.data != "resultant":
-                    fields += sensor.fields(count, kind, UNIT, axes=axes, prefix=f"{module}_", module=module)
+                    fields += sensor.taxel_fields(count, kind, UNIT, axes=axes, prefix=f"{module}_", module=module)
         return fields
 
     def framer(self) -> Framer:
-        """Return a framer of what is pushed for these modules; its sum is of 8 bits."""
+        """Return a framer for frames of these modules, each confirmed by the next, because the sum has 8 bits."""
         size = PUSH_HEADER + self._payload + 1
         return ByteFramer(
-            Framing(marker=PUSH + two(self._payload + 1), size=size, check=_sum_is_right, confirm=1, most=8192)
+            Framing(
+                marker=PUSH + pack_uint16(self._payload + 1), size=size, check=_sum_is_right, confirm=1, max_size=8192
+            )
         )
 
     def decode(self, frames: Bytes) -> Samples:
         """Return error code and forces (frame, channel)."""
-        signed, unsigned = self._places
+        signed, unsigned = self._offsets
         return Samples((frames[:, 5:6], frames.take(signed, axis=1).view(np.int8), frames.take(unsigned, axis=1)))
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the frames of these samples, 0 in the bytes that do not count."""
+        """Return the frames of these samples, with 0 in unused bytes."""
         status, signed, unsigned = samples.values
         frames = np.zeros((len(samples), PUSH_HEADER + self._payload + 1), dtype=np.uint8)
-        frames[:, :5] = np.frombuffer(PUSH + two(self._payload + 1), np.uint8)
+        frames[:, :5] = np.frombuffer(PUSH + pack_uint16(self._payload + 1), np.uint8)
         frames[:, 5:6] = status
-        frames[:, self._places[0]] = signed.view(np.uint8)
-        frames[:, self._places[1]] = unsigned
+        frames[:, self._offsets[0]] = signed.view(np.uint8)
+        frames[:, self._offsets[1]] = unsigned
         frames[:, -1] = lrc(frames[:, :-1])
         return frames
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Stop what an earlier session left, see that the modules are those of the rig file, and have the board push.
+        """Stop the stream of an earlier session, check the modules, and start the stream.
 
-        Raises `DeviceError` if others are plugged in.
+        Raises `DeviceError` if the connected modules differ from the rig file.
         """
         yield Ask(write(PUSHING, b"\x00"), pause_s=STALE_S)
-        version = yield _reading(VERSION, 15, "its version")
-        active = yield _reading(ACTIVE, 4, "its active modules")
-        counts = yield _reading(POINTS, 2 * len(SLOTS), "its point counts")
+        version = yield _read_request(VERSION, 15, "its version")
+        active = yield _read_request(ACTIVE, 4, "its active modules")
+        counts = yield _read_request(POINTS, 2 * len(SLOTS), "its point counts")
         connected = _modules(_data(active), _data(counts))
         if connected != self.points:
             raise DeviceError(
-                f"The board ({_text(_data(version))}) has {_module_list(connected)}; the rig file states "
-                f"{_module_list(self.points)}. Correct modules and variants there: {_suggestion(connected)}."
+                f"The board ({_text(_data(version))}) has {_module_list(connected)}; the rig file declares "
+                f"{_module_list(self.points)}. Correct the rig file: {_suggestion(connected)}."
             )
-        reply = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
+        reply = yield _write_request(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "the reply to setting the data type")
         if _data(reply)[:1] not in (b"", b"\x00"):
-            raise DeviceError(f'The board cannot push data = "{self.data}": error {_data(reply)[0]}. Choose another.')
-        yield Ask(write(PUSHING, b"\x01"), until=pushed, what="the first frame")
+            raise DeviceError(
+                f'The board does not support data = "{self.data}": error {_data(reply)[0]}. Choose another value.'
+            )
+        yield Ask(write(PUSHING, b"\x01"), until=find_push_reply, what="the first frame")
 
     def closing(self) -> bytes:
         """Stop the stream."""
         return write(PUSHING, b"\x00")
 
     def taring(self) -> Dialogue:
-        """Take the present load for zero. Raises `DeviceError` if the board refuses."""
+        """Zero the load. Raises `DeviceError` if the board refuses."""
         reply = yield Ask(
             message(CALIBRATE_FUNCTION, CALIBRATION, b"\x01"),
-            until=_reply(CALIBRATE_FUNCTION, CALIBRATION),
-            what="that it is calibrated",
+            until=_reply_finder(CALIBRATE_FUNCTION, CALIBRATION),
+            what="the reply to zeroing",
         )
         if _data(reply)[:1] not in (b"", b"\x00"):
             raise DeviceError(
-                f"The board did not calibrate: error {_data(reply)[0]}. Take off what presses, and try again."
+                f"The board could not be zeroed: error {_data(reply)[0]}. Remove all load, and try again."
             )
 
     def device(self) -> Device:
-        """Return a board with these modules that waits to be asked to push."""
-        counts = b"".join(two(self.points.get(slot, 0)) for slot in SLOTS)
+        """Return an emulated board with these modules that waits for the start command."""
+        counts = b"".join(pack_uint16(self.points.get(slot, 0)) for slot in SLOTS)
         bits = sum(1 << SLOTS.index(module) for module in self.modules)
         memory = {VERSION: b"PX-HS V1.0.0".ljust(15, b"\x00"), ACTIVE: bits.to_bytes(4, "little"), POINTS: counts}
         return RegisterBoard(streaming=False, memory={**memory, DATA_TYPE: b"\x03"})
 
     @functools.cached_property
     def _payload(self) -> int:
-        """How many bytes a frame holds for its modules."""
+        """Bytes of a frame with forces."""
         resultant, distributed = self.data != "distributed", self.data != "resultant"
         return sum(6 * resultant + 3 * count * distributed for count in self.points.values())
 
     @functools.cached_property
-    def _places(self) -> tuple[Indices, Indices]:
-        """Return the places of the numbers along x and y and of those along z, in the order of the fields."""
-        signed, unsigned, place = [], [], PUSH_HEADER
+    def _offsets(self) -> tuple[Indices, Indices]:
+        """The offsets in a frame of the x and y values, and of the z values, in the order of the fields."""
+        signed, unsigned, offset = [], [], PUSH_HEADER
         for count in self.points.values():
             if self.data != "distributed":
-                signed += [place, place + 2]
-                unsigned.append(place + 4)
-                place += 6
+                signed += [offset, offset + 2]
+                unsigned.append(offset + 4)
+                offset += 6
             if self.data != "resultant":
-                for point in range(place, place + 3 * count, 3):
+                for point in range(offset, offset + 3 * count, 3):
                     signed += [point, point + 1]
                     unsigned.append(point + 2)
-                place += 3 * count
+                offset += 3 * count
         return np.array(signed), np.array(unsigned)
 
 
-def _reading(register: int, length: int, description: str) -> Ask:
-    return Ask(read(register, length), until=_reply(READ_FUNCTION, register), what=description)
+def _read_request(register: int, length: int, description: str) -> Ask:
+    return Ask(read(register, length), until=_reply_finder(READ_FUNCTION, register), what=description)
 
 
-def _writing(register: int, data: bytes, description: str) -> Ask:
-    return Ask(write(register, data), until=_reply(WRITE_FUNCTION, register), what=f"that it took {description}")
+def _write_request(register: int, data: bytes, description: str) -> Ask:
+    return Ask(write(register, data), until=_reply_finder(WRITE_FUNCTION, register), what=description)
 
 
-def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return what finds a reply among what came: an earlier stream may still run, and hold its first bytes by chance.
+def _reply_finder(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return a function that finds a reply among received bytes, which may contain frames of an earlier stream.
 
-    The reply to a write may lack the data of which it states the length.
+    The reply to a write may lack the data whose length it declares.
     """
 
-    def until(received: bytes) -> int | tuple[int, int]:
+    def find(received: bytes) -> int | tuple[int, int]:
         for code in (function, function | 0x80):
-            head = REPLY + bytes([code]) + two(register)
+            head = REPLY + bytes([code]) + pack_uint16(register)
             start = received.find(head)
             while start >= 0:
-                declared = number(received[start + 6 : start + 8]) if len(received) >= start + REPLY_HEADER else 0
+                declared = unpack_uint(received[start + 6 : start + 8]) if len(received) >= start + REPLY_HEADER else 0
                 for length in (declared, 0) if function != READ_FUNCTION else (declared,):
                     stop = start + REPLY_HEADER + length + 1
-                    if stop <= len(received) and sums(received[start:stop]):
+                    if stop <= len(received) and has_valid_sum(received[start:stop]):
                         if code != function:
                             raise DeviceError(
                                 f"The board refused function {function:#04x} of register {register:#06x}."
@@ -322,24 +331,22 @@ def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, i
                 start = received.find(head, start + 1)
         return 0
 
-    return until
+    return find
 
 
-def pushed(received: bytes) -> int | tuple[int, int]:
-    """Find the reply to the order to push, which is a frame without forces, or else forces, which are not taken.
+def find_push_reply(received: bytes) -> int | tuple[int, int]:
+    """Find the reply to the start command: a frame without forces, or a frame with forces, which is not consumed.
 
-    Raises `DeviceError` if the reply reports on an error.
+    Raises `DeviceError` if the reply reports an error.
     """
     reply: int | tuple[int, int] = 0
     start = received.find(PUSH)
     while start >= 0:
-        length = number(received[start + 3 : start + 5])
+        length = unpack_uint(received[start + 3 : start + 5])
         stop = start + PUSH_HEADER + length
-        if length and stop <= len(received) and sums(received[start:stop]):
+        if length and stop <= len(received) and has_valid_sum(received[start:stop]):
             if length == 1 and received[start + 5]:
-                raise DeviceError(
-                    f"The board does not push its forces: error {received[start + 5]}. Switch it off and on."
-                )
+                raise DeviceError(f"The board does not send its forces: error {received[start + 5]}. Power-cycle it.")
             if length == 1:
                 return start, stop
             reply = (0, 0)
@@ -348,14 +355,14 @@ def pushed(received: bytes) -> int | tuple[int, int]:
 
 
 def _data(reply: bytes) -> bytes:
-    """Return the data of a reply that `_reply` found."""
+    """Return the data of a reply."""
     return reply[REPLY_HEADER:-1]
 
 
 def _modules(active: bytes, counts: bytes) -> dict[str, int]:
-    """Return the points of each module that is plugged in."""
-    bits = number(active)
-    return {slot: number(counts[2 * n : 2 * n + 2]) for n, slot in enumerate(SLOTS) if bits >> n & 1}
+    """Return the number of points of each connected module."""
+    bits = unpack_uint(active)
+    return {slot: unpack_uint(counts[2 * n : 2 * n + 2]) for n, slot in enumerate(SLOTS) if bits >> n & 1}
 
 
 def _module_list(modules: Mapping[str, int]) -> str:
@@ -373,5 +380,5 @@ def _text(data: bytes) -> str:
 
 
 def _sum_is_right(frames: Bytes) -> Bools:
-    right: Bools = frames.sum(axis=1, dtype=np.uint8) == 0
-    return right
+    is_right: Bools = frames.sum(axis=1, dtype=np.uint8) == 0
+    return is_right

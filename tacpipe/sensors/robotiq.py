@@ -1,8 +1,8 @@
-"""Robotiq TSF-85: tactile fingertips of the grippers 2F-85 and 2F-140, with a motion sensor in each.
+"""Robotiq TSF-85: tactile fingertips with motion sensors for the grippers 2F-85 and 2F-140.
 
-A packet, either way, is ``9A``, a byte that nobody sums, a command, a length and so many bytes. A packet of data holds a
-field after the other: a byte with its kind in the upper half and the finger in bits 3 and 2, then big-endian numbers.
-Nothing but this structure states a packet, so all of it is looked at: it must be made of known fields, to the last byte.
+A packet, in both directions, is ``9A``, an unused byte, a command, a length and that number of bytes. A data packet consists
+of fields: a byte with the kind in the upper half and the finger in bits 3 and 2, then big-endian numbers. There is no
+checksum, so a packet is valid only if it consists entirely of known fields.
 Source: the package pyrobotiqtactile 0.1.2 (BSD-3-Clause).
 """
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 START, HEADER = 0x9A, 4
 READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
-DATA = (READ, SYNCHRONOUS, ASYNCHRONOUS)  # commands of packets that hold data
+DATA = (READ, SYNCHRONOUS, ASYNCHRONOUS)  # commands of packets with data
 ROWS, COLUMNS = 7, 4  # taxels of a fingertip
-KINDS = {  # fields: the upper half of the byte, and the numbers after it
+KINDS = {  # fields: the upper half of the first byte, type and number of the values
     "static": (0x10, ">u2", ROWS * COLUMNS),
     "dynamic": (0x20, ">i2", 1),
     "acceleration": (0x30, ">i2", 3),
@@ -38,27 +38,25 @@ KINDS = {  # fields: the upper half of the byte, and the numbers after it
     "temperature": (0x60, ">i2", 1),
     "timestamp": (0x70, ">u8", 1),
 }
-SIZES = {
-    code: np.dtype(kind).itemsize * count for code, kind, count in KINDS.values()
-}  # sizes in bytes, after the kind
+SIZES = {code: np.dtype(kind).itemsize * count for code, kind, count in KINDS.values()}  # bytes of the values, by kind
 PARTS = {code: part for part, (code, _, _) in KINDS.items()}
 TYPES = (np.dtype(">u2"), np.dtype(">i2"), np.dtype(">u8"))  # types of the blocks of a sample
 SIGNED = ("dynamic", "acceleration", "angular_velocity", "magnetic_field", "temperature")
-KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # commands that a packet from the device may have
+IS_COMMAND = np.isin(np.arange(256), (*DATA, VERSION))  # mask (command,) of the commands that the device sends
 Key = tuple[int, int]  # kind and finger of a field
-Layout = tuple[tuple[Key, int], ...]  # the fields of a frame, with the place of the first number of each
-Columns = tuple[Indices, ...]  # the bytes of a frame that are the numbers of each block
+Layout = tuple[tuple[Key, int], ...]  # the fields of a frame, with the offset of the values of each
+Columns = tuple[Indices, ...]  # the byte offsets of the values of each block
 
 
 class Structure(NamedTuple):
-    """The bytes that frames of one size must share to have the same fields."""
+    """The bytes that frames of one size share if they have the same fields."""
 
-    places: Indices  # places of the command and of the kinds
-    values: Bytes  # values at these places
-    layout: Layout | None  # None: such frames are not made of known fields
+    offsets: Indices  # offsets of the command and of the field codes
+    values: Bytes  # values at these offsets
+    layout: Layout | None  # None if the packet does not consist of known fields
 
 
-_latest: dict[int, Structure] = {}  # last structure of each size, which is usually that of the next frame
+_latest: dict[int, Structure] = {}  # last structure by size; the next frame usually has the same
 
 
 @dataclass(frozen=True)
@@ -66,38 +64,39 @@ class Robotiq(Sensor):
     """A pair of TSF-85 fingertips."""
 
     summary: ClassVar[str] = "Robotiq TSF-85 tactile fingertips, with their motion sensors and clocks."
-    usb_ids: ClassVar[tuple[str, ...]] = ("16d0:14cc", "04b4:f232")  # the hub, and the bridge of older units
+    usb_ids: ClassVar[tuple[str, ...]] = ("16d0:14cc", "04b4:f232")  # the hub, and the bridge of older devices
 
     fingers: int = 2  # number of connected fingers
-    parts: tuple[str, ...] = tuple(KINDS)  # parts of each finger in a sample; a packet that lacks one has no sample
-    tick_us: float = 0.0  # tick of the fingertips' clock in microseconds; 0: unknown, so the clock is a channel
-    rate_hz: float = 100.0  # packets a second; the period is a whole number of milliseconds up to 255
+    parts: tuple[str, ...] = tuple(KINDS)  # parts of each finger to record; packets without one of them are skipped
+    tick_us: float = 0.0  # tick of the fingertips' clock in microseconds; 0: unknown, and the clock is only a channel
+    rate_hz: float = 100.0  # packets per second; the period must be a whole number of milliseconds up to 255
     baud: int = 115_200  # baud rate of the port
 
     def __post_init__(self) -> None:
-        sensor.within("robotiq", "fingers", self.fingers, 1, 2)
+        sensor.check_range("robotiq", "fingers", self.fingers, 1, 2)
         for part in self.parts:
-            sensor.known("robotiq", "parts", part, KINDS)
+            sensor.check_choice("robotiq", "parts", part, KINDS)
         if not self.parts or len(set(self.parts)) < len(self.parts):
-            raise UsageError(f"robotiq: parts are {self.parts}; name one or more of {', '.join(KINDS)}, each once.")
-        sensor.within("robotiq", "rate_hz", self.rate_hz, 1000 / 255, 1000)
-        sensor.within("robotiq", "tick_us", self.tick_us, 0, 1e6)
+            raise UsageError(f"robotiq: parts are {self.parts}; list one or more of {', '.join(KINDS)}, each once.")
+        sensor.check_range("robotiq", "rate_hz", self.rate_hz, 1000 / 255, 1000)
+        sensor.check_range("robotiq", "tick_us", self.tick_us, 0, 1e6)
         if abs(self.period_ms - 1000 / self.rate_hz) > 1e-6:
             raise UsageError(
-                f"robotiq: rate_hz is {self.rate_hz:g}, a period of {1000 / self.rate_hz:g} ms; it must be one of whole "
-                f"milliseconds, such as {1000 / self.period_ms:g} Hz."
+                f"robotiq: rate_hz is {self.rate_hz:g}, a period of {1000 / self.rate_hz:g} ms; the period must be a whole "
+                f"number of milliseconds, as for {1000 / self.period_ms:g} Hz."
             )
-        sensor.positive("robotiq", baud=self.baud)
+        sensor.check_positive("robotiq", baud=self.baud)
 
     @property
     def period_ms(self) -> int:
-        """The time from a packet to the next, as the device is given it."""
+        """The period of packets in ms."""
         return round(1000 / self.rate_hz)
 
     def fields(self) -> list[pa.Field]:
-        """Return ``finger1_taxel01``, …, the motion sensors' axes and ``finger1_timestamp``: integers in counts.
+        """Return ``finger1_taxel01``, …, the axes of the motion sensors and ``finger1_timestamp``, in counts.
 
-        Side by side by their type: first the taxels of both fingers, uint16, then what is int16, then the clocks, uint64.
+        They are grouped by type: first the taxels of both fingers (uint16), then the int16 channels, then the clocks
+        (uint64).
         """
         return [
             channel
@@ -109,25 +108,31 @@ class Robotiq(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer of packets that are made of known fields, or are a reply."""
+        """Return a framer for packets that consist of known fields, or are a reply."""
         largest = HEADER + 255
         return ByteFramer(
             Framing(
-                marker=bytes([START]), header=HEADER, sizes=_sizes, most=largest, check=_is_packet, lock=3, confirm=1
+                marker=bytes([START]),
+                header=HEADER,
+                sizes=_sizes,
+                max_size=largest,
+                check=_is_packet,
+                lock=3,
+                confirm=1,
             )
         )
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the numbers of those frames that hold all ``parts`` of all ``fingers``."""
+        """Return the values of the frames with all ``parts`` of all ``fingers``."""
         rows, blocks = [], []
-        for at, layout in _alike(frames, np.arange(len(frames))):
+        for same_rows, layout in _group_by_layout(frames, np.arange(len(frames))):
             columns = layout and _columns(tuple(self._groups.values()), layout)
             if not columns:
                 continue
-            rows.append(at)
-            blocks.append(self._blocks(frames if len(at) == len(frames) else frames[at], columns))
+            rows.append(same_rows)
+            blocks.append(self._blocks(frames if len(same_rows) == len(frames) else frames[same_rows], columns))
         if not blocks:
-            blocks, rows = [self._empty()], [np.zeros(0, dtype=np.int64)]
+            blocks, rows = [self._empty_blocks()], [np.zeros(0, dtype=np.int64)]
         order, values = rows[0], tuple(blocks[0])
         if len(blocks) > 1:
             order = np.concatenate(rows)
@@ -138,7 +143,7 @@ class Robotiq(Sensor):
         return Samples(values, t_device_ns=self._device_ns(values), rows=None if is_complete else order)
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return packets of these samples, with the fields of ``parts`` in the order of the protocol, finger by finger."""
+        """Return the packets of these samples, with the fields in the order of the protocol for each finger."""
         blocks = {key: block for keys, block in zip(self._groups.values(), samples.values, strict=True) for key in keys}
         used = dict.fromkeys(self._groups, 0)
         pieces: list[Bytes] = []
@@ -154,11 +159,11 @@ class Robotiq(Sensor):
         return np.hstack([np.broadcast_to(head, (len(body), HEADER)), body])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Have both fingers send all they have at once, at ``rate_hz``."""
+        """Start packets with all fields of both fingers at ``rate_hz``."""
         yield Ask(command(SYNCHRONOUS, bytes([self.period_ms])))
 
     def device(self) -> Device:
-        """Return a pair of fingertips that wait to be given their period, or to be asked."""
+        """Return an emulated pair of fingertips that wait for their period or for requests."""
         return _Fingertips(streaming=False)
 
     @functools.cached_property
@@ -177,14 +182,14 @@ class Robotiq(Sensor):
         return groups
 
     def _blocks(self, frames: Bytes, columns: Columns) -> list[AnyArray]:
-        """Return the blocks (frame, channel) of frames whose numbers stand in these columns, one a type."""
+        """Return the blocks (frame, channel) of frames with values in these columns, one block per type."""
         return [
-            frames.take(places, axis=1).view(kind).astype(kind.newbyteorder("="))
-            for kind, places in zip(self._groups, columns, strict=True)
+            frames.take(offsets, axis=1).view(kind).astype(kind.newbyteorder("="))
+            for kind, offsets in zip(self._groups, columns, strict=True)
         ]
 
-    def _empty(self) -> list[AnyArray]:
-        """Return blocks of no sample."""
+    def _empty_blocks(self) -> list[AnyArray]:
+        """Return blocks without samples."""
         widths = [sum(KINDS[PARTS[code]][2] for code, _ in keys) for keys in self._groups.values()]
         kinds = [kind.newbyteorder("=") for kind in self._groups]
         return [np.zeros((0, width), dtype=kind) for width, kind in zip(widths, kinds, strict=True)]
@@ -197,7 +202,7 @@ class Robotiq(Sensor):
 
 @dataclass
 class _Fingertips(Device):
-    """The fingertips' side: they state their version, send a packet when asked, or stream with a period."""
+    """Emulated fingertips: they report their version, send a packet on request, or stream with a period."""
 
     requests: int = 0
     version: bytes = field(default=b"\x01\x00\x00")
@@ -226,7 +231,7 @@ class _Fingertips(Device):
 
 
 def command(code: int, data: bytes = b"") -> bytes:
-    """Return a packet to the device, or a reply of it.
+    """Return a packet to the device, or its reply.
 
     >>> command(SYNCHRONOUS, bytes([10])).hex(" ")
     '9a 00 58 01 0a'
@@ -236,20 +241,20 @@ def command(code: int, data: bytes = b"") -> bytes:
 
 @functools.lru_cache(maxsize=64)
 def _columns(groups: tuple[tuple[Key, ...], ...], layout: Layout) -> Columns | None:
-    """Return the columns of frames that each group of fields is in; None where a field is not there."""
-    places = dict(layout)
-    if any(key not in places for keys in groups for key in keys):
+    """Return the byte columns of each group of fields, or None if a field is missing."""
+    offsets = dict(layout)
+    if any(key not in offsets for keys in groups for key in keys):
         return None
-    return tuple(np.concatenate([places[key] + np.arange(SIZES[key[0]]) for key in keys]) for keys in groups)
+    return tuple(np.concatenate([offsets[key] + np.arange(SIZES[key[0]]) for key in keys]) for keys in groups)
 
 
 def _fields(part: str, finger: int) -> list[pa.Field]:
-    """Return the fields of a part of a finger, counted from 1."""
+    """Return the fields of a part of a finger. Fingers are counted from 1."""
     import pyarrow as pa
 
     prefix, number = f"finger{finger}_", str(finger)
     if part == "static":
-        return sensor.grid(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)
+        return sensor.grid_fields(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)
     if part == "timestamp":
         metadata = {"unit": "1", "quantity": "time", "finger": number}
         return [pa.field(f"{prefix}timestamp", pa.uint64(), metadata=metadata)]
@@ -260,46 +265,46 @@ def _fields(part: str, finger: int) -> list[pa.Field]:
 
 
 def _sizes(heads: Bytes) -> Int64s:
-    """Return the whole size of frames from their headers (frame, 4); 0 for a command that no packet has."""
-    sizes: Int64s = KNOWN.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
+    """Return the sizes of frames (frame,) from their headers (frame, 4); 0 for an unknown command."""
+    sizes: Int64s = IS_COMMAND.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
     return sizes
 
 
 def _structure(frame: bytes) -> Structure:
-    """Return what a packet of data or of something else is made of, as far as its fields are known."""
+    """Return the offsets and values of the command and the field codes of a packet, and its fields if all are known."""
     fields: dict[Key, int] = {}
-    place, places, is_known_command = HEADER, [2], frame[2] in DATA
-    while is_known_command and place < len(frame):
-        places.append(place)
-        code, finger = frame[place] & 0xF0, frame[place] >> 2 & 3
-        is_known_command = code in SIZES and finger <= 1 and (code, finger) not in fields
-        fields[code, finger] = place + 1
-        place += 1 + SIZES.get(code, 0)
-    is_valid = is_known_command and place == len(frame) and bool(fields)
-    values = np.frombuffer(frame, np.uint8)[places]
-    return Structure(np.array(places), values, tuple(fields.items()) if is_valid else None)
+    offset, offsets, is_known = HEADER, [2], frame[2] in DATA
+    while is_known and offset < len(frame):
+        offsets.append(offset)
+        code, finger = frame[offset] & 0xF0, frame[offset] >> 2 & 3
+        is_known = code in SIZES and finger <= 1 and (code, finger) not in fields
+        fields[code, finger] = offset + 1
+        offset += 1 + SIZES.get(code, 0)
+    is_valid = is_known and offset == len(frame) and bool(fields)
+    values = np.frombuffer(frame, np.uint8)[offsets]
+    return Structure(np.array(offsets), values, tuple(fields.items()) if is_valid else None)
 
 
-def _alike(frames: Bytes, rows: Indices) -> Iterator[tuple[Indices, Layout | None]]:
-    """Yield those ``rows`` of frames of one size that have the same fields, and their layout."""
+def _group_by_layout(frames: Bytes, rows: Indices) -> Iterator[tuple[Indices, Layout | None]]:
+    """Yield (rows, layout) for each group of ``rows`` of frames of one size with the same fields."""
     size = frames.shape[1]
     while len(rows):
         selected = frames if len(rows) == len(frames) else frames[rows]
         structure = _latest.get(size)
-        if structure is None or (selected[0, structure.places] != structure.values).any():
+        if structure is None or (selected[0, structure.offsets] != structure.values).any():
             structure = _latest[size] = _structure(selected[0].tobytes())
-        same = selected.take(structure.places, axis=1) == structure.values
+        same = selected.take(structure.offsets, axis=1) == structure.values
         if same.all():
             yield rows, structure.layout
             return
-        like = same.all(axis=1)
-        yield rows[like], structure.layout
-        rows = rows[~like]
+        matches = same.all(axis=1)
+        yield rows[matches], structure.layout
+        rows = rows[~matches]
 
 
 def _is_packet(frames: Bytes) -> Bools:
-    """Return which frames (frame, byte) of one size, which their headers state, are made of known fields, or a version."""
+    """Return a mask (frame,) of the frames (frame, byte) of one size that have known fields or are a version."""
     good = frames[:, 2] == VERSION
-    for rows, layout in _alike(frames, np.flatnonzero(~good)):
+    for rows, layout in _group_by_layout(frames, np.flatnonzero(~good)):
         good[rows] = layout is not None
     return np.asarray(good)

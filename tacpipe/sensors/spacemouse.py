@@ -1,12 +1,12 @@
-"""3Dconnexion SpaceMouse on HID: what its cap is pushed and turned by, and its buttons, a row an event.
+"""3Dconnexion SpaceMouse on HID: deflection of its cap, and its buttons, one row per event.
 
-A report states a part of the state: number 1 translation and rotation, six little-endian int16, or, of older devices,
-translation alone and number 2 rotation; number 3 the buttons, a bit each; number 23 of wireless ones the battery. A
-push goes to about 350.
-Source: the reports as hidraw gives them, number first.
+Each report contains a part of the state: number 1 translation and rotation (six little-endian int16), or, with older
+devices, number 1 translation and number 2 rotation; number 3 the buttons (one bit each); number 23 the battery of wireless
+devices. A deflection is at most about 350.
+Source: the reports from hidraw, which start with the number.
 
-An event states one part and leaves the others as they were. `StateFramer` keeps that state and makes of every report a
-frame that states all of it, so that `SpaceMouse.decode` needs no memory. Until a part was given it is 0: the cap at rest.
+`StateFramer` stores the state and converts every report to a frame with the full state, so that `SpaceMouse.decode` needs no
+memory. The initial state is 0: the cap at rest.
 """
 
 from __future__ import annotations
@@ -27,30 +27,35 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TRANSLATION, ROTATION, BUTTONS, BATTERY = 1, 2, 3, 23
-SIZES = {TRANSLATION: (13, 7), ROTATION: (7,), BUTTONS: tuple(range(2, 8)), BATTERY: (2, 3)}  # bytes, number included
+SIZES = {
+    TRANSLATION: (13, 7),
+    ROTATION: (7,),
+    BUTTONS: tuple(range(2, 8)),
+    BATTERY: (2, 3),
+}  # bytes, including the number
 PARTS = {TRANSLATION: slice(0, 6), ROTATION: slice(6, 12), BUTTONS: slice(12, 16)}  # bytes of the state
-FRAME = 17  # number of the report, 6 axes, 32 buttons
-LONGEST = 13
+FRAME = 17  # bytes: number of the report, 6 axes, 32 buttons
+MAX_REPORT = 13  # bytes
 
 
 @dataclass(frozen=True)
 class SpaceMouse(Sensor):
     """A SpaceMouse, for teleoperation."""
 
-    summary: ClassVar[str] = "3Dconnexion SpaceMouse on HID: six axes and buttons, a row an event."
+    summary: ClassVar[str] = "3Dconnexion SpaceMouse on HID: six axes and buttons, one row per event."
     links: ClassVar[tuple[str, ...]] = ("hid",)
     usb_ids: ClassVar[tuple[str, ...]] = ("256f:c635",)
     steady: ClassVar[bool] = False
 
-    rate_hz: float = 125.0  # events a second while the cap is moved; none come while it rests
-    split: bool = False  # rotation comes in a report of its own, as from older devices
+    rate_hz: float = 125.0  # events per second while the cap is moved; there are none at rest
+    split: bool = False  # True if rotation has its own report, as with older devices
 
     def __post_init__(self) -> None:
         if not 0 < self.rate_hz <= 1000:
-            raise UsageError(f"spacemouse: rate_hz is {self.rate_hz:g}; it must be more than 0 and at most 1000.")
+            raise UsageError(f"spacemouse: rate_hz is {self.rate_hz:g}; it must be above 0 and at most 1000.")
 
     def fields(self) -> list[pa.Field]:
-        """Return six axes, ``translation_x`` to ``rotation_z`` (int16 counts), and ``buttons`` (uint32, a bit each)."""
+        """Return six axes, ``translation_x`` to ``rotation_z`` (int16 counts), and ``buttons`` (uint32, one bit each)."""
         import pyarrow as pa
 
         axes = [
@@ -63,25 +68,25 @@ class SpaceMouse(Sensor):
         return [*axes, pa.field("buttons", pa.uint32(), metadata={"unit": "1", "quantity": "status"})]
 
     def framer(self) -> Framer:
-        """Return a framer that makes of each report a frame with the whole state."""
+        """Return a framer that converts each report to a frame with the full state."""
         return StateFramer()
 
     def decode(self, frames: Frames) -> Samples:
-        """Return axes and buttons of frames as `StateFramer` makes them; a battery's report has no sample.
+        """Return axes and buttons of frames of `StateFramer`. Battery reports have no sample.
 
-        Reports as `encode` gives them are taken as the first since the cap was at rest.
+        A list of reports, as returned by `encode`, is decoded from the rest state.
         """
         if isinstance(frames, list):
-            frames = merged(frames, np.zeros(FRAME, dtype=np.uint8))
+            frames = accumulate(frames, np.zeros(FRAME, dtype=np.uint8))
         rows = np.flatnonzero(frames[:, 0] != BATTERY)
         axes = np.ascontiguousarray(frames[rows, 1:13]).view("<i2").astype(np.int16)
         buttons = np.ascontiguousarray(frames[rows, 13:]).view("<u4").astype(np.uint32)
         return Samples((axes, buttons), rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return a report a sample: of the part that differs from the sample before, at first from rest.
+        """Return one report per sample, with the part that differs from the previous sample (initially from rest).
 
-        Where several parts differ, a report cannot state it: the buttons go first, then rotation where it is ``split``.
+        A report contains only one part. If several differ, the buttons take precedence, then rotation if it is ``split``.
         """
         axes, buttons = samples.values
         axes_bytes = np.ascontiguousarray(axes, "<i2").view(np.uint8)
@@ -97,7 +102,7 @@ class SpaceMouse(Sensor):
 
 
 class StateFramer:
-    """Takes each packet for a report and gives out the state that it leads to: frames of 17 bytes.
+    """Treat each packet as a report, and return the resulting state as a frame of 17 bytes.
 
     The account counts the bytes of the reports.
     """
@@ -107,42 +112,44 @@ class StateFramer:
         self._state = np.zeros(FRAME, dtype=np.uint8)
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return a frame a report, and packets that are none as losses."""
+        """Return one frame per report, and invalid packets as losses."""
         self.account.received += len(chunks.data)
         packets = chunks.packets()
         good = np.array([len(packet) in SIZES.get(packet[0] if packet else 0, ()) for packet in packets], dtype=bool)
-        reports = [packet for packet, fine in zip(packets, good, strict=True) if fine]
+        reports = [packet for packet, is_good in zip(packets, good, strict=True) if is_good]
         losses = [FramingLoss(int(chunks.t_ns[row]), MALFORMED, 1, len(packets[row])) for row in np.flatnonzero(~good)]
         self.account.framed += sum(len(report) for report in reports)
         self.account.lost += sum(loss.bytes for loss in losses)
         if not reports:
             return [], losses
-        frames = merged(reports, self._state)
+        frames = accumulate(reports, self._state)
         self._state = frames[-1].copy()
         return [FrameRun(frames, chunks.t_ns[good])], losses
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return nothing: a report is whole or it is none."""
+        """Return nothing: reports are never incomplete."""
         return [], []
 
 
-def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
-    """Return the state (report, 17) after each of ``reports``, of which the first one changes ``state`` (17,)."""
+def accumulate(reports: Sequence[bytes], state: Bytes) -> Bytes:
+    """Return the state (report, 17) after each of ``reports``, starting from ``state`` (17,)."""
     sizes = np.array([len(report) for report in reports])
-    padded = np.frombuffer(b"".join(report.ljust(LONGEST, b"\0") for report in reports), np.uint8).reshape(-1, LONGEST)
+    padded = np.frombuffer(b"".join(report.ljust(MAX_REPORT, b"\0") for report in reports), np.uint8).reshape(
+        -1, MAX_REPORT
+    )
     number = padded[:, 0]
     frames = np.vstack([state, np.zeros((len(reports), FRAME), dtype=np.uint8)])
     frames[1:, 0] = number
-    is_both = (number == TRANSLATION) & (sizes == LONGEST)
-    _carry(frames[:, 1:], PARTS[TRANSLATION], number == TRANSLATION, padded[:, 1:7])
-    turned = np.where(is_both[:, None], padded[:, 7:13], padded[:, 1:7])
-    _carry(frames[:, 1:], PARTS[ROTATION], (number == ROTATION) | is_both, turned)
-    _carry(frames[:, 1:], PARTS[BUTTONS], number == BUTTONS, padded[:, 1:5])
+    is_both = (number == TRANSLATION) & (sizes == MAX_REPORT)
+    _fill_forward(frames[:, 1:], PARTS[TRANSLATION], number == TRANSLATION, padded[:, 1:7])
+    rotation = np.where(is_both[:, None], padded[:, 7:13], padded[:, 1:7])
+    _fill_forward(frames[:, 1:], PARTS[ROTATION], (number == ROTATION) | is_both, rotation)
+    _fill_forward(frames[:, 1:], PARTS[BUTTONS], number == BUTTONS, padded[:, 1:5])
     return frames[1:]
 
 
-def _carry(frames: Bytes, place: slice, reported: Bools, sent: Bytes) -> None:
-    """Write a part of the state into ``frames``, whose first row is that before: where it was given, and on from there."""
-    frames[1:, place][reported] = sent[reported]
+def _fill_forward(frames: Bytes, part: slice, reported: Bools, sent: Bytes) -> None:
+    """Write a part of the state into ``frames``. The first row is the previous state; unreported rows repeat the last."""
+    frames[1:, part][reported] = sent[reported]
     last = np.maximum.accumulate(np.where(reported, np.arange(1, len(reported) + 1), 0))
-    frames[1:, place] = frames[last, place]
+    frames[1:, part] = frames[last, part]

@@ -1,9 +1,9 @@
-"""A tap: what a lab's own programs know, sent to the recording as lines of JSON by UDP.
+"""A tap: records that other programs send to the recording as lines of JSON by UDP.
 
-A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file states which keys
-become columns of numbers; the whole record is kept as text next to them, so nothing that was sent is lost. Keys with a
-meaning: ``seq`` and ``t_ns`` where the options promise them, ``event`` (start, stop, label, or another word), and ``grasp``,
-``{"g1": [x, y, z], "g2": [x, y, z], "R": [[…], […], […]]}`` in metres, whose columns of R are the wrist's axes.
+A line is one record, such as ``{"width_m": 0.031, "phase": "lift"}``; a packet contains one or more lines. The rig file
+selects keys that become numeric columns; the full record is also stored as text. Special keys: ``seq`` and ``t_ns``, if the
+options declare them, ``event`` (start, stop, label, or another word), and ``grasp``,
+``{"g1": [x, y, z], "g2": [x, y, z], "R": [[…], […], […]]}`` in metres, where the columns of R are the wrist's axes.
 """
 
 from __future__ import annotations
@@ -28,59 +28,59 @@ from tacpipe.sensors.sensor import Samples, Sensor
 if TYPE_CHECKING:
     import pyarrow as pa
 
-ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
-TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
-LARGEST = 1 << 62  # limit of counters and times
+ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key or a path such as pose.x or q.0, with its unit
+RESERVED = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
+MAX_INTEGER = 1 << 62  # limit of counters and times
 
 
 @dataclass(frozen=True)
 class Tap(Sensor):
-    """Records of a program. A key that a record lacks is NaN in its column; text where a number was given is refused."""
+    """Records of a program. A missing key is NaN in its column; records with text instead of a number are rejected."""
 
-    summary: ClassVar[str] = "Records of your own programs, sent as lines of JSON by UDP."
+    summary: ClassVar[str] = "Records of your programs, sent as lines of JSON by UDP."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
 
-    numbers: tuple[str, ...] = ()  # keys that become columns, with their units: "width_m:m", "pose.x", "q.0:rad"
+    numbers: tuple[str, ...] = ()  # keys that become columns, with optional units: "width_m:m", "pose.x", "q.0:rad"
     grasp: Literal["", "points", "wrist"] = (
-        ""  # keep grasps alone: their points, or points and wrist; empty: any record
+        ""  # record only grasps: their points, or points and wrist; empty: all records
     )
-    counted: bool = False  # each record has a key seq that grows by 1, so that lost ones are known
-    timed: bool = False  # each record has a key t_ns, ns on the program's own clock, when it is true
-    rate_hz: float = 0.0  # records a second; 0: they come when they come
+    counted: bool = False  # each record has a key seq that increases by 1, so that losses are detected
+    timed: bool = False  # each record has a key t_ns, the time of its values in ns on the program's clock
+    rate_hz: float = 0.0  # records per second; 0: irregular
 
     def __post_init__(self) -> None:
         columns = [_column(entry) for entry in self.numbers]
         for entry, column in zip(self.numbers, columns, strict=True):
-            if not ENTRY.fullmatch(entry) or column in TAKEN or columns.count(column) > 1 or not column[0].isalpha():
+            if not ENTRY.fullmatch(entry) or column in RESERVED or columns.count(column) > 1 or not column[0].isalpha():
                 raise UsageError(
-                    f"tap: {entry!r} among numbers makes no column; name each key once, with its unit behind a colon, as "
-                    f"width_m:m or pose.x, and none of {', '.join(TAKEN)}."
+                    f"tap: {entry!r} in numbers is not a valid column; give unique keys with an optional unit, such "
+                    f"as width_m:m or pose.x, and none of {', '.join(RESERVED)}."
                 )
         if self.grasp and self.numbers:
-            raise UsageError(f"tap: a stream of grasps has no other columns; leave numbers ({self.numbers[0]}) out.")
-        object.__setattr__(self, "counter", LARGEST if self.counted else None)
+            raise UsageError(f"tap: a stream of grasps has no other columns; remove numbers ({self.numbers[0]}).")
+        object.__setattr__(self, "counter", MAX_INTEGER if self.counted else None)
 
     def fields(self) -> list[pa.Field]:
-        """Return ``event`` and ``json``, text, and the numbers, float64; of grasps the columns of `Grasp.table`."""
+        """Return ``event`` and ``json`` (text), and the numbers (float64); or the columns of `Grasp.table` for grasps."""
         import pyarrow as pa
 
         from tacpipe.channels import schema
 
         if self.grasp:
             fields = [schema.float_field(name, "m", "position", name[3]) for name in POINTS]
-            turned = [schema.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
-            return fields + turned if self.grasp == "wrist" else fields
+            wrist = [schema.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
+            return fields + wrist if self.grasp == "wrist" else fields
         numbers = [schema.float_field(_column(entry), _unit(entry), "state") for entry in self.numbers]
         text = {"unit": "1", "quantity": "text"}
         return [*(pa.field(name, pa.string(), metadata=text) for name in ("event", "json")), *numbers]
 
     def framer(self) -> Framer:
-        """Return a framer that takes packets all of whose lines are records with what the options promise."""
-        return TextFramer(self._is_right)
+        """Return a framer for packets whose lines are all valid records."""
+        return TextFramer(self._is_valid)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return a sample for each record; of grasps, for each record that holds one."""
+        """Return one sample per record, or per record with a grasp if only grasps are recorded."""
         entries = [(row, line, json.loads(line)) for row, frame in enumerate(frames) for line in _lines(frame)]
         entries = [entry for entry in entries if not self.grasp or "grasp" in entry[2]]
         records = [record for _, _, record in entries]
@@ -97,7 +97,7 @@ class Tap(Sensor):
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return a packet for each record: its text where there is one, or else a record of its numbers."""
+        """Return one packet per record: its text, or a record of its numbers if the text is empty."""
         records: list[dict[str, Any]] = [{} for _ in range(len(samples))]
         for name, stamps in (("seq", samples.seq), ("t_ns", samples.t_device_ns)):
             for record, stamp in zip(records, () if stamps is None else stamps.tolist(), strict=stamps is not None):
@@ -118,36 +118,36 @@ class Tap(Sensor):
             (text or json.dumps(record)).encode() for record, (_, text) in zip(records, texts.tolist(), strict=True)
         ]
 
-    def _is_right(self, packet: bytes) -> bool:
+    def _is_valid(self, packet: bytes) -> bool:
         try:
             records = [json.loads(line.decode()) for line in _lines(packet)]
-            return bool(records) and all(self._holds(record) for record in records)
-        except (ValueError, RecursionError):  # no JSON, no UTF-8, or lists within lists without end
+            return bool(records) and all(self._is_record(record) for record in records)
+        except (ValueError, RecursionError):  # invalid JSON or UTF-8, or lists that are nested too deeply
             return False
 
-    def _holds(self, record: Any) -> bool:
-        """Return whether a line is a record, numbers are where numbers were given, and what is promised is there.
+    def _is_record(self, record: Any) -> bool:
+        """Return whether a line is a record with the declared keys and with numbers in the numeric columns.
 
-        Raises `ValueError` for an event that is not text in UTF-8.
+        Raises `ValueError` if an event cannot be encoded as UTF-8.
         """
         if not isinstance(record, dict) or not isinstance(record.get("event", ""), str):
             return False
         record.get("event", "").encode()
-        promised = [name for name, entry in (("seq", self.counted), ("t_ns", self.timed)) if entry]
-        if not all(type(record.get(name)) is int and 0 <= record[name] < LARGEST for name in promised):
+        required = [name for name, entry in (("seq", self.counted), ("t_ns", self.timed)) if entry]
+        if not all(type(record.get(name)) is int and 0 <= record[name] < MAX_INTEGER for name in required):
             return False
         if self.grasp:
-            return "grasp" not in record or _is_grasp(record["grasp"], turned=self.grasp == "wrist")
-        values = [_at(record, _path(entry)) for entry in self.numbers]
-        return all(value is None or isinstance(value, float) or _is_whole(value) for value in values)
+            return "grasp" not in record or _is_grasp(record["grasp"], with_wrist=self.grasp == "wrist")
+        values = [_value_at(record, _path(entry)) for entry in self.numbers]
+        return all(value is None or isinstance(value, float) or _is_integer(value) for value in values)
 
     def _numbers(self, records: Sequence[Values]) -> Floats:
-        """Return the numbers (sample, channel) of records, NaN where there is none."""
+        """Return the numbers (sample, channel) of records; NaN for missing keys."""
         numbers = np.full((len(records), len(self.numbers)), np.nan)
         for column, entry in enumerate(self.numbers):
             path = _path(entry)
             for row, record in enumerate(records):
-                value = _at(record, path)
+                value = _value_at(record, path)
                 if value is not None:
                     numbers[row, column] = value
         return numbers
@@ -162,11 +162,11 @@ class Tap(Sensor):
         return np.hstack([points, wrists.transpose(0, 2, 1).reshape(len(records), len(WRIST))])
 
 
-def _is_grasp(entry: Any, *, turned: bool) -> bool:
-    """Return whether a record's grasp is one that a hand can make, with its wrist where that is wanted."""
+def _is_grasp(entry: Any, *, with_wrist: bool) -> bool:
+    """Return whether an entry is a valid grasp, with a wrist if ``with_wrist``."""
     try:
         points = [np.array(entry[name], dtype=np.float64) for name in ("g1", "g2")]
-        wrist = np.array(entry["R"], dtype=np.float64) if turned else None
+        wrist = np.array(entry["R"], dtype=np.float64) if with_wrist else None
         if any(point.shape != (3,) for point in points):
             return False
         Grasp(points[0], points[1], wrist)
@@ -175,9 +175,9 @@ def _is_grasp(entry: Any, *, turned: bool) -> bool:
     return True
 
 
-def _is_whole(value: Any) -> bool:
-    """Return whether a value is a whole number, true or false."""
-    return isinstance(value, int) and abs(value) < LARGEST
+def _is_integer(value: Any) -> bool:
+    """Return whether a value is an integer or a Boolean."""
+    return isinstance(value, int) and abs(value) < MAX_INTEGER
 
 
 def _lines(packet: bytes) -> list[bytes]:
@@ -189,7 +189,7 @@ def _path(entry: str) -> tuple[str, ...]:
 
 
 def _column(entry: str) -> str:
-    """Return the name of a number's column.
+    """Return the column name of an entry of ``numbers``.
 
     >>> _column("pose.x:m")
     'pose_x'
@@ -201,8 +201,8 @@ def _unit(entry: str) -> str:
     return entry.partition(":")[2] or "1"
 
 
-def _at(record: Any, path: Sequence[str]) -> Any:
-    """Return what a record holds at a path of keys and places in lists, None where nothing is there."""
+def _value_at(record: Any, path: Sequence[str]) -> Any:
+    """Return the value at a path of keys and list indices, or None if there is none."""
     for part in path:
         if isinstance(record, Mapping):
             record = record.get(part)

@@ -1,10 +1,9 @@
-"""Terabee TeraRanger Evo 60m and its kin: one distance along a line of sight, over USB or a UART.
+"""Terabee TeraRanger Evo 60m and related sensors: one distance, over USB or a UART.
 
-Frames of 4 bytes in binary mode: ``54``, the distance in mm, big-endian, and the CRC-8 (polynomial 0x07) of what is
-before.
-Source: TeraRanger Evo user manual; the commands' last bytes are the CRC-8 of the others, which the tests recompute.
+Frames in binary mode have 4 bytes: ``54``, the distance in mm (big-endian), and the CRC-8 (polynomial 0x07) of these bytes.
+Source: TeraRanger Evo user manual. The last byte of each command is the CRC-8 of the others, which the tests verify.
 
-Distances stay as they were sent, codes included: 0 is too near, 1 could not be measured, 65535 is too far.
+Distances are not converted, including codes: 0 is too near, 1 could not be measured, 65535 is too far.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ if TYPE_CHECKING:
 
 MARKER = b"\x54"
 SIZE = 4
-BINARY = bytes.fromhex("00 11 02 4C")  # frames as here, rather than text
+BINARY = bytes.fromhex("00 11 02 4C")  # selects binary frames instead of text
 START, STOP = bytes.fromhex("00 52 02 01 DF"), bytes.fromhex("00 52 02 00 D8")
-FASTEST_HZ = 240.0  # largest rate of the Evo 60m
+MAX_HZ = 240.0  # of the Evo 60m
 
 
 @dataclass(frozen=True)
@@ -37,13 +36,13 @@ class TeraRanger(Sensor):
 
     summary: ClassVar[str] = "Terabee TeraRanger Evo distance sensors over USB or a UART, binary mode."
 
-    rate_hz: float = FASTEST_HZ  # rate in the sensor's range mode, up to 240
-    baud: int = 115200  # over USB any
+    rate_hz: float = MAX_HZ  # frames per second in the sensor's range mode, up to 240
+    baud: int = 115200  # baud rate; any rate works over USB
 
     def __post_init__(self) -> None:
-        if not 0 < self.rate_hz <= FASTEST_HZ:
+        if not 0 < self.rate_hz <= MAX_HZ:
             raise UsageError(
-                f"teraranger: rate_hz is {self.rate_hz:g}; it must be the rate at which the sensor runs, up to 240."
+                f"teraranger: rate_hz is {self.rate_hz:g}; it must be the rate of the sensor, at most 240."
             )
 
     def fields(self) -> list[pa.Field]:
@@ -53,7 +52,7 @@ class TeraRanger(Sensor):
         return [pa.field("distance", pa.uint16(), metadata={"unit": "mm", "quantity": "proximity"})]
 
     def framer(self) -> Framer:
-        """Return a framer of frames with their CRC, each confirmed by the next: the CRC has 8 bits."""
+        """Return a framer for frames with the right CRC, each confirmed by the next, because the CRC has 8 bits."""
         return ByteFramer(Framing(marker=MARKER, size=SIZE, check=_crc_is_right, lock=3, confirm=1))
 
     def decode(self, frames: Bytes) -> Samples:
@@ -68,7 +67,7 @@ class TeraRanger(Sensor):
         return np.hstack([body, crc8(body)[:, None]])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Ask for binary frames and start the stream, which older firmware does by itself."""
+        """Select binary frames and start the stream, which older firmware does by itself."""
         yield Ask(BINARY, pause_s=0.1)
         yield Ask(START)
 
@@ -77,12 +76,12 @@ class TeraRanger(Sensor):
         return STOP
 
     def device(self) -> Device:
-        """Return a sensor that waits for the command to start."""
+        """Return an emulated sensor that waits for the start command."""
         return _Evo(streaming=False)
 
 
 class _Evo(Device):
-    """The sensor's side. It gives frames in binary mode alone, so text mode is silence here."""
+    """An emulated sensor. It sends frames only in binary mode; text mode is not emulated."""
 
     binary = False
     started = False
@@ -105,5 +104,5 @@ class _Evo(Device):
 
 
 def _crc_is_right(frames: Bytes) -> Bools:
-    right: Bools = crc8(frames[:, :-1]) == frames[:, -1]
-    return right
+    is_right: Bools = crc8(frames[:, :-1]) == frames[:, -1]
+    return is_right

@@ -1,20 +1,20 @@
-"""Benewake TFmini, TFmini-S and TFmini Plus: one distance along a line of sight, over a UART.
+"""Benewake TFmini, TFmini-S and TFmini Plus: one distance, over a UART.
 
-Frames of 9 bytes: ``59 59``, little-endian distance and strength, two bytes that differ by model, and the 8-bit sum of
-all before. Commands to Plus and S are ``5A``, their length, a number, what they state and the 8-bit sum. The original has
-none here.
+Frames have 9 bytes: ``59 59``, little-endian distance and strength, two bytes that depend on the model, and the 8-bit sum of
+all preceding bytes. Commands to Plus and S are ``5A``, their length, a number, the payload and the 8-bit sum. This driver
+sends no commands to the original.
 Source: Benewake's manuals of TFmini (SJ-PM-TFmini-T-01), TFmini-S (SJ-PM-TFmini-S) and TFmini Plus
 (SJ-GU-TFmini-Plus-01).
 
-Distances stay as they were sent, codes included:
+Distances are not converted, including codes:
 
 ======== =====================================================================================
-distance what it states
+distance meaning
 ======== =====================================================================================
-0        nothing was measured (Plus, S)
-65535    the signal is too weak to be trusted: strength below 100, of the original below 20
-65534    the signal saturates (S: strength reads 65535)
-65532    the ambient light saturates (S)
+0        no measurement (Plus, S)
+65535    the signal is too weak: strength below 100, or below 20 for the original
+65534    the signal is saturated (S: strength reads 65535)
+65532    the ambient light is saturated (S)
 1200     original, in cm: farther than 12 m
 ======== =====================================================================================
 """
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 MARKER = b"\x59\x59"
 SIZE = 9
-BITS = 10 * SIZE  # bits of a frame on the line, with start and stop bits
+BITS = 10 * SIZE  # bits per frame on the line, including start and stop bits
 VERSION, RATE, UNIT, ENABLE, SAVE = 0x01, 0x03, 0x05, 0x07, 0x11  # numbers of commands
 UNITS = {"cm": 1, "mm": 6}
 MODELS = ("original", "s", "plus")
@@ -53,35 +53,34 @@ class TfMini(Sensor):
 
     model: Literal["original", "s", "plus"] = "plus"  # model; rate and unit of S and Plus can be set
     unit: Literal["cm", "mm"] = "cm"  # unit of the distance
-    rate_hz: float = 100.0  # 1000 divided by a whole number; the original's is 100
-    save: bool = True  # keep rate and unit in the sensor's flash, as the manual asks for
+    rate_hz: float = 100.0  # frames per second: 1000 divided by a whole number; 100 for the original
+    save: bool = True  # store rate and unit in the sensor's flash, as the manual requires
     baud: int = 115200  # baud rate of the sensor
 
     def __post_init__(self) -> None:
         if self.model not in MODELS or self.unit not in UNITS:
             raise UsageError(
                 f"tfmini: model {self.model!r} with unit {self.unit!r} is unknown; "
-                f"take one of {', '.join(MODELS)}, and cm or mm."
+                f"use one of {', '.join(MODELS)}, and cm or mm."
             )
         if self.model == "original" and (self.rate_hz != 100 or self.unit != "cm"):
             raise UsageError(
-                f"tfmini: the original is set to {self.rate_hz:g} Hz in {self.unit}; it gives only 100 Hz in cm."
+                f"tfmini: the options set {self.rate_hz:g} Hz in {self.unit}; the original supports only 100 Hz in cm."
             )
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - round(1000 / self.rate_hz)) > 1e-6 * self.rate_hz:
             raise UsageError(
-                f"tfmini: rate_hz is {self.rate_hz:g}; it must be 1000 divided by a whole number, as 1000, 500, 250 or 100."
+                f"tfmini: rate_hz is {self.rate_hz:g}; it must be 1000 divided by a whole number, such as 500, 250 or 100."
             )
         if self.rate_hz * BITS > self.baud:
             raise UsageError(
-                f"tfmini: {self.rate_hz:g} frames a second take {self.rate_hz * BITS:g} baud and the line has {self.baud}; "
-                f"lower rate_hz or set the sensor and baud to 460800."
+                f"tfmini: {self.rate_hz:g} frames per second need {self.rate_hz * BITS:g} baud, but baud is {self.baud}; "
+                f"lower rate_hz, or set the sensor and baud to 460800."
             )
 
     def fields(self) -> list[pa.Field]:
-        """Return ``distance`` and ``strength``, uint16, and what else the model sends.
+        """Return ``distance`` and ``strength`` (uint16), and the additional channels of the model.
 
-        Of Plus and S ``temperature`` (uint16; in °C it is the count / 8 - 256), of the original ``mode`` and ``spare``
-        (uint8).
+        For Plus and S, ``temperature`` (uint16; °C = count / 8 − 256); for the original, ``mode`` and ``spare`` (uint8).
         """
         import pyarrow as pa
 
@@ -99,11 +98,11 @@ class TfMini(Sensor):
         return [*fields, pa.field("temperature", pa.uint16(), metadata={"unit": "count", "quantity": "temperature"})]
 
     def framer(self) -> Framer:
-        """Return a framer of frames with their sum, each confirmed by the next: the sum has 8 bits."""
+        """Return a framer for frames with the right sum, each confirmed by the next, because the sum has 8 bits."""
         return ByteFramer(Framing(marker=MARKER, size=SIZE, check=_sum_is_right, confirm=1))
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return distance and strength, and what the model sends next to them."""
+        """Return distance and strength, and the additional channels of the model."""
         words = np.ascontiguousarray(frames[:, 2:8]).view("<u2").astype(np.uint16)  # (frame, word)
         if self.model == "original":
             return Samples((words[:, :2], np.ascontiguousarray(frames[:, 6:8])))
@@ -117,22 +116,22 @@ class TfMini(Sensor):
         return np.hstack([body, sum8(body)[:, None]])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Set unit and rate and switch the stream on; the original streams by itself and is given nothing."""
+        """Set unit and rate, and start the stream. The original streams by itself and receives no commands."""
         if self.model == "original":
             return
-        yield _asked(UNIT, bytes([UNITS[self.unit]]))
-        yield _asked(RATE, round(self.rate_hz).to_bytes(2, "little"))
+        yield _request(UNIT, bytes([UNITS[self.unit]]))
+        yield _request(RATE, round(self.rate_hz).to_bytes(2, "little"))
         if self.save:
-            yield _asked(SAVE)
-        yield _asked(ENABLE, b"\x01")
+            yield _request(SAVE)
+        yield _request(ENABLE, b"\x01")
 
     def device(self) -> Device:
-        """Return a sensor that streams from power-on and answers commands."""
+        """Return an emulated sensor that streams from power-on and answers commands."""
         return Device() if self.model == "original" else _TfMini()
 
 
 class _TfMini(Device):
-    """The sensor's side: every command is answered with itself, or with whether it was done."""
+    """An emulated sensor, which answers commands with an echo or a status."""
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
@@ -144,10 +143,10 @@ class _TfMini(Device):
             message = bytes(self.heard[start : start + size])
             del self.heard[: start + max(size, 1)]
             if size >= 4 and command(message[2], message[3:-1]) == message:
-                replies += self._done(message[2], message[3:-1])
+                replies += self._replies(message[2], message[3:-1])
         return replies
 
-    def _done(self, number: int, payload: bytes) -> list[bytes]:
+    def _replies(self, number: int, payload: bytes) -> list[bytes]:
         if number == VERSION:
             return [command(VERSION, b"\x01\x02\x03")]
         if number == SAVE:
@@ -169,28 +168,30 @@ def command(number: int, payload: bytes = b"") -> bytes:
     return body + bytes([sum(body) & 0xFF])
 
 
-def _asked(number: int, payload: bytes = b"") -> Ask:
-    return Ask(command(number, payload), until=_reply(number, payload), what=f"the reply to command {number:#04x}")
+def _request(number: int, payload: bytes = b"") -> Ask:
+    return Ask(
+        command(number, payload), until=_reply_finder(number, payload), what=f"the reply to command {number:#04x}"
+    )
 
 
-def _reply(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return what finds the reply among frames, which may hold its first bytes by chance."""
+def _reply_finder(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return a function that finds the reply among frames, which may contain its first bytes by chance."""
     size = 5 if number == SAVE else len(payload) + 4
     head = bytes([0x5A, size, number])
 
-    def until(data: bytes) -> int | tuple[int, int]:
+    def find(data: bytes) -> int | tuple[int, int]:
         start = data.find(head)
         while start >= 0 and command(number, data[start + 3 : start + size - 1]) != data[start : start + size]:
             start = data.find(head, start + 1)
         if start < 0:
             return 0
         if number == SAVE and data[start + 3]:
-            raise DeviceError("The TFmini did not save its settings; set save = false to do without.")
+            raise DeviceError("The TFmini did not save its settings; set save = false to skip this.")
         return start, start + size
 
-    return until
+    return find
 
 
 def _sum_is_right(frames: Bytes) -> Bools:
-    right: Bools = sum8(frames[:, :-1]) == frames[:, -1]
-    return right
+    is_right: Bools = sum8(frames[:, :-1]) == frames[:, -1]
+    return is_right

@@ -1,8 +1,8 @@
-"""Universal Robots arms by RTDE, the real-time data exchange of their controllers, protocol version 2.
+"""Universal Robots arms with RTDE, the real-time data exchange of their controllers, protocol version 2.
 
-Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host states which version it speaks, how
-often it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by
-one. Reading takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
+Packages over TCP are big-endian: u16 size including the header, u8 type, payload. The host requests the version, sends a
+recipe (rate and outputs), and starts the stream. A data package contains the recipe's number and the outputs in order.
+Reading does not need control of the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tacpipe.signals import kinematics
 if TYPE_CHECKING:
     import pyarrow as pa
 
-WIRE = {  # type to numpy's and how many
+WIRE = {  # numpy type and number of elements, by RTDE type
     "BOOL": ("u1", 1),
     "UINT8": ("u1", 1),
     "UINT32": (">u4", 1),
@@ -67,7 +67,7 @@ TYPES = {
 REGISTERS = {"bit": ("BOOL", range(64, 128)), "int": ("INT32", range(48)), "double": ("DOUBLE", range(48))}
 REGISTER = re.compile(r"(?:output|input)_(bit|int|double)_register_(\d{1,3})")
 JOINTS = 6
-JOINT_NAMES = {  # output to what stands behind "joint1_", the unit and the quantity
+JOINT_NAMES = {  # suffix after "joint1_", unit and quantity, by output
     "actual_q": ("rad", "rad", "joint_position"),
     "actual_qd": ("velocity_rad_s", "rad/s", "joint_velocity"),
     "actual_current": ("current_a", "A", "current"),
@@ -82,7 +82,7 @@ JOINT_NAMES = {  # output to what stands behind "joint1_", the unit and the quan
 
 
 def type_of(output: str) -> str | None:
-    """Return the type of an output on the wire, None if there is no such output.
+    """Return the RTDE type of an output, or None if there is no such output.
 
     >>> type_of("actual_q"), type_of("output_int_register_24"), type_of("q")
     ('VECTOR6D', 'INT32', None)
@@ -95,7 +95,7 @@ def type_of(output: str) -> str | None:
 
 
 def fields_of(output: str) -> list[pa.Field]:
-    """Return the fields that an output becomes: those that arms have elsewhere, or its own name, small, and a number."""
+    """Return the fields of an output: the common fields of arms, or its name in lower case with a number per element."""
     import pyarrow as pa
 
     from tacpipe.channels import schema
@@ -125,56 +125,56 @@ PROTOCOL = 2
 VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvMUOISP"
 KINDS = (VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE)
 STAMP = "timestamp"  # seconds since the controller started
-EMULATED = (5, 11, 0, 0)  # controller's version: major, minor, bugfix, build
-MOST = 1e12  # no output of a controller is as large: metres, newtons, radians, seconds since its start
-LARGEST = 4096  # bytes of a package
+EMULATED_VERSION = (5, 11, 0, 0)  # major, minor, bugfix, build
+MAX_VALUE = 1e12  # larger than any output: metres, newtons, radians, seconds since start
+MAX_PACKAGE = 4096  # bytes
 
 
 @dataclass(frozen=True)
 class UrRtde(Sensor):
-    """The arm of a UR controller. RTDE does not count; what the controller skips shows in its time."""
+    """An arm of a UR controller. RTDE has no counter; skipped samples are visible in the controller's time."""
 
-    summary: ClassVar[str] = "Universal Robots arms by RTDE (CB3 from 3.4, e-Series)."
+    summary: ClassVar[str] = "Universal Robots arms with RTDE (CB3 from 3.4, e-Series)."
     links: ClassVar[tuple[str, ...]] = ("tcp",)
 
-    outputs: tuple[str, ...] = (  # names of RTDE outputs; the time is always among them
+    outputs: tuple[str, ...] = (  # names of RTDE outputs; the time is always included
         "actual_q",
         "actual_qd",
         POSE,
         "actual_TCP_speed",
         "actual_TCP_force",
     )
-    rate_hz: float = 500.0  # 500 at most of an e-Series, 125 of a CB3
+    rate_hz: float = 500.0  # samples per second: up to 500 for an e-Series, 125 for a CB3
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.outputs if type_of(name) is None or name == STAMP]
         if unknown or not self.outputs or len(set(self.outputs)) < len(self.outputs):
-            described = (
-                f"{unknown[0]} among its outputs" if unknown else f"the outputs {', '.join(self.outputs) or 'none'}"
+            problem = (
+                f"outputs contains {unknown[0]}" if unknown else f"outputs are {', '.join(self.outputs) or 'none'}"
             )
             raise UsageError(
-                f"ur-rtde has {described}; name each output of the RTDE guide once, as actual_q or output_int_register_24. "
-                f"The time comes by itself."
+                f"ur-rtde: {problem}; list outputs of the RTDE guide, each once, such as actual_q or "
+                f"output_int_register_24. The time is always included."
             )
         if not 1 <= self.rate_hz <= 500:
-            raise UsageError(f"ur-rtde: rate_hz is {self.rate_hz:g}; a controller sends 1 to 500 a second.")
+            raise UsageError(f"ur-rtde: rate_hz is {self.rate_hz:g}; it must be between 1 and 500.")
 
     @property
     def package(self) -> np.dtype[np.void]:
-        """A data package: header, recipe, the time, and the outputs."""
+        """The structured type of a data package: header, recipe, time, and outputs."""
         return np.dtype(
             [("size", ">u2"), ("type", "u1"), ("recipe", "u1"), (STAMP, ">f8")]
             + [(name, *WIRE[type_of(name) or ""]) for name in self.outputs]
         )
 
     def fields(self) -> list[pa.Field]:
-        """Return the fields of the outputs: joints, pose, speed and load named as those of other arms, others by name."""
+        """Return the fields of the outputs. Joints, pose, speed and load have the same names as for other arms."""
         return [field for name in self.outputs for field in fields_of(name)]
 
     def framer(self) -> Framer:
-        """Return a framer of packages; one of data must be as long as the recipe states, and have another behind it.
+        """Return a framer for packages. Data packages must have the size of the recipe, and another package must follow.
 
-        There is no sum; a package that was cut would take its missing bytes from the next.
+        There is no checksum, and an incomplete package would take its missing bytes from the next.
         """
         size = self.package.itemsize
 
@@ -187,22 +187,22 @@ class UrRtde(Sensor):
                 )
             return np.asarray(data | (np.isin(kinds, KINDS) & (kinds != DATA)))
 
-        return ByteFramer(Framing(header=HEADER.size, sizes=_sizes, most=LARGEST, check=check, confirm=1))
+        return ByteFramer(Framing(header=HEADER.size, sizes=_sizes, max_size=MAX_PACKAGE, check=check, confirm=1))
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the samples of data packages, with the controller's time; other packages hold none."""
+        """Return the samples of data packages, with the controller's time. Other packages have no sample."""
         dtype = self.package
         rows = np.flatnonzero(frames[:, 2] == DATA) if frames.shape[1] == dtype.itemsize else np.zeros(0, np.int64)
         records = np.ascontiguousarray(frames[rows][:, : dtype.itemsize])
         packages = records.view(dtype)[:, 0] if len(rows) else np.zeros(0, dtype)
         return Samples(
-            tuple(_native(packages[name], name) for name in self.outputs),
+            tuple(_to_columns(packages[name], name) for name in self.outputs),
             t_device_ns=np.rint(packages[STAMP] * 1e9).astype(np.int64),
             rows=rows.astype(np.int64),
         )
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return the data packages that hold these samples."""
+        """Return the data packages of these samples."""
         assert samples.t_device_ns is not None
         packages = np.zeros(len(samples), self.package)
         packages["size"], packages["type"], packages["recipe"] = self.package.itemsize, DATA, 1
@@ -213,11 +213,11 @@ class UrRtde(Sensor):
         return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Agree on the version, ask for the outputs, start. Raises `DeviceError` where the controller refuses."""
+        """Negotiate the version, request the outputs, and start. Raises `DeviceError` if the controller refuses."""
         reply = yield _ask(VERSION, PROTOCOL.to_bytes(2, "big"))
         if reply[HEADER.size :] != b"\1":
             raise DeviceError(
-                "The controller does not speak RTDE version 2. Update it to CB3 3.10, e-Series 5.4 or later."
+                "The controller does not support RTDE version 2. Update it to CB3 3.10, e-Series 5.4 or later."
             )
         names = (STAMP, *self.outputs)
         reply = yield _ask(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(names).encode())
@@ -226,26 +226,28 @@ class UrRtde(Sensor):
         for name, kind in zip(names, kinds, strict=False):
             if kind != type_of(name):
                 raise DeviceError(
-                    f"The controller states {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
-                    f"the option outputs, or update the controller."
+                    f"The controller reports type {kind} for the output {name}, which should be {type_of(name)}. Remove it "
+                    f"from the option outputs, or update the controller."
                 )
         if len(kinds) != len(names) or recipe in (b"", b"\0"):
-            raise DeviceError(f"The controller refused the outputs {', '.join(names)}. Ask for fewer, or less often.")
+            raise DeviceError(
+                f"The controller refused the outputs {', '.join(names)}. Request fewer outputs, or a lower rate."
+            )
         reply = yield _ask(START, b"")
         if reply[HEADER.size :] != b"\1":
-            raise DeviceError("The controller refused to start sending. Is another RTDE client using up its time?")
+            raise DeviceError("The controller refused to start the stream. Close other RTDE clients and try again.")
 
     def closing(self) -> bytes:
         """Pause the stream."""
-        return packed(PAUSE)
+        return pack_package(PAUSE)
 
     def device(self) -> Device:
-        """Return a controller that waits for a recipe, and serves this sensor's alone."""
+        """Return an emulated controller that waits for this sensor's recipe."""
         return _RtdeController(self)
 
 
 class _RtdeController(Device):
-    """The controller's side. It finds no outputs but those that its frames hold, in their order."""
+    """An emulated controller. It supports only the sensor's outputs, in their order."""
 
     def __init__(self, sensor: UrRtde) -> None:
         super().__init__(streaming=False)
@@ -254,39 +256,39 @@ class _RtdeController(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         replies = []
-        for kind, package in _taken(self.heard):
+        for kind, package in _pop_packages(self.heard):
             if kind == VERSION:
-                replies.append(packed(kind, bytes([package == PROTOCOL.to_bytes(2, "big")])))
+                replies.append(pack_package(kind, bytes([package == PROTOCOL.to_bytes(2, "big")])))
             elif kind == CONTROLLER:
-                replies.append(packed(kind, struct.pack(">4I", *EMULATED)))
+                replies.append(pack_package(kind, struct.pack(">4I", *EMULATED_VERSION)))
             elif kind == OUTPUTS:
                 replies.append(self._recipe(package))
             elif kind == INPUTS:
                 kinds = ",".join(type_of(name) or "NOT_FOUND" for name in package.decode("latin-1").split(","))
-                replies.append(packed(kind, b"\1" + kinds.encode()))
+                replies.append(pack_package(kind, b"\1" + kinds.encode()))
             elif kind in (START, PAUSE):
                 self.streaming = kind == START
-                replies.append(packed(kind, b"\1"))
+                replies.append(pack_package(kind, b"\1"))
         return replies
 
     def _recipe(self, package: bytes) -> bytes:
         names = tuple(package[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
         self.rate_hz = float(struct.unpack(">d", package[:8])[0])
         kinds = ",".join(str(type_of(name)) if name in self.outputs else "NOT_FOUND" for name in names)
-        return packed(OUTPUTS, bytes([names == self.outputs]) + kinds.encode())
+        return pack_package(OUTPUTS, bytes([names == self.outputs]) + kinds.encode())
 
 
-def packed(kind: int, payload: bytes = b"") -> bytes:
-    r"""Return a package.
+def pack_package(kind: int, payload: bytes = b"") -> bytes:
+    r"""Return a package of type ``kind``.
 
-    >>> packed(VERSION, b"\0\2").hex(" ")
+    >>> pack_package(VERSION, b"\0\2").hex(" ")
     '00 05 56 00 02'
     """
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
-def _taken(data: bytearray) -> Iterator[tuple[int, bytes]]:
-    """Take whole packages off the front of ``data`` and yield type and payload of each."""
+def _pop_packages(data: bytearray) -> Iterator[tuple[int, bytes]]:
+    """Remove complete packages from the front of ``data`` and yield (type, payload) of each."""
     while len(data) >= HEADER.size:
         size, kind = HEADER.unpack_from(data)
         if len(data) < max(size, HEADER.size):
@@ -297,40 +299,40 @@ def _taken(data: bytearray) -> Iterator[tuple[int, bytes]]:
 
 
 def _ask(kind: int, payload: bytes) -> Ask:
-    """Return the question of a type, whose reply is of the same type; texts may come before it."""
+    """Return a request whose reply has the same type. Text packages may precede the reply."""
 
-    def until(data: bytes) -> int | tuple[int, int]:
-        place = 0
-        while len(data) >= place + HEADER.size:
-            size, package_kind = HEADER.unpack_from(data, place)
+    def find(data: bytes) -> int | tuple[int, int]:
+        offset = 0
+        while len(data) >= offset + HEADER.size:
+            size, package_kind = HEADER.unpack_from(data, offset)
             if package_kind not in KINDS or size < HEADER.size:
                 raise DeviceError(
-                    f"Bytes {data[place : place + 8].hex(' ')} came, which are not RTDE. Is the port 30004?"
+                    f"The bytes {data[offset : offset + 8].hex(' ')} are not RTDE. Check that the port is 30004."
                 )
             if package_kind == kind:
-                return (place, place + size) if len(data) >= place + size else 0
-            place += size
+                return (offset, offset + size) if len(data) >= offset + size else 0
+            offset += size
         return 0
 
-    return Ask(packed(kind, payload), until, what=f"the controller's reply to RTDE package {chr(kind)}")
+    return Ask(pack_package(kind, payload), find, what=f"the controller's reply to RTDE package {chr(kind)}")
 
 
 def _sizes(heads: Bytes) -> Ints:
     return heads[:, 0].astype(np.int64) * 256 + heads[:, 1]
 
 
-def _native(values: AnyArray, name: str) -> AnyArray:
-    """Return an output's values (sample, channel) in this machine's order of bytes, a pose with its quaternion."""
+def _to_columns(values: AnyArray, name: str) -> AnyArray:
+    """Convert an output's values to columns (sample, channel) in native byte order. Poses get a quaternion."""
     block = values[:, None] if values.ndim == 1 else values
     block = block.astype(bool if type_of(name) == "BOOL" else block.dtype.newbyteorder("="))
     return np.hstack([block[:, :3], kinematics.quaternions_of_vectors(block[:, 3:])]) if name in POSES else block
 
 
 def _are_numbers(packages: AnyArray) -> Bools:
-    """Return in which packages (package,) all floats are of a size that a robot's state may have."""
+    """Return a mask (package,) of the packages whose floats are all plausible."""
     good = np.ones(len(packages), dtype=bool)
     for name in packages.dtype.names or ():
         values = packages[name].reshape(len(packages), -1)
         if values.dtype.kind == "f":
-            good &= (np.abs(values) < MOST).all(axis=1)  # not so of NaN either
+            good &= (np.abs(values) < MAX_VALUE).all(axis=1)  # also False for NaN
     return good

@@ -1,4 +1,4 @@
-"""Options that a product may be set to, as far as its bytes state: what to try where nobody wrote them down."""
+"""Guess the options of a sensor from received bytes, for probing."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ GRIDS = {
     256: (16, 16),
     512: (16, 32),
     1024: (32, 32),
-}  # taxels to rows and columns of boards that are known
-LEAST_TAXELS = 64  # smallest unknown board: many others mark their frames with the same two bytes
-LEAST_DEGC, MOST_DEGC = -40.0, 85.0  # operating range of the magnetometers of an AnySkin
-MOST_TRIED = 3  # distances between marks, the commonest first
+}  # rows and columns of known boards, by number of taxels
+MIN_TAXELS = 64  # smallest unknown board, because many other devices use the same two marker bytes
+MIN_DEGC, MAX_DEGC = -40.0, 85.0  # operating range of the magnetometers of an AnySkin
+MAX_DISTANCES = 3  # number of distances between marks that are tried
 
 
-def of(kind: str, data: Chunks) -> list[Options]:
-    """Return the options to try for a sensor of this registered name on these bytes, the likeliest first.
+def guess_options(kind: str, data: Chunks) -> list[Options]:
+    """Return the options to try for the sensor with the registered name ``kind``, most likely first.
 
-    >>> of("justfloat", Chunks.of([(0, (bytes(12) + bytes.fromhex("0000807f")) * 5)]))
+    >>> guess_options("justfloat", Chunks.from_pairs([(0, (bytes(12) + bytes.fromhex("0000807f")) * 5)]))
     [{'channels': 3}, {'model': 'fulai-3.0'}, {'model': 'fulai-3.1'}, {'model': 'fulai-3.2'}]
-    >>> of("biotac", Chunks.of([]))
+    >>> guess_options("biotac", Chunks.from_pairs([]))
     [{}]
     """
-    if kind == "lines":  # arrivals state more than bytes: the rate, and which number is a clock
-        return lines_guess.of(data)
+    if kind == "lines":  # needs arrival times for the rate and to find the clock
+        return lines_guess.guess_options(data)
     if kind == "lsl":
-        return lsl.options(data)
+        return lsl.guess_options(data)
     if kind == "camera":
         return camera.options(data)
     return VARIANTS[kind](data.data) if kind in VARIANTS else [{}]
 
 
 def distances(data: bytes, mark: bytes) -> list[int]:
-    """Return how many bytes a mark mostly comes after the one before, the commonest first.
+    """Return the most common distances in bytes between consecutive marks, most common first.
 
     >>> distances(b"ab__ab__ab_ab__", b"ab")
     [4, 3]
     """
-    places, mark_at = [], data.find(mark)
+    offsets, mark_at = [], data.find(mark)
     while mark_at >= 0:
-        places.append(mark_at)
+        offsets.append(mark_at)
         mark_at = data.find(mark, mark_at + 1)
-    counted = Counter(after - before for before, after in itertools.pairwise(places))
-    return [distance for distance, _ in counted.most_common(MOST_TRIED)]
+    counts = Counter(after - before for before, after in itertools.pairwise(offsets))
+    return [distance for distance, _ in counts.most_common(MAX_DISTANCES)]
 
 
 def _flexitac(data: bytes) -> list[Options]:
-    taxels = [distance - 2 for distance in distances(data, b"\xaa\x55") if distance - 2 >= LEAST_TAXELS]
+    taxels = [distance - 2 for distance in distances(data, b"\xaa\x55") if distance - 2 >= MIN_TAXELS]
     grids = [GRIDS.get(count, (1, count)) for count in taxels]
     return [{"rows": rows, "columns": columns} for rows, columns in grids] or [{}]
 
@@ -69,10 +69,10 @@ def _anyskin(data: bytes) -> list[Options]:
 
 
 def _has_temperatures(words: Sequence[bytes]) -> bool:
-    """Return whether every fourth word can be the temperature of a chip in degrees, as AnySkin sends it with decimals."""
+    """Return whether every fourth word is a plausible temperature in °C with decimals, as in lines of AnySkin."""
     try:
         return len(words) % 4 == 0 < len(words) and all(
-            b"." in word and LEAST_DEGC <= float(word) <= MOST_DEGC for word in words[::4]
+            b"." in word and MIN_DEGC <= float(word) <= MAX_DEGC for word in words[::4]
         )
     except ValueError:
         return False
@@ -84,7 +84,7 @@ def _justfloat(data: bytes) -> list[Options]:
     return plain + [{"model": model} for model in ("fulai-3.0", "fulai-3.1", "fulai-3.2")]
 
 
-def _several(name: str, *values: OptionValue) -> Callable[[bytes], list[Options]]:
+def _choices(name: str, *values: OptionValue) -> Callable[[bytes], list[Options]]:
     return lambda _: [{name: value} for value in values]
 
 
@@ -92,7 +92,7 @@ VARIANTS: Mapping[str, Callable[[bytes], list[Options]]] = {
     "anyskin": _anyskin,
     "flexitac": _flexitac,
     "justfloat": _justfloat,
-    "optoforce": _several("axes", 6, 3, 12),
-    "robotiq": _several("fingers", 2, 1),
-    "xela": _several("taxels", 16, 24, 30),
+    "optoforce": _choices("axes", 6, 3, 12),
+    "robotiq": _choices("fingers", 2, 1),
+    "xela": _choices("taxels", 16, 24, 30),
 }

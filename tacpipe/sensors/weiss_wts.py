@@ -1,16 +1,16 @@
 """Weiss Robotics WTS tactile sensors: a matrix of pressure cells over USB.
 
-Every message, both ways, is ``AA AA AA``, a number, the size of what it states (uint16), that, and a check sum (uint16), all
-little-endian. The sum is taken over the whole message with `crc16_wts`, which no standard knows. Frames are messages of
-number 0: the time (uint32, 10 µs), flags, and the cells row by row, uint16 each. With flag bit 0 the cells are run-length
-coded: of each word the upper 4 bits state how many cells in a row have the value of the lower 12. A reply has the number of
-the command and begins with an error code (uint16, 0: done).
+Messages in both directions are ``AA AA AA``, a number, the size of the payload (uint16), the payload, and a checksum
+(uint16), little-endian. The checksum covers the full message and is computed by `crc16_wts`, which is not a standard CRC.
+Frames are messages with number 0: the time (uint32, 10 µs), flags, and the cells row by row (uint16). If flag bit 0 is set,
+the cells are run-length encoded: the upper 4 bits of each word are the number of consecutive cells with the value of the
+lower 12 bits. A reply has the number of its command and starts with an error code (uint16, 0: no error).
 
-Source: wts_driver (GPL-3) for messages, numbers and sum; its example ``AA AA AA 06 01 00 FF 2A 87`` is checked in the
-tests. The word of the run-length code, the reply of the matrix information and the byte of the tare have no public
-source that was at hand, and were checked against no device.
+Source: wts_driver (GPL-3) for messages, numbers and checksum; the tests verify its example ``AA AA AA 06 01 00 FF 2A
+87``. No public source was available for run lengths, the matrix information and the tare byte, and they were not tested
+with a device.
 
-The time goes round after 11.9 hours.
+The time wraps after 11.9 hours.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, grid
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, grid_fields
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,9 +35,9 @@ MARKER = b"\xaa\xaa\xaa"
 HEADER = 6  # marker, number, size
 FRAME, START, STOP, TARE, MATRIX = 0x00, 0x21, 0x22, 0x23, 0x30
 TICK_NS = 10_000  # tick of the sensor's clock
-CELLS_AT = HEADER + 5  # place of the cells, after time and flags
+CELLS_AT = HEADER + 5  # offset of the cells, after time and flags
 RUN_LENGTH = 0x01  # flag
-LONGEST_RUN, HIGHEST = 15, 0x0FFF  # limits of 4 and 12 bits
+MAX_RUN, VALUE_MASK = 15, 0x0FFF  # 4 and 12 bits
 
 
 @dataclass(frozen=True)
@@ -47,44 +47,42 @@ class WeissWts(Sensor):
     summary: ClassVar[str] = "Weiss Robotics WTS tactile sensors over USB."
     device_wrap_ns: ClassVar[int | None] = TICK_NS << 32  # 11.9 hours
 
-    rows: int = 14  # rows of the matrix, which is 14 by 6 in a WTS 0614
+    rows: int = 14  # rows of the matrix; a WTS 0614 has 14 rows and 6 columns
     columns: int = 6  # columns of the matrix
-    compress: bool = True  # ask for run-length coded frames
-    rate_hz: float = 100.0  # frames a second: 1000 divided by whole milliseconds
-    baud: int = 115200  # over USB any
+    compress: bool = True  # request run-length encoded frames
+    rate_hz: float = 100.0  # frames per second: 1000 divided by whole milliseconds
+    baud: int = 115200  # baud rate; any rate works over USB
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
-            raise UsageError(
-                f"weiss-wts: {self.rows} rows of {self.columns} columns are not a matrix; both must be 1 or more."
-            )
+            raise UsageError(f"weiss-wts: rows is {self.rows} and columns is {self.columns}; both must be 1 or more.")
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - self.delay_ms) > 0.01:
             raise UsageError(
-                f"weiss-wts: rate_hz is {self.rate_hz:g}; it must be 1000 divided by whole milliseconds, as 100, 50 or 25."
+                f"weiss-wts: rate_hz is {self.rate_hz:g}; it must be 1000 divided by whole ms, such as 100, 50 or 25."
             )
 
     @property
     def cells(self) -> int:
-        """How many cells the matrix has."""
+        """The number of cells."""
         return self.rows * self.columns
 
     @property
     def delay_ms(self) -> int:
-        """How long the sensor waits from one frame to the next."""
+        """The period of frames in ms."""
         return round(1000 / self.rate_hz)
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01``, … row by row, uint16 counts."""
         import pyarrow as pa
 
-        return grid(self.rows, self.columns, pa.uint16(), "count")
+        return grid_fields(self.rows, self.columns, pa.uint16(), "count")
 
     def framer(self) -> Framer:
-        """Return a framer of messages with their sum; those that are frames must have all cells of the matrix."""
+        """Return a framer for messages with the right checksum; frames must have all cells of the matrix."""
         largest = max(CELLS_AT + 2 * self.cells + 2, 256)
-        return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, most=largest, check=self._is_whole))
+        return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, max_size=largest, check=self._are_valid))
 
-    def _is_whole(self, frames: Bytes) -> Bools:
+    def _are_valid(self, frames: Bytes) -> Bools:
         is_valid: Bools = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
         rows = np.flatnonzero(is_valid & (frames[:, 3] == FRAME))
         if len(rows):
@@ -92,7 +90,7 @@ class WeissWts(Sensor):
         return is_valid
 
     def _cell_counts(self, frames: Bytes) -> Int64s:
-        """Return how many cells each frame has; -1 where it is too short for any."""
+        """Return the number of cells of each frame (frame,); -1 if it is too short."""
         size = frames.shape[1] - CELLS_AT - 2
         if size < 2 or size % 2:
             return np.full(len(frames), -1)
@@ -102,24 +100,24 @@ class WeissWts(Sensor):
         return cells
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return the cells (sample, cell) with the sensor's time; replies are left out."""
+        """Return the cells (sample, cell) with the sensor's time. Replies are skipped."""
         rows = np.flatnonzero(frames[:, 3] == FRAME)
         cells = np.zeros((len(rows), self.cells), dtype=np.uint16)
         if not len(rows):
             return Samples((cells,), t_device_ns=rows, rows=rows)
         frames = frames[rows]
         ticks = np.ascontiguousarray(frames[:, HEADER : HEADER + 4]).view("<u4")[:, 0]
-        coded = (frames[:, HEADER + 4] & RUN_LENGTH).astype(bool)
+        is_run_length = (frames[:, HEADER + 4] & RUN_LENGTH).astype(bool)
         words = _words(frames)
-        if not coded.all():
-            cells[~coded] = words[~coded]
-        packed = words[coded]
-        cells[coded] = np.repeat((packed & HIGHEST).ravel(), (packed >> 12).ravel()).reshape(-1, self.cells)
+        if not is_run_length.all():
+            cells[~is_run_length] = words[~is_run_length]
+        packed = words[is_run_length]
+        cells[is_run_length] = np.repeat((packed & VALUE_MASK).ravel(), (packed >> 12).ravel()).reshape(-1, self.cells)
         return Samples((cells,), t_device_ns=ticks.astype(np.int64) * TICK_NS, rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return the frames of these samples, run-length coded of several sizes; a cell above 4095 saturates."""
-        cells = np.minimum(samples.values[0], HIGHEST)
+        """Return the frames of these samples, run-length encoded ones of different sizes. Cells above 4095 are clipped."""
+        cells = np.minimum(samples.values[0], VALUE_MASK)
         assert samples.t_device_ns is not None
         ticks = (samples.t_device_ns // TICK_NS % (1 << 32)).tolist()
         flag = bytes([RUN_LENGTH if self.compress else 0])
@@ -134,37 +132,37 @@ class WeissWts(Sensor):
         ]
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Stop what still streams, compare the matrix with the options, start frames.
+        """Stop an earlier stream, check the size of the matrix, and start frames.
 
-        Raises `DeviceError` where the sensor has another matrix, or states no.
+        Raises `DeviceError` if the matrix differs from the options, or the sensor refuses.
         """
-        yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
-        reply = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
+        yield Ask(message(STOP), until=_reply_finder(STOP, refusable=True), what="the reply to stop")
+        reply = yield Ask(message(MATRIX), until=_reply_finder(MATRIX), what="the matrix information")
         payload = reply[HEADER:-2]
         columns, rows = (int.from_bytes(payload[start : start + 2], "little") for start in (2, 4))
         if (rows, columns) != (self.rows, self.columns):
             raise DeviceError(
-                f"The WTS has {rows} rows of {columns} columns and the options state {self.rows} of {self.columns}; "
+                f"The WTS has {rows} rows and {columns} columns, but the options declare {self.rows} and {self.columns}; "
                 f"set rows = {rows} and columns = {columns}."
             )
         start = bytes([RUN_LENGTH if self.compress else 0]) + self.delay_ms.to_bytes(2, "little")
-        yield Ask(message(START, start), until=_reply(START), what="the reply to start")
+        yield Ask(message(START, start), until=_reply_finder(START), what="the reply to start")
 
     def closing(self) -> bytes:
         """Stop the frames."""
         return message(STOP)
 
     def taring(self) -> Dialogue:
-        """Take the present pressure for zero."""
-        yield Ask(message(TARE, b"\x01"), until=_reply(TARE), what="the reply to tare")
+        """Zero the pressure."""
+        yield Ask(message(TARE, b"\x01"), until=_reply_finder(TARE), what="the reply to tare")
 
     def device(self) -> Device:
-        """Return a sensor with this matrix that waits for the start."""
+        """Return an emulated sensor with this matrix that waits for the start command."""
         return _Wts(self)
 
 
 class _Wts(Device):
-    """The sensor's side: each command is answered with its number and an error code."""
+    """An emulated sensor, which answers each command with its number and an error code."""
 
     def __init__(self, sensor: WeissWts) -> None:
         super().__init__(streaming=False)
@@ -174,14 +172,14 @@ class _Wts(Device):
         self.heard += data
         replies, stop = [], 0
         for number, stop, payload in messages(bytes(self.heard)):  # noqa: B007
-            replies.append(message(number, self._done(number, payload)))
+            replies.append(message(number, self._execute(number, payload)))
         del self.heard[:stop]
         return replies
 
-    def _done(self, number: int, payload: bytes) -> bytes:
+    def _execute(self, number: int, payload: bytes) -> bytes:
         accepted, unknown = b"\x00\x00", b"\x0e\x00"
         if number == MATRIX:
-            sizes = (self.sensor.columns, self.sensor.rows, 340, 340, HIGHEST)  # cells are 3.4 mm wide, in 1/100 mm
+            sizes = (self.sensor.columns, self.sensor.rows, 340, 340, VALUE_MASK)  # cells are 3.4 mm wide, in 1/100 mm
             return accepted + b"".join(size.to_bytes(2, "little") for size in sizes)
         if number == START and len(payload) == 3:
             self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(payload[1:], "little"))
@@ -193,7 +191,7 @@ class _Wts(Device):
 
 
 def message(number: int, payload: bytes = b"") -> bytes:
-    r"""Return a message, to the sensor or from it.
+    r"""Return a message to or from the sensor.
 
     >>> message(0x06, b"\xff").hex(" ")
     'aa aa aa 06 01 00 ff 2a 87'
@@ -203,7 +201,7 @@ def message(number: int, payload: bytes = b"") -> bytes:
 
 
 def messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yield number, end and content of each whole message in ``data`` whose sum is right."""
+    """Yield (number, end offset, payload) of each complete message in ``data`` with the right checksum."""
     start = data.find(MARKER)
     while start >= 0 and len(data) >= start + HEADER:
         size = int.from_bytes(data[start + 4 : start + 6], "little")
@@ -215,23 +213,23 @@ def messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def run_lengths(cells: Counts) -> Counts:
-    """Return cells (cell,) as words of run lengths: no run is longer than 15.
+    """Return cells (cell,) as run-length encoded words, with runs of at most 15 cells.
 
     >>> [hex(word) for word in run_lengths(np.array([0] * 17 + [7], dtype=np.uint16))]
     ['0xf000', '0x2000', '0x1007']
     """
     starts = np.flatnonzero(np.diff(cells, prepend=cells[0] ^ 1))
     lengths = np.diff(starts, append=len(cells))
-    pieces = -(-lengths // LONGEST_RUN)  # words that each run takes
-    counts = np.full(pieces.sum(), LONGEST_RUN)
-    counts[np.cumsum(pieces) - 1] = lengths - LONGEST_RUN * (pieces - 1)
+    pieces = -(-lengths // MAX_RUN)  # words per run
+    counts = np.full(pieces.sum(), MAX_RUN)
+    counts[np.cumsum(pieces) - 1] = lengths - MAX_RUN * (pieces - 1)
     return (counts << 12 | np.repeat(cells[starts], pieces)).astype(np.uint16)
 
 
-def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return what finds the reply among frames."""
+def _reply_finder(number: int, *, refusable: bool = False) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return a function that finds the reply among frames."""
 
-    def until(data: bytes) -> int | tuple[int, int]:
+    def find(data: bytes) -> int | tuple[int, int]:
         for packet, stop, payload in messages(data):
             if packet == number:
                 code = int.from_bytes(payload[:2], "little")
@@ -242,7 +240,7 @@ def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int | t
                 return stop - HEADER - len(payload) - 2, stop
         return 0
 
-    return until
+    return find
 
 
 def _words(frames: Bytes) -> Counts:

@@ -1,9 +1,9 @@
-"""XELA uSkin behind the XELA Server: a websocket that sends a JSON text for each reading of all sensors.
+"""XELA uSkin behind the XELA Server: a websocket that sends one JSON message per reading of all sensors.
 
 ``{"message": 17, "time": 1763.2, "1": {"sensor": "1", "time": 1763.2, "taxels": 16, "data": "7FA1,81C0,…", "calibrated":
-[…]}, "2": {…}}``: ``message`` counts, keys that are numbers are sensors, ``data`` is three hexadecimal counts a taxel, x, y,
-z, and ``calibrated``, where the server has a calibration, three newtons a taxel. The first text after a connection states
-Welcome for its ``message`` and holds no reading. Source: the vendor's ROS node xela_server_ros 1.7.6, as read.
+[…]}, "2": {…}}``. ``message`` is a counter; numeric keys are sensors; ``data`` has three hexadecimal counts per taxel (x, y,
+z); ``calibrated`` has three forces in N per taxel, if the server has a calibration. The first message after connecting has
+Welcome as its ``message`` and no reading. Source: the vendor's ROS node xela_server_ros 1.7.6.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 COUNT = "[0-9a-fA-F]{1,4}"
-DIGITS = 4  # hexadecimal, of a count with leading zeros
-WELCOME = b'{"message": "Welcome"}'  # a server's first text, as short as one may be
-LATEST_S = 4e9  # a time beyond the year 2096 is none
+DIGITS = 4  # hexadecimal digits of a count with leading zeros
+WELCOME = b'{"message": "Welcome"}'  # the shortest first message of a server
+MAX_TIME_S = 4e9  # the year 2096; later times are invalid
 
 
 @dataclass(frozen=True)
 class Xela(Sensor):
     """One uSkin of a XELA Server.
 
-    The server stamps a reading when it took it off the sensor's bus, before the websocket delays it. This is the clock of
-    the computer that it runs on, to the microsecond, so it is kept as the device's time.
+    The server stamps a reading when it reads the sensor's bus, before the delay of the websocket. The timestamp, on the
+    clock of the server's computer in µs, is therefore stored as the device's time.
     """
 
     summary: ClassVar[str] = "XELA uSkin tactile sensors behind the XELA Server's websocket."
     product: ClassVar[str] = "xela-uskin"
     links: ClassVar[tuple[str, ...]] = ("ws",)
-    counter: ClassVar[int | None] = 1 << 53  # the server's count has no end; JSON numbers are exact up to here
+    counter: ClassVar[int | None] = 1 << 53  # the counter does not wrap; JSON numbers are exact up to this value
 
-    sensor: int = 1  # number of the sensor at the server
-    taxels: int = 16  # number of taxels: 16 of a 4x4, 24 of a 4x6, 30 of a curved fingertip
-    forces: bool = False  # keep calibrated forces next to the counts; needs the server's calibration
-    rate_hz: float = 100.0  # rate of the server
+    sensor: int = 1  # number of the sensor on the server
+    taxels: int = 16  # number of taxels: 16 (4x4), 24 (4x6) or 30 (curved fingertip)
+    forces: bool = False  # record calibrated forces in addition to counts; needs a calibration on the server
+    rate_hz: float = 100.0  # readings per second of the server
 
     def __post_init__(self) -> None:
         if self.sensor < 1 or not 1 <= self.taxels <= 99:
             raise UsageError(
-                f"xela: sensor is {self.sensor} and taxels {self.taxels}; sensors count from 1, taxels are 1 to 99."
+                f"xela: sensor is {self.sensor} and taxels {self.taxels}; sensor must be at least 1, taxels 1 to 99."
             )
 
     def fields(self) -> list[pa.Field]:
-        """Return ``taxel01_x``, …, uint16 counts, and with ``forces`` ``taxel01_force_x_n``, …, float32 newtons."""
+        """Return ``taxel01_x``, … (uint16 counts), and with ``forces`` also ``taxel01_force_x_n``, … (float32, N)."""
         import pyarrow as pa
 
         from tacpipe.channels import schema
@@ -78,13 +78,13 @@ class Xela(Sensor):
         ]
 
     def framer(self) -> Framer:
-        """Return a framer that takes the server's texts, those without this sensor too, and no other."""
-        return TextFramer(self._is_right, check_all=self._are_right)
+        """Return a framer for the server's messages, with or without this sensor."""
+        return TextFramer(self._is_valid, check_all=self._are_valid)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return counts and forces; NaN where the server sent no forces."""
-        texts = _parsed(tuple(frames))
-        assert texts is not None, "the framer gives JSON alone"
+        """Return counts and forces. Forces are NaN if the server did not send them."""
+        texts = _parse(tuple(frames))
+        assert texts is not None, "the framer accepts only JSON"
         key = str(self.sensor)
         rows = [row for row, text in enumerate(texts) if key in text]
         readings = [texts[row][key] for row in rows]
@@ -102,7 +102,7 @@ class Xela(Sensor):
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return the server's texts that hold these samples, of this sensor alone."""
+        """Return the server's messages with these samples of only this sensor."""
         assert samples.seq is not None and samples.t_device_ns is not None
         forces = samples.values[1].tolist() if self.forces else [None] * len(samples)
         return [
@@ -112,23 +112,23 @@ class Xela(Sensor):
             )
         ]
 
-    def _is_right(self, packet: bytes) -> bool:
-        return self._are_right([packet])
+    def _is_valid(self, packet: bytes) -> bool:
+        return self._are_valid([packet])
 
-    def _are_right(self, packets: Sequence[bytes]) -> bool:
-        texts = _parsed(tuple(packets))
-        return texts is not None and all(map(self._is_servers, texts))
+    def _are_valid(self, packets: Sequence[bytes]) -> bool:
+        texts = _parse(tuple(packets))
+        return texts is not None and all(map(self._is_message, texts))
 
-    def _is_servers(self, text: Any) -> bool:
-        """Return whether a text is the server's: with what this sensor's part must have, or without this sensor."""
+    def _is_message(self, text: Any) -> bool:
+        """Return whether a message is from a server, and contains a valid reading of this sensor or none."""
         if not isinstance(text, dict) or "message" not in text:
             return False
         reading = text.get(str(self.sensor))
-        return reading is None or (_is_count(text["message"]) and self._holds(reading))
+        return reading is None or (_is_count(text["message"]) and self._is_reading(reading))
 
-    def _holds(self, reading: Any) -> bool:
-        """Return whether a sensor's part of a text has a time, a count a taxel and axis, and as many forces or none."""
-        if not isinstance(reading, dict) or not _is_finite(reading.get("time")) or abs(reading["time"]) > LATEST_S:
+    def _is_reading(self, reading: Any) -> bool:
+        """Return whether a reading has a time, one count per taxel and axis, and as many forces or none."""
+        if not isinstance(reading, dict) or not _is_finite(reading.get("time")) or abs(reading["time"]) > MAX_TIME_S:
             return False
         data, forces = reading.get("data"), reading.get("calibrated")
         if not isinstance(data, str) or not _are_counts(data, 3 * self.taxels):
@@ -136,40 +136,40 @@ class Xela(Sensor):
         return not forces or (isinstance(forces, list) and len(forces) == 3 * self.taxels and _are_finite(forces))
 
 
-@functools.lru_cache(maxsize=4)  # kept between the framer's look at them and their decoding
-def _parsed(packets: tuple[bytes, ...]) -> list[Any] | None:
-    """Return what texts hold; None where one is not JSON."""
+@functools.lru_cache(maxsize=4)  # the framer and the decoder parse the same messages
+def _parse(packets: tuple[bytes, ...]) -> list[Any] | None:
+    """Return the parsed messages, or None if one is not JSON."""
     try:
-        return [json.loads(_decoded(packet)) for packet in packets]
+        return [json.loads(_decode(packet)) for packet in packets]
     except (ValueError, RecursionError):
         return None
 
 
-def _decoded(packet: bytes) -> bytes | str:
-    """Return a text as `json.loads` would decode it, which takes longer to find that it is UTF-8."""
+def _decode(packet: bytes) -> bytes | str:
+    """Decode a message like `json.loads`, but without its slower detection of the encoding."""
     return packet.decode("utf-8", "surrogatepass") if packet.startswith(b'{"') else packet
 
 
 def _are_counts(data: str, width: int) -> bool:
-    """Return whether a text is a list of so many hexadecimal counts; at once where all have four digits."""
+    """Return whether a text is a list of ``width`` hexadecimal counts. Counts with four digits are checked at once."""
     if len(data) == width * (DIGITS + 1) - 1 and data[DIGITS :: DIGITS + 1] == "," * (width - 1):
         try:
-            return len(_of_digits(data)) == 2 * width
+            return len(_unhexlify(data)) == 2 * width
         except ValueError:
             return False
-    return _list_of(width).fullmatch(data) is not None
+    return _list_pattern(width).fullmatch(data) is not None
 
 
-def _of_digits(data: str) -> bytes:
-    """Return the bytes of a list of hexadecimal numbers; raises `ValueError` where it is none."""
+def _unhexlify(data: str) -> bytes:
+    """Return the bytes of a list of hexadecimal numbers. Raises `ValueError` if it is invalid."""
     return binascii.unhexlify(data.encode().translate(None, b","))
 
 
 def _counts(texts: Sequence[str], width: int) -> Counts:
-    """Return the counts (sample, channel) of lists of hexadecimal numbers; at once where all have four digits."""
+    """Return the counts (sample, channel) of lists of hexadecimal numbers. Counts with four digits are parsed at once."""
     joined = ",".join(texts)
     if len(joined) == len(texts) * width * (DIGITS + 1) - 1:  # the largest possible length
-        counts = np.frombuffer(_of_digits(joined), dtype=">u2").astype(np.uint16)
+        counts = np.frombuffer(_unhexlify(joined), dtype=">u2").astype(np.uint16)
     else:
         counts = np.array([int(count, 16) for count in joined.split(",") if count], dtype=np.uint16)
     return counts.reshape(len(texts), width)
@@ -189,13 +189,13 @@ def _text(
 
 
 @functools.cache
-def _list_of(width: int) -> re.Pattern[str]:
-    """Return what a list of so many hexadecimal counts looks like."""
+def _list_pattern(width: int) -> re.Pattern[str]:
+    """Return the pattern of a list of ``width`` hexadecimal counts."""
     return re.compile(rf"(?:{COUNT},){{{width - 1}}}{COUNT}")
 
 
 def _are_finite(values: Sequence[Any]) -> bool:
-    """Return whether a list holds numbers alone, and finite ones: their sum states."""
+    """Return whether a list contains only finite numbers. Their sum is then finite."""
     try:
         return math.isfinite(sum(values))
     except (TypeError, OverflowError):

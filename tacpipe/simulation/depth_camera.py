@@ -1,8 +1,8 @@
-"""A depth camera that looks down on a table: which points of bodies it sees, how exactly, and in what colours.
+"""Simulate a depth camera above a table: the visible points of bodies, with depth noise and colours.
 
-The camera's frame: x to the right of the image, y down, z along the optical axis. Its rays run through the pixels of an
-Intel RealSense D415 at 640 x 480. Depth is noisy, the more the farther: 1.5 mm at 1 m, growing with the square, as
-stereo errors do. Colours are random and state nothing of the object.
+In the camera frame, x points right in the image, y down, and z along the optical axis. The rays are those of the pixels
+of an Intel RealSense D415 at 640 x 480. Depth noise is 1.5 mm at 1 m and increases with the square of the distance, as
+for stereo. Colours are random and independent of the object.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from tacpipe.simulation.bodies import Rest, Shape
 WIDTH, HEIGHT, FOCAL = 640, 480, 615.0  # pixels
 DEPTH_NOISE_M = 0.0015  # standard deviation at 1 m
 COLOUR_NOISE = 6.0  # standard deviation, of 255
-RIPPLES = 3  # waves in a texture
-WAVE_M = (0.01, 0.08)  # their lengths
+RIPPLES = 3  # number of waves in a texture
+WAVE_M = (0.01, 0.08)  # range of their wavelengths
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A body in the camera's frame: the rotation from its own frame (3, 3), and where its origin is (xyz), metres."""
+    """A body in the camera frame: the rotation from its own frame (3, 3), and the position of its origin (xyz) in metres."""
 
     shape: Shape
     rotation: Floats
     origin_m: Floats
 
-    def inward(self, at_m: Floats) -> Floats:
-        """Return points of the camera's frame in the body's (point, xyz), metres."""
+    def to_body_frame(self, at_m: Floats) -> Floats:
+        """Transform points (point, xyz) in metres from the camera frame to the body frame."""
         return np.asarray((at_m - self.origin_m) @ self.rotation)
 
     def hit(self, origin_m: Floats, direction: Floats) -> Floats:
-        """Return how far along each ray of the camera's frame the body is first met (ray,); inf where never."""
-        return self.shape.hit(self.inward(origin_m), direction @ self.rotation)
+        """Return the distance of the first intersection of rays in the camera frame (ray,); inf if there is none."""
+        return self.shape.hit(self.to_body_frame(origin_m), direction @ self.rotation)
 
     def normal(self, at_m: Floats) -> Floats:
         """Return the outward unit normals at points of the surface (point, xyz)."""
-        return np.asarray(self.shape.normal(self.inward(at_m)) @ self.rotation.T)
+        return np.asarray(self.shape.normal(self.to_body_frame(at_m)) @ self.rotation.T)
 
     def bending(self, at_m: Floats) -> Floats:
-        """Return the matrices of the normal curvatures (point, xyz, xyz), 1/m."""
-        return np.asarray(self.rotation @ self.shape.bending(self.inward(at_m)) @ self.rotation.T)
+        """Return the curvature matrices (point, xyz, xyz) in 1/m."""
+        return np.asarray(self.rotation @ self.shape.bending(self.to_body_frame(at_m)) @ self.rotation.T)
 
 
-def camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: float) -> tuple[Floats, float]:
-    """Return the table's upward normal in the camera's frame (xyz) and how far it is along the optical axis, metres.
+def sample_camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: float) -> tuple[Floats, float]:
+    """Return the table's upward normal in the camera frame (xyz), and its distance along the optical axis in metres.
 
-    The camera looks straight down but for a tilt of up to ``tilt_rad``.
+    The camera looks straight down, with a random tilt of up to ``tilt_rad``.
     """
     tilt, turn = tilt_rad * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     up = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
@@ -63,9 +63,9 @@ def camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: fl
 def place_shape(
     shape: Shape, pose: Rest, yaw_rad: float, at_m: tuple[float, float], up: Floats, height_m: float
 ) -> Placed:
-    """Return a body lying on the table as ``pose`` states, turned by ``yaw_rad`` about the vertical.
+    """Return a body on the table in a stable ``pose``, rotated by ``yaw_rad`` around the vertical.
 
-    ``at_m`` is where the camera sees its origin: x and y on the optical axis' plane at ``height_m``, metres.
+    ``at_m`` is the apparent position of its origin in metres: x and y in the plane at ``height_m`` on the optical axis.
     """
     ray = np.array([*at_m, height_m]) / height_m
     ground = ray * height_m * up[2] / (ray @ up)
@@ -75,7 +75,7 @@ def place_shape(
 
 
 def rays(rows: range, columns: range) -> Floats:
-    """Return the directions of a window of pixels (ray, xyz), row by row, each one metre deep."""
+    """Return the ray directions of a window of pixels (ray, xyz), row by row, with a depth of 1 m."""
     y, x = np.meshgrid(rows, columns, indexing="ij")
     return (
         np.column_stack([(x.ravel() - WIDTH / 2 + 0.5), (y.ravel() - HEIGHT / 2 + 0.5), np.full(x.size, FOCAL)]) / FOCAL
@@ -83,7 +83,7 @@ def rays(rows: range, columns: range) -> Floats:
 
 
 def window(placed: Placed) -> tuple[range, range]:
-    """Return the rows and columns of the pixels that may see a body: those about its bounding sphere."""
+    """Return the rows and columns of the pixels that may see a body, from its bounding sphere."""
     x, y, z = placed.origin_m
     reach = placed.shape.bound_m / (z - placed.shape.bound_m) * FOCAL * 1.1
 
@@ -94,22 +94,22 @@ def window(placed: Placed) -> tuple[range, range]:
     return clip_range(y / z, HEIGHT), clip_range(x / z, WIDTH)
 
 
-def depths(placed: Placed) -> tuple[Floats, Floats]:
-    """Return the directions of the rays that meet a body (ray, xyz), one metre deep, and how deep they do (ray,), metres."""
-    through = rays(*window(placed))
-    deep = placed.hit(np.zeros((1, 3)), through)
-    met = np.isfinite(deep)
-    return through[met], deep[met]
+def visible_rays(placed: Placed) -> tuple[Floats, Floats]:
+    """Return the directions (ray, xyz), with a depth of 1 m, and depths (ray,) in metres of the rays that reach a body."""
+    direction = rays(*window(placed))
+    depth = placed.hit(np.zeros((1, 3)), direction)
+    is_visible = np.isfinite(depth)
+    return direction[is_visible], depth[is_visible]
 
 
-def measured(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
-    """Return the points that the camera gives (point, xyz), metres: true ones, shifted along their rays by noise."""
+def noisy_points(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
+    """Return the measured points (point, xyz) in metres: the true points, shifted along their rays by noise."""
     noise = noise_scale * DEPTH_NOISE_M * depth_m**2 * rng.normal(size=len(depth_m))
     return (direction * (depth_m + noise)[:, None]).astype(np.float32)
 
 
-def painted(own_m: Floats, rng: np.random.Generator) -> Bytes:
-    """Return colours (point, rgb) of points in a body's own frame: a random colour, random waves of others, and noise."""
+def random_colours(own_m: Floats, rng: np.random.Generator) -> Bytes:
+    """Return random colours (point, rgb) of points in the body frame: a base colour, waves of other colours, and noise."""
     colours = np.tile(rng.uniform(50, 205, 3), (len(own_m), 1))
     for _ in range(RIPPLES):
         along = rng.normal(size=3)
@@ -120,7 +120,7 @@ def painted(own_m: Floats, rng: np.random.Generator) -> Bytes:
 
 
 def _basis(third: Floats) -> Floats:
-    """Return a right-handed basis (component, axis) whose third axis is given."""
+    """Return a right-handed basis (component, axis) with the given third axis."""
     helper = np.eye(3)[int(np.argmin(np.abs(third)))]
     first = np.cross(helper, third)
     first /= np.linalg.norm(first)
@@ -128,15 +128,15 @@ def _basis(third: Floats) -> Floats:
 
 
 TABLE, OBJECT, CLUTTER = 0, 1, 2
-GAP_M = (0.04, 0.10)  # gap between the bounding spheres of the two bodies
-SIDES = 60  # number of directions tried for the other body
+GAP_M = (0.04, 0.10)  # range of the gap between the bounding spheres of the two bodies
+SIDES = 60  # number of positions tried for the other body
 HALF_M = (0.45, 0.35)  # half the table's edges along x and y
-EDGE_PX = 10  # margin of the other body to the edge of the image
+EDGE_PX = 10  # smallest distance of the other body from the edge of the image
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """All points that the camera gives, and what each lies on: the table, the object or clutter (point,)."""
+    """A cloud, and the surface of each of its points (point,): table, object or clutter."""
 
     cloud: Cloud
     surface: NDArray[np.int8]
@@ -145,42 +145,42 @@ class CameraView:
 def view(
     placed: Placed, neighbour: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
 ) -> CameraView:
-    """Return the camera's view of a body on the table, with a body ``neighbour`` set down next to it."""
-    through = rays(range(HEIGHT), range(WIDTH))
-    depth = _table(through, up, camera_m)
+    """Return the camera's view of a body on the table, with the body ``neighbour`` next to it."""
+    direction = rays(range(HEIGHT), range(WIDTH))
+    depth = _table_depth(direction, up, camera_m)
     surface = np.full(len(depth), TABLE, np.int8)
     bodies = [(OBJECT, placed), (CLUTTER, _place_neighbour(placed, neighbour, up, camera_m, rng))]
     for kind, body in bodies:
         rows, columns = window(body)
         pixels = (np.array(rows)[:, None] * WIDTH + np.array(columns)).ravel()
-        deep = body.hit(np.zeros((1, 3)), through[pixels])
-        nearer = deep < depth[pixels]
-        depth[pixels[nearer]] = deep[nearer]
+        body_depth = body.hit(np.zeros((1, 3)), direction[pixels])
+        nearer = body_depth < depth[pixels]
+        depth[pixels[nearer]] = body_depth[nearer]
         surface[pixels[nearer]] = kind
-    met = np.isfinite(depth)
-    through, depth, surface = through[met], depth[met], surface[met]
-    colours = painted(through * depth[:, None], rng)
+    is_visible = np.isfinite(depth)
+    direction, depth, surface = direction[is_visible], depth[is_visible], surface[is_visible]
+    colours = random_colours(direction * depth[:, None], rng)
     for kind, body in bodies:
         visible = surface == kind
-        colours[visible] = painted(body.inward(through[visible] * depth[visible, None]), rng)
-    return CameraView(Cloud(measured(through, depth, noise_scale, rng), colours), surface)
+        colours[visible] = random_colours(body.to_body_frame(direction[visible] * depth[visible, None]), rng)
+    return CameraView(Cloud(noisy_points(direction, depth, noise_scale, rng), colours), surface)
 
 
 def tables(view: CameraView) -> dict[str, pa.Table]:
-    """Return the stream ``scene``, and ``scene_truth`` with a row a point: 0 the table, 1 the object, 2 another one."""
+    """Return the streams ``scene`` and ``scene_truth``, which has one row per point: 0 table, 1 object, 2 clutter."""
     truth = pa.Table.from_arrays([pa.array(view.surface)], schema=pa.schema([schema.label_field("gt_surface")]))
     return {"scene": view.cloud.table(), "scene_truth": truth}
 
 
-def _table(through: Floats, up: Floats, camera_m: float) -> Floats:
-    """Return how deep rays meet the table (ray,), inf beyond its edges."""
-    depth = np.asarray(camera_m * up[2] / (through @ up))
-    off = np.abs(through[:, :2] * depth[:, None]) <= HALF_M
-    return np.where(off.all(axis=1) & (depth > 0), depth, np.inf)
+def _table_depth(direction: Floats, up: Floats, camera_m: float) -> Floats:
+    """Return the depths at which rays reach the table (ray,), or inf beyond its edges."""
+    depth = np.asarray(camera_m * up[2] / (direction @ up))
+    on_table = np.abs(direction[:, :2] * depth[:, None]) <= HALF_M
+    return np.where(on_table.all(axis=1) & (depth > 0), depth, np.inf)
 
 
 def _place_neighbour(placed: Placed, neighbour: Shape, up: Floats, camera_m: float, rng: np.random.Generator) -> Placed:
-    """Return a body put down next to another, where the camera sees all of it if there is such a place."""
+    """Return a body next to another one, fully visible if one of `SIDES` random positions allows it."""
     rests = neighbour.rests()
     pose = rests[int(rng.integers(len(rests)))]
     centre = placed.origin_m[:2] / placed.origin_m[2] * camera_m
@@ -190,7 +190,7 @@ def _place_neighbour(placed: Placed, neighbour: Shape, up: Floats, camera_m: flo
         x, y = centre + (placed.shape.bound_m + neighbour.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
         best = place_shape(neighbour, pose, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
         rows, columns = window(best)
-        visible = len(rows) and len(columns)  # it may lie next to the picture
+        visible = len(rows) and len(columns)  # it may be outside of the image
         if visible and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < HEIGHT:
             break
     assert best is not None

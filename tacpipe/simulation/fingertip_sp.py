@@ -1,9 +1,9 @@
-"""The fingertips of a simulated hand, middle finger and thumb: a BioTac SP each, and what it reads of a contact.
+"""Simulate the BioTac SP fingertips of a hand, middle finger and thumb, under contact.
 
-An electrode's impedance falls where the skin is pressed towards it and the fluid between gets thin, and rises where the
-fluid goes. The published tip positions are unrolled: an electrode lies at how far it is along the finger and how far
-around the core. Rest and noise are those of the untouched sensors of a published rig; how far electrodes fall and the
-pressure rises is an assumption, of the size of the readings under published grasps.
+An electrode's impedance decreases where the skin is pressed towards it and the fluid layer gets thin, and increases
+where the fluid moves. The published electrode positions are unrolled: distance along the finger, and distance around the
+core. Rest levels and noise are those of untouched sensors of a published rig. The changes of electrodes and pressure
+under load are assumptions with the magnitude of readings under published grasps.
 """
 
 from __future__ import annotations
@@ -15,20 +15,18 @@ import numpy as np
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import biotac_sp
 
-CHANNELS = (
-    biotac_sp.ELECTRODES + 1
-)  # channels of a finger that measure touch: the electrodes, then the fluid's pressure
-GAIN_COUNT = 2600.0  # decrease of an electrode under a contact that squeezes out all fluid
-FLUID_M = 0.0006  # indentation at which 1 - 1/e of that is reached
-BREADTH = 1.1  # sigma of the pressed region over the contact's radius
-BULGE = 0.35  # fraction of what pressed electrodes fall by that the others rise by
-REST_COUNT = (2400.0, 3480.0)  # noise of an electrode
-NOISE_COUNT = (3.5, 6.4)  # standard deviation of an electrode
+CHANNELS = biotac_sp.ELECTRODES + 1  # tactile channels of a finger: the electrodes, then the fluid pressure
+GAIN_COUNT = 2600.0  # decrease of an electrode if all fluid is squeezed out
+FLUID_M = 0.0006  # indentation at which 1 - 1/e of this is reached
+BREADTH = 1.1  # ratio of the pressed region's sigma to the contact radius
+BULGE = 0.35  # fraction of the decrease of pressed electrodes by which the others increase
+REST_COUNT = (2400.0, 3480.0)  # range of the rest level of an electrode
+NOISE_COUNT = (3.5, 6.4)  # range of the standard deviation of an electrode
 PRESSURE_NOISE_COUNT = (0.05, 0.25)
 PRESSURE_COUNT = (1676.0, 2779.0)  # untouched, by finger
 PRESSURE_COUNT_N = 140.0  # slope
 FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # bounds of the readings
-DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods in which a reading drifts
+DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods of the drift
 DAY_NS = 86_400_000_000_000
 OTHERS_COUNT = {
     "pac0": (2037, 2049),
@@ -37,12 +35,12 @@ OTHERS_COUNT = {
     "tdc": (2620, 2449),
 }  # values by finger
 OTHERS_NOISE_COUNT = {"pac0": 8.0, "pac1": 8.0, "tac": 10.0, "tdc": 6.0}
-VIBRATION_COUNT_S_N = 3.0  # PAC, by the rate at which the force changes
+VIBRATION_COUNT_S_N = 3.0  # PAC per rate of change of the force
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """Two sensors as they were made: rest and noise of their channels (finger, channel) and phases of their drift."""
+    """The properties of two sensors: rest levels and noise of their channels (finger, channel), and phases of the drift."""
 
     rest: Floats
     noise: Floats
@@ -50,7 +48,7 @@ class Sensors:
 
 
 def sensors(rng: np.random.Generator) -> Sensors:
-    """Return two sensors as ``rng`` draws them."""
+    """Return two random sensors."""
     fingers, electrodes = len(biotac_sp.FINGERS), biotac_sp.ELECTRODES
     rest_counts = np.column_stack([rng.uniform(*REST_COUNT, (fingers, electrodes)), PRESSURE_COUNT])
     noise = np.column_stack(
@@ -62,30 +60,30 @@ def sensors(rng: np.random.Generator) -> Sensors:
     return Sensors(rest_counts, noise, rng.uniform(0, 2 * np.pi, (len(DRIFT_DAYS), *rest_counts.shape)))
 
 
-def pressed(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
-    """Return by how many counts a contact changes electrodes (..., electrode).
+def electrode_change(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
+    """Return the change of electrodes by a contact (..., electrode) in counts.
 
-    ``contact_m`` is the contact's radius (...), ``skin_m`` by how much the skin gives way (...), ``centre_m`` the middle
-    of the contact on the unrolled core (..., axis), all in metres.
+    ``contact_m`` is the radius of the contact (...), ``skin_m`` the deformation of the skin (...), ``centre_m`` the
+    centre of the contact on the unrolled core (..., axis), all in metres.
     """
-    way2 = ((biotac_sp.unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
+    distance2 = ((biotac_sp.unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
     sigma2 = np.maximum(BREADTH * contact_m, 1e-9) ** 2
-    near = np.exp(-way2 / (2 * sigma2[..., None]))
+    near = np.exp(-distance2 / (2 * sigma2[..., None]))
     fall = GAIN_COUNT * (1 - np.exp(-skin_m / FLUID_M))[..., None] * near
     distribution = (1 - near) / (1 - near).sum(axis=-1, keepdims=True)
     return np.asarray(BULGE * fall.sum(axis=-1, keepdims=True) * distribution - fall)
 
 
 def signal(hand: Sensors, force_n: Floats, contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
-    """Return what both sensors show without noise and drift (..., finger, channel), counts."""
+    """Return the counts of both sensors without noise and drift (..., finger, channel)."""
     pressure = PRESSURE_COUNT_N * force_n[..., None]
-    return np.asarray(hand.rest + np.concatenate([pressed(contact_m, skin_m, centre_m), pressure], axis=-1))
+    return np.asarray(hand.rest + np.concatenate([electrode_change(contact_m, skin_m, centre_m), pressure], axis=-1))
 
 
 def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | Times = 0) -> Floats:
-    """Return by how many counts channels have drifted at ``t_ns``, of phases (..., period, finger, channel).
+    """Return the drift of channels at ``t_ns`` in counts, from phases (..., period, finger, channel).
 
-    Each drifts by ``rate_count_day`` counts a day on root-mean-square average, as the sum of three slow waves.
+    The drift is a sum of three slow waves with a root-mean-square rate of ``rate_count_day`` counts per day.
     """
     rate = 2 * np.pi / np.array(DRIFT_DAYS)[:, None, None]  # rad a day
     size = rate_count_day / rate * np.sqrt(2 / len(DRIFT_DAYS))
@@ -93,16 +91,16 @@ def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | Times = 0) -> F
     return np.asarray((size * np.sin(rate * days + phases_rad)).sum(axis=-3))
 
 
-def counted(counts: Floats) -> Counts:
-    """Return channels (..., channel) as they are logged: whole and within `FULL_COUNT`."""
+def to_counts(counts: Floats) -> Counts:
+    """Return the logged channels (..., channel), rounded and clipped to `FULL_COUNT`."""
     low, high = np.array([FULL_COUNT["electrode"]] * biotac_sp.ELECTRODES + [FULL_COUNT["pdc"]]).T
     return np.rint(counts).clip(low, high).astype(np.uint16)
 
 
 def rows(counts: Counts, speed_n_s: Floats, noise_scale: float, rng: np.random.Generator) -> list[Floats]:
-    """Return the 58 columns of `biotac_sp.fields` (time,), of channels (time, finger, channel).
+    """Return the 58 columns (time,) of `biotac_sp.fields` for channels (time, finger, channel).
 
-    ``speed_n_s`` is how fast the force changes (time, finger): it shows on the quick readings of the pressure.
+    ``speed_n_s`` is the rate of change of the force (time, finger), which the vibration readings show.
     """
     blocks = []
     for field in biotac_sp.fields():

@@ -1,17 +1,17 @@
-"""Simulate grasps on a table: a camera sees an object, two fingers pinch it, and their sensors read what they measure.
+"""Simulate grasps on a table: a camera records an object, two fingers pinch it, and their sensors are read.
 
-Trial i is of object i mod n. What happens in one:
+Trial i is a grasp of object i mod n:
 
-1. an object comes to rest on the table in a random pose, and `tacpipe.simulation.depth_camera` sees it;
-2. `tacpipe.simulation.grasp_scene` plans where two fingers take it;
-3. the fingers, a little off, press as `tacpipe.simulation.pinch` states;
-4. `tacpipe.simulation.fingertip_sp` reads that.
+1. an object lies on the table in a random pose, and `tacpipe.simulation.depth_camera` records it;
+2. `tacpipe.simulation.grasp_scene` plans a grasp with two fingers;
+3. the fingers press with small position errors (`tacpipe.simulation.pinch`);
+4. `tacpipe.simulation.fingertip_sp` computes the readings.
 
-Grasps of an object follow one another in sessions, over which the sensors drift.
+Grasps of an object are grouped in sessions, during which the sensors drift.
 
-The effort of the hand, the errors of the fingertips' poses, drift and noise do not show in a cloud and a planned grasp. The
-mean over them, E[y | geometry], has the least root-mean-square error of all predictions from these. Sensors drift alike in
-grasps that are near in time: a model fitted on some of them may fall below this error unless nothing drifts.
+A cloud and a planned grasp do not show the hand's effort, the pose errors of the fingertips, drift and noise. The mean over
+them, E[y | geometry], has the smallest root-mean-square error of all predictions from cloud and grasp. Grasps that are close
+in time have similar drift, so a model trained on some of them may have a smaller error unless drift is off.
 """
 
 from __future__ import annotations
@@ -50,27 +50,27 @@ def draw_readings(
     noise_scale: float = 1.0,
     drift_count_day: float = 30.0,
 ) -> Counts:
-    """Return what the sensors may read of one situation (draw, finger, channel), whatever is unseen drawn anew each time.
+    """Return possible readings of one situation (draw, finger, channel), with random unobserved values for each draw.
 
-    Channels are the electrodes, then the pressure; times of drift are drawn too.
+    Channels are the electrodes, then the pressure. The times of the drift are random, too.
     """
-    contact = pinch.touch(situation, pinch.unseen(rng, draws, effort_spread))
+    contact = pinch.touch(situation, pinch.draw_unseen(rng, draws, effort_spread))
     counts = fingertip_sp.signal(hand, contact.force_n, contact.contact_m, contact.skin_m, contact.centre_m)
     phases = rng.uniform(0, 2 * np.pi, (draws, *hand.phases_rad.shape))
-    off = fingertip_sp.drift(phases, drift_count_day) + noise_scale * hand.noise * rng.normal(size=counts.shape)
-    return fingertip_sp.counted(counts + off)
+    error = fingertip_sp.drift(phases, drift_count_day) + noise_scale * hand.noise * rng.normal(size=counts.shape)
+    return fingertip_sp.to_counts(counts + error)
 
 
 def mean_and_variance(possible: Counts) -> tuple[Floats, Floats]:
-    """Return mean and variance of readings (draw, finger, channel), each (finger, channel), counts and counts squared."""
+    """Return mean in counts and variance in counts² (finger, channel) of readings (draw, finger, channel)."""
     return possible.mean(axis=0), possible.var(axis=0, ddof=1)
 
 
 def irreducible_rmse(variances: Floats) -> dict[str, float]:
-    """Return the least root-mean-square error of each target, counts, over situations (situation, finger, channel).
+    """Return the smallest possible root-mean-square error of each target in counts.
 
-    It is the root of the mean of the variances given the geometry: C. M. Bishop, *Pattern Recognition and Machine
-    Learning*, 2006, equation (1.90).
+    ``variances`` (situation, finger, channel) are those given the geometry. The error is the root of their mean: C. M.
+    Bishop, *Pattern Recognition and Machine Learning*, 2006, equation (1.90).
     """
     mf, th = np.sqrt(variances[:, :, -1].mean(axis=0))
     e_mf, e_th = np.sqrt(variances[:, :, :-1].mean(axis=(0, 2)))
@@ -80,7 +80,7 @@ def irreducible_rmse(variances: Floats) -> dict[str, float]:
 def error_bound(
     hand: fingertip_sp.Sensors, scene: GraspScene, rig: GraspRig, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return mean and variance of what the sensors may read, given the geometry alone, each (finger, channel)."""
+    """Return mean and variance (finger, channel) of the readings given only the geometry."""
     possible = draw_readings(
         scene.situation,
         hand,
@@ -95,10 +95,10 @@ def error_bound(
 def truth_table(
     t_ns: int, scene: GraspScene, sensed: Readings, estimate: tuple[Floats, Floats], moments_ns: Mapping[str, int]
 ) -> pa.Table:
-    """Return the stream ``truth``: of each finger, gt_mf_… and gt_th_…, then of the object.
+    """Return the stream ``truth``: gt_mf_… and gt_th_… for the fingers, then the columns of the object.
 
-    ``gt_expected_…`` is the mean and ``gt_variance_…`` the variance of a reading given the geometry, counts and counts
-    squared; ``moments_ns`` are when fingers touch, hold and let go, in nanoseconds, each a column ``gt_…_ns``.
+    ``gt_expected_…`` is the mean in counts and ``gt_variance_…`` the variance in counts² of a reading given the geometry.
+    ``moments_ns`` are the times of contact, hold and release, each a column ``gt_…_ns``.
     """
     columns = [column for finger in range(len(biotac_sp.FINGERS)) for column in _finger(finger, scene, sensed)]
     columns += [(f"gt_position_{axis}_m", "m", "position", scene.placed.origin_m[i]) for i, axis in enumerate("xyz")]
@@ -124,7 +124,7 @@ def truth_table(
 
 
 def _finger(finger: int, scene: GraspScene, sensed: Readings) -> list[tuple[str, str, str, float]]:
-    """Return name, unit, quantity and value of what is true of a finger."""
+    """Return (name, unit, quantity, value) of the ground truth of a finger."""
     touch, situation = sensed.touch, scene.situation
     columns = [
         ("force_n", "N", "force", touch.force_n[0, finger]),
@@ -142,18 +142,19 @@ def _finger(finger: int, scene: GraspScene, sensed: Readings) -> list[tuple[str,
     return [(f"gt_{biotac_sp.FINGERS[finger]}_{name}", unit, kind, float(value)) for name, unit, kind, value in columns]
 
 
-START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
-GRASP_NS = 180_000_000_000  # time between two grasps of a session
+START_NS = 1_620_000_000_000_000_000  # UTC time of the first grasp
+GRASP_NS = 180_000_000_000  # time between grasps of a session
 SESSION = 20  # grasps
 READ_NS = 5_000_000_000  # time between the plan and the reading
 NOISE, BOUND = 4, 5  # streams of random numbers
 
 
 def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
-    """Return trial ``index`` of the rig: cloud, grasp, reading, truth; or raw: scene, grasp, biotac_sp, scene_truth, truth.
+    """Simulate trial ``index`` of the rig.
 
-    The same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
-    `TacpipeError` for a rig that cannot be.
+    The streams are cloud, grasp, reading and truth; with ``raw``, scene, grasp, biotac_sp, scene_truth and truth. The
+    same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
+    `TacpipeError` if the rig is invalid.
     """
     _check(rig)
     scene = perform(seed, index, rig)
@@ -180,13 +181,13 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
 
 
 def stamp_ns(index: int, rig: GraspRig) -> int:
-    """Return when trial ``index`` takes place, UTC nanoseconds: objects take turns session by session."""
+    """Return the time of trial ``index`` in UTC ns. Objects alternate by session."""
     turn, number = divmod(_number(index, rig), SESSION)
     return START_NS + ((turn * _objects(rig) + index % _objects(rig)) * SESSION + number) * GRASP_NS
 
 
 def session(index: int, rig: GraspRig) -> int:
-    """Return in which session of its object trial ``index`` is, from 1."""
+    """Return the session of trial ``index`` for its object, from 1."""
     return _number(index, rig) // SESSION + 1
 
 
@@ -195,7 +196,7 @@ def _objects(rig: GraspRig) -> int:
 
 
 def _number(index: int, rig: GraspRig) -> int:
-    """Return which of the grasps of its object a trial is, from 0."""
+    """Return the number of a trial among the grasps of its object, from 0."""
     return index // _objects(rig)
 
 
@@ -207,9 +208,9 @@ def _readings_over_time(
     rig: GraspRig,
     rng: np.random.Generator,
 ) -> pa.Table:
-    """Return the stream of both sensors while fingers close, hold and let go."""
+    """Return the readings of both sensors while the fingers close, hold and release."""
     force = course.fraction[:, None] * readings.touch.force_n  # (time, finger)
-    contact, skin = pinch.pressed(scene.situation, force)
+    contact, skin = pinch.deformation(scene.situation, force)
     centre = np.broadcast_to(readings.touch.centre_m, (len(force), *readings.touch.centre_m.shape[1:]))
     counts = fingertip_sp.signal(hand, force, contact, skin, centre) + readings.drift
     speed = np.gradient(force, course.t_ns / 1e9, axis=0)
@@ -224,8 +225,8 @@ def _logged(
     rig: GraspRig,
     rng: np.random.Generator,
 ) -> pa.Table:
-    """Return a stream of readings of what sensors show (time, finger, channel), with noise."""
-    counts = fingertip_sp.counted(signal + rig.noise_scale * hand.noise * rng.normal(size=signal.shape))
+    """Return a stream of readings with noise, from the noise-free signal (time, finger, channel)."""
+    counts = fingertip_sp.to_counts(signal + rig.noise_scale * hand.noise * rng.normal(size=signal.shape))
     return schema.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
 
 
@@ -240,13 +241,13 @@ def _attributes(scene: GraspScene, session: int) -> dict[str, Attribute]:
 
 
 def _check(rig: GraspRig) -> None:
-    """Refuse a rig that cannot be."""
+    """Raise `TacpipeError` if a rig is invalid."""
     if rig.objects < 1:
         raise TacpipeError(f"objects is {rig.objects}; a family needs 1 or more.")
     for name in ("effort_spread", "noise_scale", "drift_count_day"):
         if getattr(rig, name) < 0:
             raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 0 or more.")
     if not 0 <= rig.shift <= 1:
-        raise TacpipeError(f"shift is {rig.shift}; it is a fraction of half the cloud's length, 0 to 1.")
+        raise TacpipeError(f"shift is {rig.shift}; it must be a fraction between 0 and 1.")
     if rig.raw and rig.spheres:
-        raise TacpipeError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")
+        raise TacpipeError("raw and spheres are both set, but spheres of all sizes have no table. Remove one of them.")

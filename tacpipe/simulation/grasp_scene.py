@@ -1,11 +1,10 @@
-"""Draw the scene of a grasp on the simulated table: an object, what a camera sees of it, and how two fingers take it.
+"""Generate the scene of a simulated grasp: an object, its cloud, and the grasp with two fingers.
 
-What nobody sees of it, such as the effort of the hand, is part of the scene too: it is all that a trial needs for what
-the fingers then measure.
+The scene also contains unobserved values, such as the hand's effort, so that it determines the readings of a trial.
 
-As in the letter's protocol, the line between the fingers goes through a point shifted along the first principal axis of what
-the camera sees, half as deep as the body is there. Of the level lines through it one is taken along which both fingers stay
-within a cone of friction about the normals.
+As in the published protocol, the line between the fingers passes through a point that is shifted along the first principal
+axis of the visible points, at half the depth of the body. Of the nearly horizontal lines through it, one is chosen for which
+both fingers are within a friction cone around the normals.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ from tacpipe.simulation.depth_camera import Placed
 
 FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
 MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}
-SHARES = (0.6, 0.2, 0.2)  # fraction of the objects per entry of MODULI_PA
+SHARES = (0.6, 0.2, 0.2)  # fractions of the objects by entry of MODULI_PA
 TAPER, NARROW = (
     (0.08, 0.22),
     0.4,
-)  # slope of cones within friction, and smallest fraction of the radius at the top
+)  # range of the slope of cones, within friction, and smallest ratio of the radii of top and bottom
 REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
-SPHERES_M = (0.012, 0.058)  # radii of those
+SPHERES_M = (0.012, 0.058)  # range of their radii
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A named object, its surface, and how readily it gives way: one over Young's modulus, 1/Pa."""
+    """A named object with its shape and stiffness class."""
 
     name: str
     family: str
@@ -44,26 +43,26 @@ class Thing:
 
     @property
     def compliance_1_pa(self) -> float:
-        """One over Young's modulus, 1/Pa; 0 if rigid."""
+        """The inverse of Young's modulus in 1/Pa; 0 if rigid."""
         return 1 / MODULI_PA[self.stiffness]
 
 
 def draw_household_thing(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
-    """Return an object of a family as ``rng`` draws it, named by the family and its ``number``, as in "cone-03".
+    """Return a random object of a family, named by the family and ``number``, such as "cone-03".
 
     ``stiffness`` is one of `MODULI_PA`, or mixed. Raises `TacpipeError` for an unknown family or stiffness.
     """
     if family not in FAMILIES:
-        raise TacpipeError(f"There is no family {family!r}; known are {', '.join(FAMILIES)}.")
+        raise TacpipeError(f"There is no family {family!r}; the families are {', '.join(FAMILIES)}.")
     if stiffness not in (*MODULI_PA, "mixed"):
-        raise TacpipeError(f"There is no stiffness {stiffness!r}; known are mixed, {', '.join(MODULI_PA)}.")
+        raise TacpipeError(f"There is no stiffness {stiffness!r}; give mixed, {', '.join(MODULI_PA)}.")
     drawn = str(rng.choice(list(MODULI_PA), p=SHARES))
     shape = _shape(family, rng)
     return Thing(f"{family}-{number:02d}", family, shape, drawn if stiffness == "mixed" else stiffness)
 
 
 def _shape(family: str, rng: np.random.Generator) -> Shape:
-    """Return a body whose least width is some 20 mm and whose greatest 120 mm."""
+    """Return a random body of a family with widths between about 20 and 120 mm."""
 
     def between(*limits_mm: tuple[float, float]) -> list[float]:
         return [0.001 * float(rng.uniform(*limits)) for limits in limits_mm]
@@ -84,35 +83,35 @@ def _shape(family: str, rng: np.random.Generator) -> Shape:
     return Bow(arc, tube, float(rng.uniform(1.2, 2.6)))
 
 
-OPENING_M = (0.02, 0.12)  # distance between the fingers
-CONE_RAD = np.deg2rad(15.0)  # largest angle between closing and a normal
-MARGIN_M = 0.004  # least way from a contact to an edge
-DIRECTIONS = 36  # number of lines that are tried
+OPENING_M = (0.02, 0.12)  # range of the distance between the fingers
+CONE_RAD = np.deg2rad(15.0)  # largest angle between the closing direction and a normal
+MARGIN_M = 0.004  # smallest distance of a contact from an edge
+DIRECTIONS = 36  # number of candidate lines
 LEAN_RAD = np.deg2rad(4.0)  # standard deviation of their angle to the table
-PITCH_RAD = np.deg2rad(20.0)  # largest angle of the approach to the vertical, about the closing axis
+PITCH_RAD = np.deg2rad(20.0)  # largest angle between approach and vertical, around the closing axis
 FAR_M = 0.2  # distance from which the fingers approach
 
 
 def antipodal_grasps(
     placed: Placed, seen_m: Floats, up: Floats, shift: float, rng: np.random.Generator, *, central: bool = False
 ) -> Grasp | None:
-    """Return a grasp of a body that is seen at points (point, xyz), metres; None if no line suits.
+    """Return a random grasp of a body with visible points (point, xyz) in metres, or None if no line is suitable.
 
-    ``shift`` is the largest fraction of half the cloud's length by which the point is shifted; ``central`` takes the
-    body's origin instead. Finger 1, the one at ``g1``, comes from the camera's left, as on the published rig.
+    ``shift`` is the largest shift of the point as a fraction of half the cloud's length. With ``central``, the body's origin
+    is used instead. Finger 1, at ``g1``, is on the camera's left, as on the published rig.
     """
     through = placed.origin_m if central else _inside(placed, _shifted(seen_m, shift, rng))
     if through is None:
         return None
-    ways = _level(up, rng)
-    start, stop = (through - FAR_M * side * ways for side in (1, -1))
-    first = start + placed.hit(start, ways)[:, None] * ways
-    second = stop - placed.hit(stop, -ways)[:, None] * ways
+    directions = _level_directions(up, rng)
+    start, stop = (through - FAR_M * side * directions for side in (1, -1))
+    first = start + placed.hit(start, directions)[:, None] * directions
+    second = stop - placed.hit(stop, -directions)[:, None] * directions
     suitable = np.flatnonzero(_suitable(placed, first, second))
     if not len(suitable):
         return None
     chosen = int(rng.choice(suitable))
-    closing, pitch = ways[chosen], rng.uniform(-PITCH_RAD, PITCH_RAD)
+    closing, pitch = directions[chosen], rng.uniform(-PITCH_RAD, PITCH_RAD)
     down = -up + (up @ closing) * closing
     down /= np.linalg.norm(down)
     approach = np.cos(pitch) * down + np.sin(pitch) * np.cross(closing, down)
@@ -120,7 +119,7 @@ def antipodal_grasps(
 
 
 def _shifted(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
-    """Return the seen point nearest to one on the first principal axis (xyz), metres."""
+    """Return the visible point (xyz) in metres that is closest to a random point on the first principal axis."""
     centre = seen_m.mean(axis=0)
     axis = np.linalg.eigh(np.cov(seen_m.T))[1][:, -1]
     half = np.ptp(seen_m @ axis) / 2
@@ -129,30 +128,30 @@ def _shifted(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
 
 
 def _inside(placed: Placed, seen_m: Floats) -> Floats | None:
-    """Return the point halfway through the body along the camera's ray to ``seen_m`` (xyz), metres, None if it misses."""
+    """Return the point (xyz) in metres halfway through the body on the camera's ray to ``seen_m``, or None if it misses."""
     ray = seen_m / np.linalg.norm(seen_m)
     near = float(placed.hit(np.zeros((1, 3)), ray[None])[0])
     back = near + 2 * placed.shape.bound_m + FAR_M
     far = back - float(placed.hit((back * ray)[None], -ray[None])[0])
     if not np.isfinite(near):
         return None
-    hollow = far - near > 2 * placed.shape.bound_m
-    return None if hollow else np.asarray((near + far) / 2 * ray)
+    misses = far - near > 2 * placed.shape.bound_m
+    return None if misses else np.asarray((near + far) / 2 * ray)
 
 
-def _level(up: Floats, rng: np.random.Generator) -> Floats:
-    """Return unit vectors nearly level with the table (direction, xyz), all towards positive x."""
+def _level_directions(up: Floats, rng: np.random.Generator) -> Floats:
+    """Return nearly horizontal unit vectors (direction, xyz), all towards positive x."""
     side = np.cross(up, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     angle = np.pi * (np.arange(DIRECTIONS) + rng.random()) / DIRECTIONS - np.pi / 2
     lean = rng.normal(0, LEAN_RAD, DIRECTIONS)
     level = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(up, side))
-    ways = np.cos(lean)[:, None] * level + np.outer(np.sin(lean), up)
-    return np.asarray(ways * np.where(ways[:, :1] < 0, -1.0, 1.0))
+    directions = np.cos(lean)[:, None] * level + np.outer(np.sin(lean), up)
+    return np.asarray(directions * np.where(directions[:, :1] < 0, -1.0, 1.0))
 
 
 def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
-    """Return which pairs of contacts (pair, xyz) fingers of the hand can hold (pair,)."""
+    """Return a mask (pair,) of the pairs of contacts (pair, xyz) that the fingers can grasp."""
     with np.errstate(invalid="ignore"):
         gap = second_m - first_m
         opening = np.linalg.norm(gap, axis=1)
@@ -161,15 +160,17 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
     for at_m, sign in ((first_m, -1), (second_m, 1)):
         rows = np.flatnonzero(suitable)
         along = sign * (placed.normal(at_m[rows]) * closing[rows]).sum(axis=1)
-        suitable[rows] &= (along >= np.cos(CONE_RAD)) & (placed.shape.margin_m(placed.inward(at_m[rows])) >= MARGIN_M)
+        suitable[rows] &= (along >= np.cos(CONE_RAD)) & (
+            placed.shape.margin_m(placed.to_body_frame(at_m[rows])) >= MARGIN_M
+        )
     return np.asarray(suitable)
 
 
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera
 SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # mean and standard deviation of object positions in the camera's view
-MIN_POINTS = 800  # smallest size of a cloud, as in the published set
-TRIES = 100  # poses until one is seen and grasped
+MIN_POINTS = 800  # of a cloud, as in the published set
+MAX_POSES = 100  # tried poses of an object
 SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 
 
@@ -177,8 +178,8 @@ SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 class GraspRig:
     """The objects and the quality of the sensors. The fields are those of the stage's params.
 
-    Controls: ``spheres`` makes all objects alike but for their size, ``one_pose`` leaves the cloud only the object to
-    state, ``effort_spread=0`` makes the force one of the geometry alone.
+    Control experiments: with ``spheres``, objects differ only in size; with ``one_pose``, the cloud depends only on the
+    object; with ``effort_spread=0``, the force depends only on the geometry.
     """
 
     families: str = "all"
@@ -195,7 +196,7 @@ class GraspRig:
 
 @dataclass(frozen=True)
 class GraspScene:
-    """The true course of a trial."""
+    """The ground truth of a trial."""
 
     thing: Thing
     placed: Placed
@@ -209,7 +210,7 @@ class GraspScene:
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of both sensors at contact: the true touch, and the counts (finger, channel) without noise."""
+    """The true contact, and the drift and the noise-free counts (finger, channel) of both sensors."""
 
     touch: pinch.Touch
     drift: Floats
@@ -217,18 +218,18 @@ class Readings:
 
 
 def families(rig: GraspRig) -> tuple[str, ...]:
-    """Return the families that a rig grasps, raising `TacpipeError` for an unknown one."""
+    """Return the families of objects of a rig. Raises `TacpipeError` for an unknown family."""
     names = FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
     unknown = [name for name in names if name not in FAMILIES]
     if unknown:
         raise TacpipeError(
-            f"There is no family {unknown[0]!r}; known are {', '.join(FAMILIES)}, or all for all of them."
+            f"There is no family {unknown[0]!r}; the families are {', '.join(FAMILIES)}; all selects all of them."
         )
     return ("sphere",) if rig.spheres else names
 
 
 def draw_thing(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
-    """Return what trial ``index`` grasps: the same object whichever others there are, but for spheres of all sizes."""
+    """Return the object of trial ``index``. It does not depend on the other objects, except with ``spheres``."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
         drawn = draw_household_thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
@@ -240,46 +241,46 @@ def draw_thing(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
 
 
 def sensors(seed: int) -> fingertip_sp.Sensors:
-    """Return the two sensors of a rig."""
+    """Return the two sensors of the rig with this seed."""
     return fingertip_sp.sensors(np.random.default_rng([seed, SENSORS]))
 
 
 def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
-    """Return what truly happens in trial ``index``; raises `TacpipeError` if in `TRIES` poses nothing could be grasped."""
+    """Simulate the scene of trial ``index``. Raises `TacpipeError` if no grasp is possible in `MAX_POSES` poses."""
     thing = draw_thing(seed, index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
     rests = thing.shape.rests()
     scale = float(rng.uniform(*SPHERES_M)) / REFERENCE_M if rig.spheres else 1.0
-    for _ in range(TRIES):
-        up, height_m = depth_camera.camera(rng, CAMERA_M, TILT_RAD)
+    for _ in range(MAX_POSES):
+        up, height_m = depth_camera.sample_camera(rng, CAMERA_M, TILT_RAD)
         pose = rests[0 if rig.one_pose else int(rng.integers(len(rests)))]
         at_m = (float(rng.normal(SEEN_AT_M[0], SPREAD_M)), float(rng.normal(SEEN_AT_M[1], SPREAD_M)))
         placed = depth_camera.place_shape(thing.shape, pose, float(rng.uniform(0, 2 * np.pi)), at_m, up, height_m)
-        direction, depth_m = depth_camera.depths(placed)
+        direction, depth_m = depth_camera.visible_rays(placed)
         if len(depth_m) < MIN_POINTS:
             continue
-        points = depth_camera.measured(direction, depth_m, rig.noise_scale, rng)
+        points = depth_camera.noisy_points(direction, depth_m, rig.noise_scale, rng)
         grasp = antipodal_grasps(placed, points.astype(np.float64), up, rig.shift, rng, central=rig.spheres)
         if grasp is None:
             continue
-        colours = depth_camera.painted(placed.inward(direction * depth_m[:, None]), rng)
+        colours = depth_camera.random_colours(placed.to_body_frame(direction * depth_m[:, None]), rng)
         situation = pinch.situation(placed, grasp, thing.compliance_1_pa)
-        hidden = pinch.unseen(rng, 1, rig.effort_spread)
+        hidden = pinch.draw_unseen(rng, 1, rig.effort_spread)
         scene = GraspScene(thing, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
         return scene if scale == 1 else _scaled(scene, scale)
-    raise TacpipeError(f"The object {thing.name} could not be seen and grasped in {TRIES} poses; take another seed.")
+    raise TacpipeError(f"The object {thing.name} could not be grasped in {MAX_POSES} poses; use another seed.")
 
 
 def read_sensors(hand: fingertip_sp.Sensors, scene: GraspScene, t_ns: int, rig: GraspRig = GraspRig()) -> Readings:
-    """Return what both sensors measure of a scene at ``t_ns``; where the camera is does not matter."""
+    """Return the readings of both sensors for a scene at ``t_ns``. The camera's position does not matter."""
     touch = pinch.touch(scene.situation, scene.hidden)
-    off = fingertip_sp.drift(hand.phases_rad, rig.drift_count_day, t_ns)
+    drift = fingertip_sp.drift(hand.phases_rad, rig.drift_count_day, t_ns)
     signal = fingertip_sp.signal(hand, touch.force_n, touch.contact_m, touch.skin_m, touch.centre_m)[0]
-    return Readings(touch, off, signal + off)
+    return Readings(touch, drift, signal + drift)
 
 
 def _scaled(scene: GraspScene, scale: float) -> GraspScene:
-    """Return a scene with all lengths times ``scale``: the camera sees the same, only nearer and smaller or the reverse."""
+    """Return a scene with all lengths multiplied by ``scale``. The camera's image does not change."""
     thing = replace(scene.thing, shape=Ellipsoid(np.full(3, REFERENCE_M * scale)))
     placed = Placed(thing.shape, scene.placed.rotation, scene.placed.origin_m * scale)
     grasp = Grasp(scene.grasp.g1_m * scale, scene.grasp.g2_m * scale, scene.grasp.wrist)

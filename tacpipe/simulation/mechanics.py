@@ -1,23 +1,23 @@
-"""Stick and slip between two fingers and the object that they hold.
+"""Simulate stick and slip between two fingers and the object in their grasp.
 
-The fingers press along y with N each, so that Coulomb friction holds up to 2 mu N in the plane of x and z. What they
-must bring up there is D = m (a + g e_z), with a the acceleration of the hand in its own frame. It is a hybrid of two
-states, stepped with the velocity taken implicitly:
+Each finger presses along y with N, so that Coulomb friction transmits up to 2 mu N in the xz plane. The required force
+is D = m (a + g e_z), where a is the acceleration of the hand in its own frame. The model has two states and is
+integrated with an implicit velocity step:
 
-- *stick*: a critically damped spring about an anchor (k = 2e4 N/m, c = 2 sqrt(k m)) carries the load; slip starts
-  where the spring's force exceeds 2 mu_s N. The damper's does not count: for some ms after a jolt it adds a few percent;
-- *slip*: friction of 2 mu_k N against the relative velocity. Where it would turn the velocity round, the object
-  sticks again, and the anchor is set so that the spring carries the load of that moment.
+- *stick*: a critically damped spring at an anchor (k = 2e4 N/m, c = 2 sqrt(k m)) carries the load. Slip starts if the spring
+  force exceeds 2 mu_s N. The damper force is not counted; it adds a few percent for some ms after a jolt;
+- *slip*: friction of 2 mu_k N opposes the relative velocity. If it would reverse the velocity, the object sticks again, with
+  the anchor set so that the spring carries the load at that time.
 
-Not LuGre: its break-away force depends on how fast the load comes, and it creeps at rest. The spring represents the
-stiffness of a contact at rest; its deflection (0.3 mm at 6 N) is not a displacement here, which slip alone makes.
+The LuGre model is not used, because its break-away force depends on the loading rate, and it creeps at rest. The spring
+represents the stiffness of a resting contact. Its deflection (0.3 mm at 6 N) is not counted as displacement; only slip is.
 
-Along y the object is clamped: its acceleration is the difference of the two normal forces, and their sum stays 2 N.
-While the object stands on the table, the table bears its weight, and hands it over within `TABLE_M` of rise. Once it has
-moved by `DROP_M` the fingers have lost it: contact forces are zero, it falls, and lies where it lands.
+Along y the object is clamped: its acceleration follows from the difference of the normal forces, whose sum stays 2 N. While
+the object is on the table, the table carries its weight, and transfers it within `TABLE_M` of rise. After a displacement of
+`DROP_M` the object is dropped: contact forces are zero, it falls, and rests where it lands.
 
-A grasp next to the centre of mass twists the object about y as well. The two soft fingers hold (2/3) mu N R each, as
-uniform pressure on a disc of radius R does. The twist has a friction limit of its own, not one in common with the shear.
+A grasp next to the centre of mass also twists the object around y. Each soft finger resists up to (2/3) mu N R, as for
+uniform pressure on a disc of radius R. The friction limits of twist and shear are independent.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats
 
 GRAVITY_M_S2 = 9.81
-UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # acceleration that the table or the hand gives an object at rest
+UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # acceleration of a resting object due to its support
 STIFFNESS_N_M = 2e4
 KINETIC = 0.8  # mu_k / mu_s
 DROP_M = 0.025
-TABLE_M = 0.001  # rise over which the table hands the object's weight over to the fingers
-PATCH_M = 0.008  # R, radius of the patch that twists
-BLOCK_ROWS = 1 << 14  # rows that are plain numbers at once, in ten times the memory of an array
-GYRATION_M = 0.06  # radius of gyration of a small bottle
+TABLE_M = 0.001  # rise over which the object's weight is transferred from the table to the fingers
+PATCH_M = 0.008  # R, radius of the contact patch
+BLOCK_ROWS = 1 << 14  # rows converted to Python numbers at once, which need ten times the memory of an array
+GYRATION_M = 0.06  # radius of gyration, as for a small bottle
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,20 @@ class HeldObject:
 
     mass_kg: float
     friction: float  # mu_s
-    grip_n: Floats  # (time,), N: the normal force of each finger while nothing accelerates along y
-    lever_m: float = 0.0  # how far the centre of mass lies next to the grasp, along x
+    grip_n: Floats  # (time,), normal force of each finger in N without acceleration along y
+    lever_m: float = 0.0  # offset of the centre of mass from the grasp along x
 
     @property
     def limit_n(self) -> Floats:
-        """The largest force in the plane that both fingers hold in stick, 2 mu_s N (time,)."""
+        """The largest static friction force of both fingers in the xz plane, 2 mu_s N (time,)."""
         limit: Floats = 2 * self.friction * self.grip_n
         return limit
 
     def demand_n(self, acceleration_m_s2: Floats, borne: Floats | float = 1.0) -> Floats:
-        """Return the force (time, axis) in the hand's frame that moves the object as the hand moves.
+        """Return the force (time, axis) in the hand frame that moves the object with the hand.
 
-        ``acceleration_m_s2`` (time, axis) is that of the hand in its frame; ``borne`` (time,) is the fraction of the
-        weight that the table has handed over.
+        ``acceleration_m_s2`` (time, axis) is that of the hand in its frame; ``borne`` (time,) is the fraction of the weight
+        that the fingers carry.
         """
         pull: Floats = self.mass_kg * (acceleration_m_s2 + UPWARDS_M_S2)
         pull[:, 2] *= borne
@@ -69,25 +69,25 @@ class HeldObject:
 
 @dataclass(frozen=True)
 class Contact:
-    """The motion of the fingers and of the object between them, in the frame of the hand."""
+    """Contact forces, and the motion of the object relative to the fingers, in the hand frame."""
 
-    force_n: Floats  # (time, axis) on the object, of both fingers together
+    force_n: Floats  # (time, axis), force of both fingers on the object
     normal_n: Floats  # (time, finger)
-    displacement_m: Floats  # (time, 2) of the object against the fingers, along x and z
-    velocity_m_s: Floats  # (time, 2), likewise
-    slip: Bools  # (time,), held and slipping
+    displacement_m: Floats  # (time, 2), relative displacement of the object along x and z
+    velocity_m_s: Floats  # (time, 2), relative velocity along x and z
+    slip: Bools  # (time,), True while the object slips and is not dropped
     dropped: Bools  # (time,)
-    torque_nm: Floats  # (time,) about y, of both fingers together
-    rotation_rad: Floats  # (time,) about y, of the object against the fingers
+    torque_nm: Floats  # (time,), torque of both fingers around y
+    rotation_rad: Floats  # (time,), relative rotation of the object around y
 
     @property
     def onset(self) -> int | None:
-        """The row in which the first slip starts, or None."""
+        """The first row with slip, or None."""
         return int(self.slip.argmax()) if self.slip.any() else None
 
 
 def onset_m_s2(mass_kg: float, grip_n: float, friction: float) -> float:
-    """Return the upward acceleration at which an object begins to slip, 2 mu_s N / m - g.
+    """Return the upward acceleration at which an object starts to slip, 2 mu_s N / m - g.
 
     >>> round(onset_m_s2(0.36, 6.0, 0.45), 2)
     5.19
@@ -98,10 +98,10 @@ def onset_m_s2(mass_kg: float, grip_n: float, friction: float) -> float:
 def carry(
     grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None = None, *, rate_hz: float = 1000.0
 ) -> Contact:
-    """Return the contact while the hand accelerates by ``acceleration_m_s2`` (time, axis), in its own frame.
+    """Simulate the contact while the hand accelerates with ``acceleration_m_s2`` (time, axis) in its own frame.
 
-    ``rise_m`` (time,) is the hand's height above the place where the object stands on the table; without it there is no
-    table, and the object begins in stick under its load.
+    ``rise_m`` (time,) is the hand's height above its height at which the object is on the table. If it is None, there is no
+    table, and the object initially sticks under its load.
     """
     moves = _slide(grasp, acceleration_m_s2, rise_m, 1 / rate_hz)  # (time, 7)
     is_held = moves[:, 6] < 2
@@ -118,7 +118,7 @@ def carry(
 def run_profile(
     acceleration_m_s2: Floats, mass_kg: float, grip_n: float, friction: float, *, rate_hz: float = 1000.0
 ) -> Contact:
-    """Return the contact of an object in the air under a commanded acceleration: (time,) upwards, or (time, axis)."""
+    """Simulate the contact of a lifted object under a commanded acceleration: (time,) upwards, or (time, axis)."""
     commanded = np.asarray(acceleration_m_s2, dtype=np.float64)
     if commanded.ndim == 1:
         commanded = np.column_stack([np.zeros((len(commanded), 2)), commanded])
@@ -129,8 +129,8 @@ def run_profile(
 def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, step_s: float) -> Floats:
     """Return force x and z, displacement x and z, velocity x and z, and state (time, 7).
 
-    The state is 0 in stick or before contact, 1 in slip and 2 once dropped. A loop over plain numbers: which state a row
-    is in hangs on the row before.
+    The state is 0 for stick or before contact, 1 for slip and 2 after a drop. The loop over rows is needed because the
+    state of a row depends on the previous row.
     """
     rows = len(acceleration_m_s2)
     moves = np.zeros((rows, 7))
@@ -146,9 +146,9 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
     ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * borne / STIFFNESS_N_M
     slipping = False
-    pending: list[tuple[float, ...]] = []  # rows that `moves` does not have yet
-    last = first  # row before which it does
-    for rise, pull_x, pull_z, limit in _plain(mass, acceleration_m_s2, limits, rises, first):
+    pending: list[tuple[float, ...]] = []  # rows that are not in `moves` yet
+    last = first  # number of rows in `moves`
+    for rise, pull_x, pull_z, limit in _python_rows(mass, acceleration_m_s2, limits, rises, first):
         borne = min(max((rise + sz) / TABLE_M, 0.0), 1.0)
         dx, dz = pull_x, pull_z * borne
         if not slipping:
@@ -182,10 +182,10 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     return moves
 
 
-def _plain(
+def _python_rows(
     mass_kg: float, acceleration_m_s2: Floats, limits_n: Floats, rises_m: Floats, first: int
 ) -> Iterator[tuple[float, float, float, float]]:
-    """Yield rise, pull along x and z and friction limit of each row from ``first``, as plain numbers."""
+    """Yield (rise, force along x, force along z, friction limit) of each row from ``first`` on as Python numbers."""
     for begin in range(first, len(rises_m), BLOCK_ROWS):
         block = slice(begin, begin + BLOCK_ROWS)
         pull_x = (mass_kg * acceleration_m_s2[block, 0]).tolist()
@@ -200,7 +200,7 @@ def _fall(
     velocity_m_s: tuple[float, float],
     step_s: float,
 ) -> Floats:
-    """Return displacement x and z and velocity x and z of an object let go (time, 4), until it lands and then lies."""
+    """Return displacement x and z and velocity x and z of a dropped object (time, 4), which rests after landing."""
     velocity = np.array(velocity_m_s) - np.cumsum(acceleration_m_s2[:, ::2] + [0.0, GRAVITY_M_S2], axis=0) * step_s
     displacement = np.array(displacement_m) + np.cumsum(velocity, axis=0) * step_s
     landed = height + displacement[:, 1] <= 0
@@ -214,10 +214,10 @@ def _fall(
 
 
 def _twist(grasp: HeldObject, force_n: Floats, is_held: Bools, step_s: float) -> tuple[Floats, Floats]:
-    """Return torque about y and rotation of the object against the fingers (time,).
+    """Return torque around y and relative rotation of the object (time,).
 
-    The centre of mass hangs ``lever_m`` next to the grasp at angle 0 and swings down as the object turns; friction holds
-    it up to the limit of the soft fingers, and brakes it beyond. Once the object is dropped, the angle stays.
+    At angle 0, the centre of mass is ``lever_m`` next to the grasp. Friction prevents a rotation up to the limit of the soft
+    fingers, and damps it beyond. After a drop, the angle is constant.
     """
     rows = len(force_n)
     torques, angles = np.zeros(rows), np.zeros(rows)

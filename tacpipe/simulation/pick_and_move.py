@@ -1,17 +1,18 @@
-"""A pick-and-move trial of the simulated rig: two fingers with a uSkin each grasp a bottle, lift it and carry it about.
+"""Simulate pick-and-move trials: two fingers with uSkin sensors grasp a bottle, lift it and move it.
 
-What happens, in order:
+A trial has these steps:
 
-1. the fingers close (0.6 to 1.2 s), then the grip force ramps up (0.4 s);
-2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` states;
-3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` states;
-4. what the fingers bring up shows on `tacpipe.simulation.taxels`, slip on `tacpipe.simulation.pick_and_move` as well;
-5. each device logs it on its own clock, with the faults of `tacpipe.simulation.faults`.
+1. the fingers close (0.6 to 1.2 s), then the grip force increases (0.4 s);
+2. the hand lifts the bottle and moves it (`tacpipe.simulation.trajectory`);
+3. the bottle sticks, slips or is dropped (`tacpipe.simulation.mechanics`);
+4. the contact forces act on the taxels (`tacpipe.simulation.taxels`), and slip also on the proximity sensor;
+5. each device logs on its own clock, with the faults of `tacpipe.simulation.faults`.
 
-The grip is weak on purpose, as it was on the published rig: the accelerations at which the bottle slips lie among those
-that the hand reaches. Axes of the hand: x and y are horizontal, y from finger 1 to finger 2, z is up.
+The grip is intentionally weak, as on the published rig, so that the hand reaches accelerations at which the bottle
+slips. Axes of the hand: x and y are horizontal, y points from finger 1 to finger 2, z is up.
 
-The spread of the tared counts comes near that of the published recordings, 279, 190 and 1219 counts in x, y and z.
+The standard deviations of tared counts are close to those of the published recordings: 279, 190 and 1219 counts in x, y
+and z.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, mechanics, taxels, trajectory
 
-# The proximity sensor at the wrist looks down at the object's top face, whose distance grows as the object slips. Rest
-# level, slope, noise and saturation are those of the published derived recordings: 737 to 748 counts at rest, 544 at the
-# least, a robust standard deviation of 0.82 counts about the filtered trace.
+# The proximity sensor at the wrist measures the distance to the object's top face, which increases with slip. Rest level,
+# slope, noise and saturation are those of the published derived recordings: 737 to 748 counts at rest, a minimum of 544, and
+# a robust standard deviation of 0.82 counts around the filtered signal.
 PROXIMITY_RATE_HZ = 400.0
 REST_COUNT = 740.0
 COUNT_MM = 8.0  # decrease of the reading per millimetre of downward slip
@@ -41,38 +42,36 @@ FLOOR_COUNT = 544.0  # reached at 24.5 mm
 
 
 def proximity_readings(up_m: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.int16]:
-    """Return the counts for an object that moved ``up_m`` (time,) against the fingers; slipping down is negative."""
+    """Return the counts for an object with the relative displacement ``up_m`` (time,), negative for downward slip."""
     level = REST_COUNT + COUNT_MM * 1000 * up_m + NOISE_COUNT * noise_scale * rng.normal(size=len(up_m))
     counts: NDArray[np.int16] = np.rint(level).clip(FLOOR_COUNT, np.iinfo(np.int16).max).astype(np.int16)
     return counts
 
 
-START_NS = 1_600_000_000_000_000_000  # UTC stamp of the first trial's start; the next ones follow minutes later
+START_NS = 1_600_000_000_000_000_000  # UTC time of the first trial; the next ones start minutes later
 TRIAL_NS = 120_000_000_000
 MASSES_KG = (0.20, 0.28, 0.36, 0.44, 0.52)  # five fills of a bottle
 GRIP_N = (4.0, 8.0)  # normal force of each finger
 FRICTION = (0.35, 0.60)  # mu_s
-RESERVE = (
-    1.3  # least 2 mu_s N over the weight: slip begins at 0.3 g or more, and kinetic friction still bears the weight
-)
+RESERVE = 1.3  # smallest 2 mu_s N per weight: slip starts at 0.3 g or more, and kinetic friction carries the weight
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
-KEPT_BYTES = 1 << 24  # size of streams that are kept in memory
-LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the load must then be too much
+MEMORY_BYTES = 1 << 24  # size of streams above which they move to disk
+LOSS_S, SLIDE_S = 0.02, 0.04  # duration of a loss of grip, and of the overload after it
 
 
 @dataclass(frozen=True)
 class PickRig:
     """The handling of the bottle and the logging of the streams. The fields are those of the stage's params.
 
-    To study one thing at a time: ``friction_scale=4`` never slips, ``effort=1.15`` slips because of the plan alone,
-    ``effort=0.9, grip_loss_probability=1, grip_loss=0.3`` because of the grip alone, and ``still`` keeps the load constant.
+    Control experiments: ``friction_scale=4`` never slips, ``effort=1.15`` slips only because of the planned motion,
+    ``effort=0.9, grip_loss_probability=1, grip_loss=0.3`` only because of the grip, and ``still`` has a constant load.
     """
 
     duration_s: float = 12.0
     protocol: str = "mixed"  # name of trajectory.PROTOCOLS, or mixed for equal chances
-    effort: float = 0.0  # largest load that the plan makes over the friction limit; 0: grip and friction are random
+    effort: float = 0.0  # ratio of the largest planned load to the friction limit; 0: random grip and friction
     friction_scale: float = 1.0
     grip_loss_probability: float = 0.0
     grip_loss: float = 0.2
@@ -91,7 +90,7 @@ class PickRig:
 
 @dataclass(frozen=True)
 class PickScene:
-    """The true course of a trial before logging; arrays are (time, …) at 1 kHz."""
+    """The ground truth of a trial. Arrays have shape (time, …) at 1 kHz."""
 
     protocol: str
     path: trajectory.Trajectory
@@ -99,19 +98,19 @@ class PickScene:
     grasp: mechanics.HeldObject
     contact: mechanics.Contact
     skins: tuple[taxels.Skin, taxels.Skin]
-    loss_ns: int | None  # when the grip gave way
+    loss_ns: int | None  # time of a loss of grip
 
 
 def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> RecordingOutput:
-    """Return trial ``index`` of the rig: the streams xela1, xela2, robot, proximity and truth, and what is known of them.
+    """Simulate trial ``index`` of the rig, with the streams xela1, xela2, robot, proximity and truth.
 
-    The same seed, index and rig give the same values. Attributes that begin with ``gt_`` and the columns of ``truth``,
-    at 1 kHz, are ground truth. Raises `TacpipeError` for a trial too short to lift anything.
+    The same seed, index and rig give the same values. Attributes that start with ``gt_`` and the columns of ``truth``, at
+    1 kHz, are ground truth. Raises `TacpipeError` if the trial is too short for the lift.
     """
     scene = perform(seed, index, rig)
     start_ns = START_NS + index * TRIAL_NS
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
-    spill = Spill(KEPT_BYTES)
+    spill = Spill(MEMORY_BYTES)
     labels: dict[str, Attribute] = {}
     duration_ns = int(scene.path.t_ns[-1])
     devices = {
@@ -126,11 +125,11 @@ def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> Recording
         offset, skew = rng.uniform(-1, 1, 2)
         clock = faults.DeviceClock(round(offset * offset_ms * 1e6), float(skew * rig.clock_skew_ppm * 1e-6))
         arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
-        measured, fields = _measured(name, scene, samples.true_ns, rig, rng)
+        measure, fields = _measurement(name, scene, samples.true_ns, rig, rng)
 
         def build_rows(block: slice) -> pa.Table:
             clocks = [start_ns + faults.device_stamps(samples.true_ns[block], clock), samples.seq[block]]  # noqa: B023
-            columns = [*clocks, *measured(block).T]  # noqa: B023
+            columns = [*clocks, *measure(block).T]  # noqa: B023
             return schema.stream(start_ns + arrived_ns[block], columns, [*_clock_fields(), *fields])  # noqa: B023
 
         streams[name] = _in_blocks(len(samples.seq), build_rows, spill)
@@ -140,7 +139,7 @@ def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> Recording
 
 
 def _in_blocks(rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill) -> pa.Table | pa.RecordBatchReader:
-    """Return a stream of so many rows, of which some are made at a time and put aside."""
+    """Return a stream of ``rows`` rows, built in blocks that are spilled to disk."""
     gathered = Gathered(spill, build_rows(slice(0, 0)))
     for first in range(0, rows, BLOCK_ROWS):
         gathered.add(build_rows(slice(first, first + BLOCK_ROWS)))
@@ -148,7 +147,7 @@ def _in_blocks(rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill)
 
 
 def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
-    """Return what truly happens in trial ``index``; how its streams are logged changes nothing of it."""
+    """Simulate the scene of trial ``index``. It does not depend on the logging of its streams."""
     rng = np.random.default_rng([seed, index])
     approach_s, pause_s = rng.uniform(*APPROACH_S), rng.uniform(*PAUSE_S)
     chance = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
@@ -200,17 +199,17 @@ def touch(
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
     pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
-    late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
+    late = at(taxels.lag(contact.normal_n[:, finger], trajectory.RATE_HZ))
     fraction = taxels.fractions(scene.skins[finger], displacement, torque, places_m)
     pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * fraction
     columns = slice(finger * len(places_m), (finger + 1) * len(places_m))
     return np.concatenate([pulled[:, columns] + taxels.bulge(pressed, places_m), pressed[:, :, None]], axis=2)
 
 
-def _measured(
+def _measurement(
     name: str, scene: PickScene, true_ns: Times, rig: PickRig, rng: np.random.Generator
 ) -> tuple[Callable[[slice], AnyArray], list[Any]]:
-    """Return what a device logs of some of the samples taken at ``true_ns`` (time, channel), and its fields."""
+    """Return a function that returns a block of a device's samples at ``true_ns`` (time, channel), and the fields."""
     if name == "robot":
         return lambda block: arm(scene, true_ns[block]), [
             schema.float_field("finger_m", "m", "finger_width"),
@@ -225,14 +224,14 @@ def _measured(
     force = touch(scene, finger, true_ns, creep=0.0 if rig.still else taxels.CREEP)
     drift_scale = 0.0 if rig.still else rig.noise_scale
     errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
-    counts = taxels.digitised(skin.base_count + taxels.signal(skin, force) + errors)
+    counts = taxels.digitise(skin.base_count + taxels.signal(skin, force) + errors)
     return faults.hold(counts, rig.hold_probability, rng)[0].__getitem__, schema.uskin_fields()
 
 
 def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a random grip force and friction that hold the weight, or such that ``load_n`` is ``effort`` of their limit.
+    """Return a random grip force and friction that hold the weight, or with which ``load_n`` is ``effort`` of the limit.
 
-    Where effort, mass and plan ask for a grip beyond `GRIP_N`, the grip lies beyond it.
+    The grip is outside of `GRIP_N` if effort, mass and plan require it.
     """
     if effort:
         product = load_n / (2 * effort)
@@ -248,17 +247,18 @@ def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator
 def _loss_row(
     load_n: Floats, grasp: mechanics.HeldObject, rise_m: Floats, loss: float, rng: np.random.Generator
 ) -> int:
-    """Return a random row in which the grip gives way while the hand is up: one after which the load is too much.
+    """Return a random row for a loss of grip while the hand is lifted and after which the load exceeds friction.
 
-    The load must stay so from where the grip has given way until `SLIDE_S` later. Where that is nowhere so, any row
-    will do.
+    The load must exceed friction for `SLIDE_S` after the loss. If there is no such row, any row with a lifted hand is used.
     """
     aloft = rise_m >= rise_m.max() / 2
-    start, until = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
-    short = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))  # rows before each in which friction holds
+    start, stop = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
+    sticking = np.cumsum(
+        np.append(0, load_n <= (1 - loss) * grasp.limit_n)
+    )  # number of earlier rows in which friction holds
     sliding = aloft.copy()
-    sliding[-until:] = False
-    sliding[:-until] &= short[until:-1] == short[start : start - until - 1]
+    sliding[-stop:] = False
+    sliding[:-stop] &= sticking[stop:-1] == sticking[start : start - stop - 1]
     return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
 
 
@@ -277,7 +277,7 @@ def interpolation(scene: PickScene, true_ns: Times) -> Any:
 
 
 def arm(scene: PickScene, true_ns: Times) -> Floats:
-    """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
+    """Return finger width, position and quaternion (time, 8) at ``true_ns``. The gripper points down and yaws."""
     at = interpolation(scene, true_ns)
     half = at(scene.path.yaw_rad) / 2
     zero = np.zeros_like(half)
@@ -290,7 +290,7 @@ def _clock_fields() -> list[Any]:
 
 
 def _truth(scene: PickScene, start_ns: int) -> Callable[[slice], pa.Table]:
-    """Return a function that returns some rows of the stream ``truth`` at 1 kHz."""
+    """Return a function that returns a block of rows of the stream ``truth`` at 1 kHz."""
     contact, acceleration_m_s2 = scene.contact, scene.path.acceleration_m_s2
 
     def build_rows(block: slice) -> pa.Table:

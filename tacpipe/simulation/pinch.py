@@ -1,13 +1,13 @@
-"""A pinch: how hard two fingers press on what lies between them, and where and how widely each touches it.
+"""Compute the forces of a pinch with two fingers, and the position and size of each contact.
 
-What a camera and a planned grasp state is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
-the torque of its joints allows, the less the wider the hand is open, or, on soft objects, as the object resists:
-F = min(F_max, k s), with k = 2 E R of a flat punch as wide as the tip (K. L. Johnson, *Contact Mechanics*, Cambridge
-1985, section 3.8) and s by how much fingers close beyond touch. The two forces differ by what the table's friction and
-the arm hold, as in published grasps, where the pressures of the two fingers go their own ways.
+`Situation` has the values that a camera and a planned grasp determine, `Unseen` the others. Each finger presses with the
+force that its joint torque allows, which decreases with the opening, or, on soft objects, with the object's resistance:
+F = min(F_max, k s), where k = 2 E R is the stiffness for a flat punch with the width of the tip (K. L. Johnson, *Contact
+Mechanics*, Cambridge 1985, section 3.8) and s is the closing distance beyond contact. The two forces may differ, because
+table friction and the arm carry the difference, as in published grasps.
 
-The width and depth of a contact follow Hertz, with the equations of chapter 4 of the same book. Arrays of any shape are
-taken together; forces are in newton, lengths in metres, curvatures in 1/m, moduli in pascal.
+Size and depth of a contact follow Hertz, with the equations of chapter 4 of the same book. Arrays may have any shape.
+Units are N, m, 1/m and Pa.
 """
 
 from __future__ import annotations
@@ -25,12 +25,11 @@ from tacpipe.simulation.depth_camera import Placed
 
 
 def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:
-    """Return the radius of the sphere that touches a plane as a spherical tip does a surface, metres.
+    """Return the radius in metres of the sphere whose contact with a plane equals that of a tip with a surface.
 
-    ``curvatures_1_m`` are the surface's two principal curvatures (..., 2). Each adds to the tip's own; the radius is
-    the geometric mean of both relative ones, equation (4.25) with R_e = (R' R'')^(1/2). For a sphere of radius R it is
-    1 / (1/tip + 1/R). Raises `ValueError` if the surface is hollowed out so much that the tip does not reach its
-    ground.
+    ``curvatures_1_m`` are the surface's principal curvatures (..., 2). Each is added to the tip's curvature; the radius
+    is the geometric mean of both relative radii, equation (4.25) with R_e = (R' R'')^(1/2). For a sphere of radius R it
+    is 1 / (1/tip + 1/R). Raises `ValueError` if the surface is so concave that the tip does not fit.
     """
     relative = 1 / tip_m + np.asarray(curvatures_1_m, np.float64)
     if (relative <= 0).any():
@@ -39,17 +38,17 @@ def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:
 
 
 def effective_modulus_pa(skin_pa: float, compliance_1_pa: float) -> float:
-    """Return E* of a skin on an object, pascal: 1/E* = 1/E_skin + compliance, which is 0 for a rigid object."""
+    """Return E* of a skin on an object in Pa: 1/E* = 1/E_skin + compliance, where a rigid object has compliance 0."""
     return 1 / (1 / skin_pa + compliance_1_pa)
 
 
 def contact_radius_m(force_n: ArrayLike, radius_m: ArrayLike, modulus_pa: float) -> Floats:
-    """Return a = (3 F R / 4 E*)^(1/3), metres, equation (4.22), or 0 if there is no force."""
+    """Return the contact radius a = (3 F R / 4 E*)^(1/3) in metres, equation (4.22); 0 without force."""
     return np.asarray(np.cbrt(3 * np.asarray(force_n, np.float64) * np.asarray(radius_m) / (4 * modulus_pa)))
 
 
 def indentation_m(contact_m: ArrayLike, radius_m: ArrayLike) -> Floats:
-    """Return by how much both bodies together give way, a^2 / R, metres, equation (4.23)."""
+    """Return the total indentation of both bodies a^2 / R in metres, equation (4.23)."""
     return np.asarray(np.asarray(contact_m, np.float64) ** 2 / np.asarray(radius_m))
 
 
@@ -57,42 +56,42 @@ TIP_M = 0.0067  # radius of a fingertip, an assumption
 SKIN_PA = 1.0e6  # modulus of its skin, an assumption
 FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # force of the joints at the smallest and the widest opening, by finger
 OPENING_M = (0.02, 0.12)
-SQUEEZE_M = (0.008, 0.012)  # distance that fingers close beyond the touch
-COMMON = 0.8  # fraction of the logarithm of the effort that both fingers have in common
+SQUEEZE_M = (0.008, 0.012)  # range of the closing distance beyond contact
+COMMON = 0.8  # common fraction of the variance of both fingers' log effort
 CENTRE_M = (
     (0.0038, 0.0),
     (-0.0013, 0.0),
-)  # along and around the finger, where a level contact is, but for the thumb's side
-SIDE_M = (0.003, 0.005)  # offset of the thumb's contact to its side
+)  # position of a level contact along and around the finger, without the thumb's side offset
+SIDE_M = (0.003, 0.005)  # range of the side offset of the thumb's contact
 BEND_RAD = 0.3  # angle of the last joint at the smallest opening; it is straight at the widest
 SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's pose
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The geometry of a grasp. Fingers are middle finger and thumb, axes are along and around the finger."""
+    """The geometry of a grasp. Fingers are middle finger and thumb; axes are along and around the finger."""
 
     opening_m: float
-    curvatures_1_m: Floats  # (finger, 2), principal ones of the object at the contact
-    bending_1_m: Floats  # (finger, axis), its normal curvatures along the axes of the pad
-    lean_rad: Floats  # (finger, axis), of the normal from the pad's own
-    compliance_1_pa: float  # compliance of the object
+    curvatures_1_m: Floats  # (finger, 2), principal curvatures of the object at the contact
+    bending_1_m: Floats  # (finger, axis), normal curvatures of the object along the axes of the pad
+    lean_rad: Floats  # (finger, axis), tilt of the contact normal from the pad's normal
+    compliance_1_pa: float  # of the object
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """The unobserved values of grasps, drawn any number of times."""
+    """Random draws of the unobserved values of grasps."""
 
-    effort: Floats  # (draw, finger), by which the torque limit is multiplied
-    squeeze_m: Floats  # (draw,)
-    shift_m: Floats  # (draw, finger, axis), of the fingertip across the normal
-    tilt_rad: Floats  # (draw, finger, axis)
-    side_m: Floats  # (draw,), of the thumb
+    effort: Floats  # (draw, finger), factor of the torque limit
+    squeeze_m: Floats  # (draw,), closing distance beyond contact
+    shift_m: Floats  # (draw, finger, axis), position error of the fingertip across the normal
+    tilt_rad: Floats  # (draw, finger, axis), orientation error of the fingertip
+    side_m: Floats  # (draw,), side offset of the thumb's contact
 
 
 @dataclass(frozen=True)
 class Touch:
-    """The resulting touch: force, radius of the contact, deformation of the skin, and position of the contact."""
+    """Force, radius and position of a contact, and the deformation of the skin."""
 
     force_n: Floats  # (draw, finger)
     contact_m: Floats  # (draw, finger)
@@ -101,7 +100,7 @@ class Touch:
 
 
 def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation:
-    """Return what geometry reports on a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
+    """Return the geometry of a grasp with a wrist. The middle finger is at ``g1``, the thumb at ``g2``."""
     assert grasp.wrist is not None
     at_m = np.stack([grasp.g1_m, grasp.g2_m])
     normal, bending = placed.normal(at_m), placed.bending(at_m)
@@ -115,8 +114,8 @@ def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation
     return Situation(grasp.opening_m, principal_curvatures(bending, normal), along, lean, compliance_1_pa)
 
 
-def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen:
-    """Return ``draws`` draws of what nobody sees; ``effort_spread`` is the standard deviation of the effort's logarithm."""
+def draw_unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen:
+    """Return ``draws`` draws of the unobserved values. ``effort_spread`` is the standard deviation of the log effort."""
     common, individual = rng.normal(size=(draws, 1)), rng.normal(size=(draws, 2))
     return Unseen(
         np.exp(effort_spread * (np.sqrt(COMMON) * common + np.sqrt(1 - COMMON) * individual)),
@@ -128,24 +127,24 @@ def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen
 
 
 def limits_n(opening_m: float) -> Floats:
-    """Return the force that the joints' torque allows each finger (finger,), N: it falls with the opening."""
+    """Return the largest force of each finger (finger,) in N, which decreases with the opening."""
     fraction = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
     return np.array([narrow + fraction * (wide - narrow) for narrow, wide in FORCE_N])
 
 
 def touch(situation: Situation, hidden: Unseen) -> Touch:
-    """Return what comes of a situation and each draw of what nobody sees."""
+    """Return the contacts for a situation and each draw of the unobserved values."""
     force = hidden.effort * limits_n(situation.opening_m)
     if situation.compliance_1_pa:
         resisted = 2 / situation.compliance_1_pa * TIP_M * hidden.squeeze_m
         force = np.minimum(force, resisted[:, None])
-    return Touch(force, *pressed(situation, force), centre(situation, hidden))
+    return Touch(force, *deformation(situation, force), centre(situation, hidden))
 
 
-def pressed(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
-    """Return the contact's radius and by how much the skin gives way, metres, under forces (..., finger).
+def deformation(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
+    """Return the contact radius and the deformation of the skin in metres under forces (..., finger).
 
-    Of the whole indentation the skin takes the share E* / E_skin: both bodies give way in proportion to compliance.
+    The skin's share of the total indentation is E* / E_skin, because both bodies deform in proportion to their compliance.
     """
     radius = effective_radius_m(TIP_M, situation.curvatures_1_m)
     modulus = effective_modulus_pa(SKIN_PA, situation.compliance_1_pa)
@@ -154,10 +153,10 @@ def pressed(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
 
 
 def centre(situation: Situation, hidden: Unseen) -> Floats:
-    """Return the middle of the contact on the unrolled core (draw, finger, axis), metres.
+    """Return the centre of the contact on the unrolled core (draw, finger, axis) in metres.
 
-    A round tip touches where its normal is the object's. Tips that are shifted by e over a surface of curvature k roll
-    to where the normal leans by e k / (1 + k R).
+    The contact of a round tip is where its normal equals the object's. For a tip shifted by e on a surface of curvature
+    k, the normal tilts by e k / (1 + k R).
     """
     fraction = (situation.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
     lean = situation.lean_rad + np.array([BEND_RAD * (2 * fraction - 1), 0.0]) + hidden.tilt_rad
@@ -169,20 +168,20 @@ def centre(situation: Situation, hidden: Unseen) -> Floats:
 
 RATE_HZ = 100.0  # rate of readings
 FREE_S, CLOSING_S, HELD_S, RELEASE_S, AFTER_S = (0.8, 1.4), (0.3, 0.6), (0.8, 1.4), 0.2, 0.5
-JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the host
+JITTER_NS = 100_000.0  # mean and standard deviation of the delay of a reading
 
 
 @dataclass(frozen=True)
 class PinchCourse:
-    """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
+    """The arrival times of readings (time,), and the fraction of the full force at these times (time,)."""
 
     t_ns: Times
     fraction: Floats
-    moments_ns: dict[str, int]  # contact: first touch; hold: the force is reached; release: it begins to fall
+    moments_ns: dict[str, int]  # contact: first touch; hold: full force; release: start of its decrease
 
 
 def course(start_ns: int, rng: np.random.Generator) -> PinchCourse:
-    """Return a course that starts at ``start_ns``; how long each part lasts is random."""
+    """Return a course that starts at ``start_ns`` and whose phases have random durations."""
     free_s, closing_s, held_s = (float(rng.uniform(*limits)) for limits in (FREE_S, CLOSING_S, HELD_S))
     knots_s = np.cumsum([free_s, closing_s, held_s, RELEASE_S])
     true_s = np.arange(round((knots_s[-1] + AFTER_S) * RATE_HZ)) / RATE_HZ

@@ -1,18 +1,18 @@
-"""A slide over a material, on the simulated rig of two unlike sensors: a BioTac on an arm, or RoboSkin on a forearm.
+"""Simulate slides over materials with two different sensors: a BioTac on an arm, and RoboSkin on a forearm.
 
-Trial i is one of the BioTac if i is even, of RoboSkin if it is odd; the materials take turns. What happens in one of the
-BioTac, as on the published rig:
+Even trials use the BioTac, odd ones RoboSkin; the materials alternate. A BioTac trial, as on the published rig:
 
-1. the finger hangs free, then comes down at 0.5 mm/s until its pressure exceeds 40 counts, 1.4 N;
-2. the arm draws it along at 25 mm/s for 8 s (for 6 s on material 1), while the force settles at about 1 N;
+1. the finger is free, then moves down at 0.5 mm/s until its pressure exceeds 40 counts (1.4 N);
+2. the arm moves it at 25 mm/s for 8 s (6 s on material 1), while the force settles at about 1 N;
 3. the arm lifts it.
 
-A slide of RoboSkin is 75 frames in contact, at a speed and over triangles that are not well controlled.
+A RoboSkin slide has 75 frames in contact, at a speed and over triangles that are not well controlled.
 
-Both sensors measure ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
-``texture`` is what `tacpipe.simulation.texture` reports on the surface, and the offset is nuisance. It is in part one of
-the session, common to all trials of a material in it and drifting from trial to trial, as is a gain: where each
-material has one session, as in the published recordings, such a fingerprint states the material without any texture.
+Each channel of both sensors measures ``gain share [F (1 + mu d) + texture(x + xi) + offset]``: xi is the position of the
+channel, ``texture`` is from `tacpipe.simulation.texture`, and the offset is a nuisance. Part of it belongs to the
+session: it is common to all trials of a material in the session and drifts between trials; there is also a gain per
+session. If each material has only one session, as in the published recordings, this fingerprint reveals the material
+without any texture.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from tacpipe.simulation import faults, fingertip, forearm, texture
 
 SENSORS = ("biotac", "roboskin")
 SPECTRA = ("shared", "independent")
-START_NS = 1_581_000_000_000_000_000  # UTC stamp of the first trial's start
+START_NS = 1_581_000_000_000_000_000  # UTC time of the first trial
 TRIAL_NS = 60_000_000_000
-FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a fraction of it
-HOVER_S = (0.2, 0.4)  # time before the finger touches
+FORCE_SPREAD = 0.05  # relative standard deviation of the force between trials
+HOVER_S = (0.2, 0.4)  # range of the time before contact
 APPROACH_M_S = 0.0005
-SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material was recorded for less time
-RAMP_S = 0.3  # over which speed and force settle
+SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material has shorter recordings
+RAMP_S = 0.3  # time in which speed and force settle
 STOP_S, LIFT_S, AFTER_S = 0.1, 0.1, 0.3
-SPEED_SPREAD = 0.01  # standard deviation of the arm's speed between trials; half as much within a trial
-WANDER, MOST_WANDER = 0.07, 0.3  # share by which the forearm's speed varies: standard deviation, and at most
-WANDER_S = (0.8, 2.0)  # periods of that
-SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviation between sessions: gain, and offset of each channel in newton
-DRIFT_N, DRIFT_TRIALS = 0.04, 50  # drift of an offset, over so many trials of a session
-TRIAL_N = 0.10  # standard deviation of each channel's offset from trial to trial
+SPEED_SPREAD = 0.01  # relative standard deviation of the arm's speed between trials; half of it within a trial
+WANDER, MAX_WANDER = 0.07, 0.3  # relative variation of the forearm's speed: standard deviation, and limit
+WANDER_S = (0.8, 2.0)  # range of the period of this variation
+SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviations between sessions: gain, and offset of each channel in N
+DRIFT_N, DRIFT_TRIALS = 0.04, 50  # drift of an offset over a number of trials of a session
+TRIAL_N = 0.10  # standard deviation of each channel's offset between trials
 ARM_HZ = 150.0
-ARM_GAP = 0.12  # fraction of the arm's readings after which the link is silent
+ARM_GAP = 0.12  # fraction of the arm's readings that are followed by a gap
 ARM_GAP_S = 0.04
 SPEED_NOISE_M_S, SPIKE_M_S, SPIKES = 0.0006, 0.02, 0.01
 FORCE_NOISE_N, TORQUE_NOISE_NM = 0.15, 0.02
@@ -58,9 +58,8 @@ MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
 class SlideRig:
     """The materials and the quality of the sensors. The fields are those of the stage's params.
 
-    Controls: with ``identical_materials`` nothing but the session distinguishes one class from another, with
-    ``session_scale=0`` nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in
-    common.
+    Control experiments: with ``identical_materials``, classes differ only in their sessions; with ``session_scale=0``,
+    only in their materials; with ``spectra="independent"``, the two sensors measure unrelated textures.
     """
 
     materials: int = 20
@@ -78,8 +77,8 @@ class SlideRig:
 
 
 @dataclass(frozen=True)
-class TrialPlace:
-    """The place of a trial in the plan of the rig; all but ``number`` count from 1, except that material 0 is any."""
+class SlideTrial:
+    """Sensor, material, session and number of a trial. Materials and sessions count from 1."""
 
     sensor: str
     material: int
@@ -89,40 +88,40 @@ class TrialPlace:
 
 @dataclass(frozen=True)
 class SlideScene:
-    """The true course of a trial at the sensor's samples; arrays are (time,) unless stated otherwise."""
+    """The ground truth of a trial at the sensor's sample times. Arrays have shape (time,) by default."""
 
-    place: TrialPlace
+    trial: SlideTrial
     material: texture.Material
     surface: texture.Waves
     true_ns: Times  # since the start of the trial
-    position_m: Floats  # position along the slide
+    position_m: Floats  # along the slide
     speed_m_s: Floats
     force_n: Floats
-    contact: Floats  # 0: nothing is touched, 1: pressed as in the slide
-    phase: NDArray[np.int8]  # -1 before the slide, 0 in it, 1 after
-    patch_m: Floats  # (time, axis): centre of what is pressed, along the skin and across it
-    pressure_count: Counts  # pressure of the finger's fluid as logged, empty for RoboSkin
+    contact: Floats  # 0: no contact, 1: full contact
+    phase: NDArray[np.int8]  # -1 before the slide, 0 during it, 1 after it
+    patch_m: Floats  # (time, axis): centre of the pressed patch along and across the skin
+    pressure_count: Counts  # logged fluid pressure of the finger; empty for RoboSkin
 
 
-def place(index: int, rig: SlideRig) -> TrialPlace:
-    """Return what trial ``index`` is a trial of."""
+def slide_trial(index: int, rig: SlideRig) -> SlideTrial:
+    """Return sensor, material, session and number of trial ``index``."""
     number, position = divmod(index, len(SENSORS) * rig.materials)
     session = number % rig.sessions + 1
-    return TrialPlace(SENSORS[position % len(SENSORS)], position // len(SENSORS) + 1, session, number)
+    return SlideTrial(SENSORS[position % len(SENSORS)], position // len(SENSORS) + 1, session, number)
 
 
 def material(seed: int, sensor: str, number: int, rig: SlideRig = SlideRig()) -> texture.Material:
-    """Return material ``number`` as ``sensor`` measures it: the same for both sensors where they share their spectra."""
+    """Return material ``number`` for ``sensor``. It is the same for both sensors if they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
     index = 0 if rig.identical_materials else number
     return texture.material(np.random.default_rng([seed, MATERIAL, source, index]))
 
 
 def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> RecordingOutput:
-    """Return trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some of the BioTac the arm's.
+    """Simulate trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some BioTac trials the arm.
 
-    The same seed, index and rig give the same values. Columns of ``truth``, on the true times of the tactile samples,
-    are ground truth. Raises `TacpipeError` for a rig that cannot be.
+    The same seed, index and rig give the same values. Columns of ``truth``, at the true times of the tactile samples,
+    are ground truth. Raises `TacpipeError` if the rig is invalid.
     """
     _check(rig)
     scene = perform(seed, index, rig)
@@ -130,33 +129,33 @@ def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> Recordi
     rng = np.random.default_rng([seed, NOISE, index])
     signal = response(seed, index, scene, rig)
     streams = {}
-    if scene.place.sensor == "biotac":
+    if scene.trial.sensor == "biotac":
         arrived_ns = start_ns + faults.arrivals(scene.true_ns, rig.jitter_ms * 1e6, rng)
         streams["biotac"] = schema.stream(arrived_ns, _finger(scene, signal, rig, rng), schema.biotac_fields())
-        if rig.arm_every and scene.place.number % rig.arm_every == 0:
+        if rig.arm_every and scene.trial.number % rig.arm_every == 0:
             streams |= _arm(scene, start_ns, rig, rng)
     else:
         taxels = forearm.read(signal, rig.noise_scale, rng)
         note = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
         streams["roboskin"] = schema.stream(start_ns + scene.true_ns, taxels.T, schema.roboskin_fields(), note)
     streams["truth"] = _truth(scene, start_ns)
-    return RecordingOutput(streams, _attributes(scene.place))
+    return RecordingOutput(streams, _attributes(scene.trial))
 
 
 def perform(seed: int, index: int, rig: SlideRig = SlideRig()) -> SlideScene:
-    """Return what truly happens in trial ``index``."""
-    slot = place(index, rig)
+    """Simulate the scene of trial ``index``."""
+    trial = slide_trial(index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
-    surface_material = material(seed, slot.sensor, slot.material, rig)
+    surface_material = material(seed, trial.sensor, trial.material, rig)
     surface = texture.track(surface_material, rng)
     force_n = rig.force_n * (1 + FORCE_SPREAD * float(rng.normal()))
-    if slot.sensor == "biotac":
-        return _drawn(slot, surface_material, surface, force_n, rig, rng)
-    return _rolled(slot, surface_material, surface, force_n, rig, rng)
+    if trial.sensor == "biotac":
+        return _biotac_scene(trial, surface_material, surface, force_n, rig, rng)
+    return _roboskin_scene(trial, surface_material, surface, force_n, rig, rng)
 
 
 def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig()) -> Floats:
-    """Return what each channel measures in a trial (time, channel), counts without noise."""
+    """Return the noise-free counts of each channel in a trial (time, channel)."""
     gain, lean, along_m, aperture_m = sensitivity(scene)
     contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
@@ -166,8 +165,8 @@ def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig(
 
 
 def sensitivity(scene: SlideScene) -> tuple[Floats, Floats, Floats, float]:
-    """Return counts per newton (time, channel), d (time, channel), xi (channel,) in metres, and the aperture's sigma."""
-    if scene.place.sensor == "biotac":
+    """Return counts per newton (time, channel), d (time, channel), xi (channel,) in m, and the aperture's sigma in m."""
+    if scene.trial.sensor == "biotac":
         shape = (len(scene.true_ns), schema.ELECTRODES)
         gain, lean = (np.broadcast_to(values, shape) for values in (fingertip.gains(), fingertip.leans()))
         return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
@@ -176,45 +175,45 @@ def sensitivity(scene: SlideScene) -> tuple[Floats, Floats, Floats, float]:
 
 
 def nuisance(seed: int, index: int, number: int, rig: SlideRig = SlideRig()) -> tuple[float, Floats]:
-    """Return the gain of a trial's session and the offset of each of ``number`` channels in that trial, N (channel,)."""
-    slot = place(index, rig)
-    rng = np.random.default_rng([seed, SESSION, SENSORS.index(slot.sensor), slot.material, slot.session])
+    """Return the gain of a trial's session, and the offsets (channel,) in N of ``number`` channels in the trial."""
+    trial = slide_trial(index, rig)
+    rng = np.random.default_rng([seed, SESSION, SENSORS.index(trial.sensor), trial.material, trial.session])
     factor = float(np.exp(rig.session_scale * SESSION_GAIN * rng.normal()))
     offset, drift = rng.normal(0, 1, (2, number))
-    late = slot.number // rig.sessions / DRIFT_TRIALS
+    late = trial.number // rig.sessions / DRIFT_TRIALS
     noise = np.random.default_rng([seed, SESSION, index]).normal(0, 1, number)
     return factor, rig.session_scale * (SESSION_N * offset + DRIFT_N * late * drift) + rig.noise_scale * TRIAL_N * noise
 
 
-def _drawn(
-    slot: TrialPlace,
+def _biotac_scene(
+    trial: SlideTrial,
     surface_material: texture.Material,
     surface: texture.Waves,
     force_n: float,
     rig: SlideRig,
     rng: np.random.Generator,
 ) -> SlideScene:
-    """Return a slide of the BioTac, which starts with the first sample whose pressure is above the trigger."""
+    """Return a BioTac slide, which starts with the first sample whose pressure exceeds the trigger."""
     rate_hz = fingertip.RATE_HZ
     touch_s, phase_s = rng.uniform(*HOVER_S), rng.random() / rate_hz
     loading_n_s = surface_material.stiffness_n_m * APPROACH_M_S
-    short = slot.material == SHORT_MATERIAL and not rig.identical_materials
-    lasts_s = SHORT_SLIDE_S if short else SLIDE_S
+    short = trial.material == SHORT_MATERIAL and not rig.identical_materials
+    duration_s = SHORT_SLIDE_S if short else SLIDE_S
     longest_s = touch_s + 2 * fingertip.TRIGGER_COUNT / fingertip.PRESSURE_COUNT_N / loading_n_s
-    at_s = phase_s + np.arange(round((longest_s + lasts_s + AFTER_S) * rate_hz)) / rate_hz
+    at_s = phase_s + np.arange(round((longest_s + duration_s + AFTER_S) * rate_hz)) / rate_hz
     noise = rig.noise_scale * rng.normal(0, fingertip.PRESSURE_NOISE_COUNT, len(at_s))
     coming_n = loading_n_s * np.maximum(at_s - touch_s, 0)
     first = int((fingertip.pressure(coming_n, noise) > fingertip.TRIGGER_COUNT).argmax())
-    rows = first + round((lasts_s + AFTER_S) * rate_hz)
+    rows = first + round((duration_s + AFTER_S) * rate_hz)
     at_s, since_s = at_s[:rows], at_s[:rows] - at_s[first]
-    position_m, speed_m_s = _way(since_s, lasts_s, rig.speed_m_s, rng)
+    position_m, speed_m_s = _arm_motion(since_s, duration_s, rig.speed_m_s, rng)
     settling = np.clip(since_s / RAMP_S, 0, 1)
-    lifting = 1 - np.clip((since_s - lasts_s) / LIFT_S, 0, 1)
+    lifting = 1 - np.clip((since_s - duration_s) / LIFT_S, 0, 1)
     sliding_n = (1 - settling) * coming_n[first] + settling * force_n
     pressed_n = np.where(since_s < 0, coming_n[:rows], sliding_n * lifting)
-    phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(lasts_s * rate_hz), 0, 1))
+    phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(duration_s * rate_hz), 0, 1))
     return SlideScene(
-        slot,
+        trial,
         surface_material,
         surface,
         np.rint(at_s * 1e9).astype(np.int64),
@@ -228,24 +227,24 @@ def _drawn(
     )
 
 
-def _rolled(
-    slot: TrialPlace,
+def _roboskin_scene(
+    trial: SlideTrial,
     surface_material: texture.Material,
     surface: texture.Waves,
     force_n: float,
     rig: SlideRig,
     rng: np.random.Generator,
 ) -> SlideScene:
-    """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
+    """Return a RoboSkin slide, which is in contact in all frames, with a varying speed."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
-    variation = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
+    variation = float(np.clip(WANDER * rng.normal(), -MAX_WANDER, MAX_WANDER))
     period_s, phase = rng.uniform(*WANDER_S), rng.uniform(0, 2 * np.pi)
     turn = 2 * np.pi / period_s
     speed = rig.roboskin_speed_m_s * (1 + variation * np.sin(turn * at_s + phase))
     way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
     return SlideScene(
-        slot,
+        trial,
         surface_material,
         surface,
         np.rint(at_s * 1e9).astype(np.int64),
@@ -259,18 +258,20 @@ def _rolled(
     )
 
 
-def _way(since_s: Floats, lasts_s: float, limit_m_s: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return position and speed of the arm (time,) at ``since_s`` after it is started."""
-    grid = np.arange(0, lasts_s, 0.001)
+def _arm_motion(
+    since_s: Floats, duration_s: float, limit_m_s: float, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return position and speed of the arm (time,) at ``since_s`` after its start."""
+    grid = np.arange(0, duration_s, 0.001)
     swing, period_s, phase = rng.normal(0, SPEED_SPREAD / 2), rng.uniform(1, 4), rng.uniform(0, 2 * np.pi)
     speed = limit_m_s * (1 + SPEED_SPREAD * rng.normal() + swing * np.sin(2 * np.pi * grid / period_s + phase))
-    speed *= np.clip(grid / RAMP_S, 0, 1) * np.clip((lasts_s - grid) / STOP_S, 0, 1)
+    speed *= np.clip(grid / RAMP_S, 0, 1) * np.clip((duration_s - grid) / STOP_S, 0, 1)
     position = np.append(0, np.cumsum(speed[:-1] + np.diff(speed) / 2) * 0.001)
     return np.interp(since_s, grid, position), np.interp(since_s, grid, speed, left=0.0, right=0.0)
 
 
 def _finger(scene: SlideScene, signal: Floats, rig: SlideRig, rng: np.random.Generator) -> list[Any]:
-    """Return the 44 columns of the stream biotac, each (time,)."""
+    """Return the 44 columns (time,) of the stream biotac."""
     electrodes = fingertip.read(signal, rig.noise_scale, rng)
     touched = scene.true_ns[int((scene.force_n > 0).argmax())]
     tdc, tac = fingertip.warmth((scene.true_ns - touched) / 1e9, rig.noise_scale, rng)
@@ -285,14 +286,16 @@ def _finger(scene: SlideScene, signal: Floats, rig: SlideRig, rng: np.random.Gen
 
 
 def _arm(scene: SlideScene, start_ns: int, rig: SlideRig, rng: np.random.Generator) -> dict[str, pa.Table]:
-    """Return the streams twist and wrench of the arm, on its own clock and with the silences of its link.
+    """Return the streams twist and wrench of the arm, on its own clock and with gaps.
 
-    The arm slides along -x, and z is up. Nobody estimates angular velocity: it is NaN, as in the published recordings.
+    The arm slides along -x, and z is up. Angular velocity is NaN, as in the published recordings.
     """
     sample_ns = faults.samples(int(scene.true_ns[-1]), ARM_HZ, 0.0, rng).true_ns
     silent = rng.random(len(sample_ns)) < ARM_GAP
-    until_ns = np.maximum.accumulate(np.where(silent, sample_ns + rng.exponential(ARM_GAP_S * 1e9, len(sample_ns)), 0))
-    sample_ns = sample_ns[np.append(True, sample_ns[1:] > until_ns[:-1])]
+    gap_end_ns = np.maximum.accumulate(
+        np.where(silent, sample_ns + rng.exponential(ARM_GAP_S * 1e9, len(sample_ns)), 0)
+    )
+    sample_ns = sample_ns[np.append(True, sample_ns[1:] > gap_end_ns[:-1])]
     arrived_ns = start_ns + faults.arrivals(sample_ns, rig.jitter_ms * 1e6, rng)
     speed, force = (np.interp(sample_ns, scene.true_ns, values) for values in (scene.speed_m_s, scene.force_n))
     phase = np.interp(sample_ns, scene.true_ns, scene.phase)
@@ -327,24 +330,24 @@ def _truth(scene: SlideScene, start_ns: int) -> pa.Table:
     return schema.stream(start_ns + scene.true_ns, columns, fields)
 
 
-def _attributes(slot: TrialPlace) -> dict[str, Attribute]:
+def _attributes(trial: SlideTrial) -> dict[str, Attribute]:
     return {
-        "sensor": slot.sensor,
+        "sensor": trial.sensor,
         "simulated": True,
-        "material": slot.material,
-        "trial": slot.number + 1,
-        "session": f"{slot.sensor}-m{slot.material:02d}-s{slot.session}",
-        "rate_hz": fingertip.RATE_HZ if slot.sensor == "biotac" else forearm.RATE_HZ,
-        **({"layout": "time"} if slot.sensor == "roboskin" else {}),
+        "material": trial.material,
+        "trial": trial.number + 1,
+        "session": f"{trial.sensor}-m{trial.material:02d}-s{trial.session}",
+        "rate_hz": fingertip.RATE_HZ if trial.sensor == "biotac" else forearm.RATE_HZ,
+        **({"layout": "time"} if trial.sensor == "roboskin" else {}),
     }
 
 
 def _check(rig: SlideRig) -> None:
     if rig.spectra not in SPECTRA:
-        raise TacpipeError(f"There are no spectra {rig.spectra!r}; those of the sensors are shared or independent.")
+        raise TacpipeError(f"spectra is {rig.spectra!r}; it must be shared or independent.")
     for name in ("materials", "sessions"):
         if getattr(rig, name) < 1:
-            raise TacpipeError(f"{name} is {getattr(rig, name)}; the rig needs 1 or more.")
+            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 1 or more.")
     for name in ("force_n", "speed_m_s", "roboskin_speed_m_s"):
         if getattr(rig, name) <= 0:
-            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be above 0 for a slide.")
+            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be above 0.")

@@ -1,13 +1,13 @@
-"""The skin of a finger: how a 4x4 grid of taxels shares out what presses and pulls at it, and what it counts.
+"""Simulate the skin of a finger: a 4x4 grid of taxels under pressure and shear, and its counts.
 
-A Gaussian centred where the object touches shares the pressure; the object's displacement and a torque move it. Shear is
-elastic: the object moves the skins of both fingers by one and the same length, each taxel pulls back in proportion, up
-to mu times its pressure, and what the capped ones cannot bear the others do. So slip starts at the rim, where the
-pressure is least, and is complete where the object slips. The history of partial slip (Cattaneo and Mindlin) is left out.
-Pressure also bulges the skin outwards, by forces that add up to nothing.
+The pressure has a Gaussian distribution around the contact, which the object's displacement and a torque shift. Shear is
+elastic: the object displaces the skins of both fingers equally, and each taxel resists in proportion, up to mu times its
+pressure. Taxels below this limit carry the remaining load. Slip therefore starts at the rim, where the pressure is
+smallest, and is complete when the object slips. The history of partial slip (Cattaneo and Mindlin) is not modelled.
+Pressure also pushes the skin outwards, with forces that add up to zero.
 
-A count is ``base + C (f + q |f| f)`` with the neighbours' cross-talk, drift and noise, rounded; a fraction of the pressure
-in f follows late (creep). C (axis, axis) is a matrix a taxel. Without drift and noise `forces` gives f back.
+A count is ``base + C (f + q |f| f)`` plus cross-talk of neighbours, drift and noise, rounded. A fraction of the pressure
+in f is delayed (creep). C (axis, axis) is a matrix per taxel. Without drift and noise, `forces` returns f.
 
 Axes: a taxel's x is the hand's x, its y the hand's z, its z the pressure. Taxels are numbered row by row.
 """
@@ -22,28 +22,32 @@ from tacpipe.arrays import Counts, Floats
 from tacpipe.channels import places, schema
 
 PITCH_M = places.USKIN_PITCH_M  # pitch of the taxels
-PAD_M = 2 * PITCH_M  # half the width of a pad: the centre of what presses on it stays within
+PAD_M = 2 * PITCH_M  # half the width of a pad, the limit of the centre of pressure
 PLACES_M = places.uskin_m()  # (taxel, axis)
 SIGMA_M = (0.004, 0.006)  # standard deviation of the Gaussian that distributes the pressure
-CENTRE_M = 0.003  # largest distance of its centre from the pad's, along either axis
-TWIST_M_NM = 0.02  # shift of the pressure by a torque
-GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)  # x, y, z; with `BULGE` set for the spread of the published recordings
-OFF_AXIS = 0.05  # fraction of a force on the other axes
+CENTRE_M = 0.003  # largest distance of its centre from the pad's centre along each axis
+TWIST_M_NM = 0.02  # shift of the centre of pressure per torque
+GAIN_COUNT_N = (
+    1500.0,
+    1500.0,
+    3250.0,
+)  # x, y, z; chosen with `BULGE` for the standard deviations of the published recordings
+OFF_AXIS = 0.05  # fraction of a force that acts on the other axes
 QUADRATIC_N = 0.03  # q as a fraction of the gain, at one newton
 CROSSTALK = 0.08  # fraction of a taxel's signal in its four neighbours
-CREEP, CREEP_S = 0.03, 0.5  # fraction of the pressure that follows late, and how late
-BULGE = 0.4  # outward part of a taxel's pressure per pitch of distance from the centre
-BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # level at rest in the published recordings
+CREEP, CREEP_S = 0.03, 0.5  # fraction of the pressure that is delayed, and time constant of the delay
+BULGE = 0.4  # outward fraction of a taxel's pressure, per pitch of distance from the centre
+BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # rest levels in the published recordings
 BASE_SPREAD_COUNT = 300.0
-DRIFT_COUNT = 2.0  # random walk, counts after one second
+DRIFT_COUNT = 2.0  # random walk: standard deviation after one second
 NOISE_COUNT = (1.35, 1.15, 3.4)  # x, y, z; standard deviation of second differences / sqrt(6), quiet xela-psc frames
 
 
 @dataclass(frozen=True)
 class Skin:
-    """One finger's taxels and how the object lies on them."""
+    """The taxels of a finger, and the position of the contact."""
 
-    centre_m: Floats  # (2,), where the object touches before it moves
+    centre_m: Floats  # (2,), initial position of the contact
     sigma_m: float
     gain_count_n: Floats  # C (taxel, axis, axis)
     base_count: Floats  # (taxel, axis)
@@ -58,10 +62,10 @@ def skin(rng: np.random.Generator) -> Skin:
 
 
 def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats, places_m: Floats = PLACES_M) -> Floats:
-    """Return the fraction of the normal force that each taxel bears (time, taxel); they add up to one.
+    """Return the fraction of the normal force on each taxel (time, taxel). The fractions add up to 1.
 
-    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it; taxels lie at
-    ``places_m`` (taxel, axis).
+    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) the torque on it;
+    taxels lie at ``places_m`` (taxel, axis).
     """
     moved = skin.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
@@ -72,18 +76,19 @@ def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats, places_m: F
 
 
 def shear(cap_n: Floats, load_n: Floats) -> Floats:
-    """Return the shear of each taxel (time, taxel, 2) that together carry ``load_n`` (time, 2).
+    """Return the shear force of each taxel (time, taxel, 2), which together carry ``load_n`` (time, 2).
 
-    Each bears as much as the next, up to its cap (time, taxel). Where all are capped, they share in proportion to it.
+    All taxels carry the same load up to their caps (time, taxel). If all are capped, the load is distributed in
+    proportion to the caps.
     """
     total = np.linalg.norm(load_n, axis=1)
     ordered = np.sort(cap_n, axis=1)
     taxels = cap_n.shape[1]
-    below = np.cumsum(ordered, axis=1) - ordered  # load of the taxels with a smaller cap, if they are capped
+    below = np.cumsum(ordered, axis=1) - ordered  # load of the taxels with smaller caps, if they are capped
     level = (total[:, None] - below) / (
         taxels - np.arange(taxels)
-    )  # level of the remaining taxels if this one is not capped
-    fits = level <= ordered  # the first taxel of which this is so is not capped, nor are those behind it
+    )  # load of each remaining taxel if this one is not capped
+    fits = level <= ordered  # the first taxel for which this is True and those after it are not capped
     borne = np.minimum(cap_n, np.take_along_axis(level, fits.argmax(axis=1)[:, None], axis=1))
     full = ~fits.any(axis=1)
     borne[full] = cap_n[full]
@@ -94,7 +99,7 @@ def shear(cap_n: Floats, load_n: Floats) -> Floats:
 
 
 def bulge(pressed_n: Floats, places_m: Floats = PLACES_M) -> Floats:
-    """Return by how much pressure (time, taxel) pushes each taxel outwards (time, taxel, 2), nothing in sum."""
+    """Return the outward forces of taxels (time, taxel, 2) by pressure (time, taxel). Their sum is zero."""
     total = np.maximum(pressed_n.sum(axis=1, keepdims=True), 1e-12)
     outwards = places_m - (pressed_n @ places_m / total)[:, None]
     pushed: Floats = BULGE * pressed_n[:, :, None] * outwards / PITCH_M
@@ -102,14 +107,14 @@ def bulge(pressed_n: Floats, places_m: Floats = PLACES_M) -> Floats:
 
 
 def signal(skin: Skin, force_n: Floats) -> Floats:
-    """Return the counts above base (time, taxel, axis) that a force on each taxel (time, taxel, axis) gives."""
+    """Return the counts above base (time, taxel, axis) for forces on taxels (time, taxel, axis) in N."""
     bent = force_n + QUADRATIC_N * np.abs(force_n) * force_n
     counts: Floats = np.einsum("mn,tna->tma", crosstalk(), np.einsum("tna,nba->tnb", bent, skin.gain_count_n))
     return counts
 
 
 def forces(skin: Skin, counts: Floats) -> Floats:
-    """Return the force on each taxel (time, taxel, axis), N, that would give these counts without drift and noise."""
+    """Return the forces on taxels (time, taxel, axis) in N that give these counts without drift and noise."""
     above = np.einsum("mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, schema.TAXELS, 3) - skin.base_count)
     bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(skin.gain_count_n))
     size = (np.sqrt(1 + 4 * QUADRATIC_N * np.abs(bent)) - 1) / (2 * QUADRATIC_N)
@@ -118,15 +123,15 @@ def forces(skin: Skin, counts: Floats) -> Floats:
 
 
 def crosstalk() -> Floats:
-    """Return what of each taxel's signal each one sees (taxel, taxel)."""
+    """Return the cross-talk matrix (taxel, taxel)."""
     row, column = np.divmod(np.arange(schema.TAXELS), 4)
     distance = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
     matrix: Floats = np.eye(schema.TAXELS) + CROSSTALK * (distance == 1)
     return matrix
 
 
-def lagged(values: Floats, rate_hz: float) -> Floats:
-    """Return ``values`` (time,) after a first-order lag of `CREEP_S`, at rest in their first value."""
+def lag(values: Floats, rate_hz: float) -> Floats:
+    """Apply a first-order lag of `CREEP_S` to ``values`` (time,). The initial state is their first value."""
     steps = np.arange(round(12 * CREEP_S * rate_hz))
     kernel = np.exp(-steps / (CREEP_S * rate_hz))
     kernel /= kernel.sum()
@@ -137,7 +142,7 @@ def lagged(values: Floats, rate_hz: float) -> Floats:
 
 
 def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.Generator) -> Floats:
-    """Return noise and drift in counts (time, taxel, axis) of samples taken at ``at_s`` (time,)."""
+    """Return noise plus drift in counts (time, taxel, axis) for samples at ``at_s`` (time,)."""
     shape = (len(at_s), schema.TAXELS, 3)
     steps_s = np.diff(at_s, prepend=at_s[:1])
     drift = np.cumsum(rng.normal(0, 1.0, shape) * np.sqrt(steps_s)[:, None, None], axis=0) * DRIFT_COUNT
@@ -146,7 +151,7 @@ def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.
     return off
 
 
-def digitised(counts: Floats) -> Counts:
-    """Return counts (time, taxel, axis) as the device sends them (time, channel): rounded, within 16 bits."""
+def digitise(counts: Floats) -> Counts:
+    """Return the device's counts (time, channel) for counts (time, taxel, axis): rounded, clipped to 16 bits."""
     rounded: Counts = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
     return rounded

@@ -1,14 +1,14 @@
-"""The path of the hand: how the arm lifts an object and moves it about.
+"""Generate random paths of the hand that lift and move an object.
 
-Two protocols of collection are known (Mandil et al., TAROS 2021, and the authors' recordings):
+There are two published protocols (Mandil et al., TAROS 2021, and the authors' recordings):
 
-- *controlled*: Cartesian velocity commands of trapezoidal profile, first up, then along -x, then a hold. The published
-  generator cuts this into seven phases of equal length T, with acceleration V / T and 2 V T a leg, from x = 0.58 m and
-  z = 0.18 m; V and T are random here, and random legs follow until the time is over;
+- *controlled*: Cartesian velocity commands with a trapezoidal profile, first up, then along -x, then a hold. The published
+  generator has seven phases of equal duration T, with acceleration V / T and legs of length 2 V T, from x = 0.58 m and
+  z = 0.18 m. Here V and T are random, and random legs follow until the end;
 - *kinaesthetic*: a person moves the arm by hand. Human reaching is close to minimum jerk (Flash and Hogan 1985,
-  J. Neurosci. 5(7)); segments overlap, and a tremor lies on top.
+  J. Neurosci. 5(7)). Segments overlap, and a tremor is added.
 
-World axes: x and y are horizontal, z is up. The gripper points down and turns about the vertical by the yaw angle.
+World axes: x and y are horizontal, z is up. The gripper points down and rotates around the vertical by the yaw angle.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from tacpipe.errors import TacpipeError
 
 RATE_HZ = 1000  # rate of a Franka Emika Panda's states
 PROTOCOLS = ("controlled", "kinaesthetic")
-START_M = (0.58, 0.0, 0.18)  # x and z: the published profile generator
-JERK_S = 0.03  # over which the acceleration of a controlled profile changes
-PHASE_S = (0.16, 0.6)  # T of the lift and the leg after it
-JOLT_S = (0.06, 0.6)  # T of further legs: the short ones make the object slip a little and hold again
-SPEED_M_S = 1.0  # largest V; a Panda's hand is rated for 1.7 m/s
-LEG_M = (0.30, 0.15, 0.40)  # longest leg along x, y, z; the published ones are 0.30 m long
-AFTER_LIFT_S = 1.5  # time of a trial after the lift, at least
+START_M = (0.58, 0.0, 0.18)  # x and z from the published profile generator
+JERK_S = 0.03  # time in which the acceleration of a controlled profile changes
+PHASE_S = (0.16, 0.6)  # range of T for the lift and the next leg
+JOLT_S = (0.06, 0.6)  # range of T for further legs; short ones make the object slip briefly
+SPEED_M_S = 1.0  # largest V; the limit of a Panda's hand is 1.7 m/s
+LEG_M = (0.30, 0.15, 0.40)  # longest leg along x, y, z; the published legs have 0.30 m
+AFTER_LIFT_S = 1.5  # shortest time of a trial after the lift
 BOX_M = (
     (-0.25, 0.25),
     (-0.15, 0.15),
     (0.10, 0.40),
 )  # region in which a person carries the object, relative to the start
-PEAK_M_S2 = (1.0, 8.0)  # peak acceleration of a minimum-jerk segment; the larger one is the limit of a leg's too
-REACH = (0.05, 1.0)  # fraction of the way to its random target per segment: short ones are shakes
-MIN_SEGMENT_S = 0.12  # segment
-JERK_PEAK = 10 / np.sqrt(3)  # peak acceleration of a minimum-jerk segment of one metre in one second
-OVERLAP = (0.75, 1.15)  # start of the next segment, in lengths of this one
+PEAK_M_S2 = (1.0, 8.0)  # range of the peak acceleration of a minimum-jerk segment; the maximum also applies to legs
+REACH = (0.05, 1.0)  # range of the fraction of the distance to the target that a segment covers; short ones are shakes
+MIN_SEGMENT_S = 0.12
+JERK_PEAK = 10 / np.sqrt(3)  # peak acceleration in m/s² of a minimum-jerk segment of 1 m in 1 s
+OVERLAP = (0.75, 1.15)  # range of the start of the next segment, as a fraction of the duration of the current one
 TREMOR_HZ = 4.0
-TREMOR_M = (0.0002, 0.0008)  # amplitude along each axis: up to 0.5 m/s²
+TREMOR_M = (0.0002, 0.0008)  # range of the amplitude along each axis: up to 0.5 m/s²
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The motion of the hand at `RATE_HZ` from 0. Arrays are (time,) or (time, axis), in world coordinates."""
+    """The motion of the hand at `RATE_HZ`, starting at 0, in world coordinates."""
 
     t_ns: Times
     position_m: Floats  # (time, axis)
@@ -53,27 +53,27 @@ class Trajectory:
 
     @property
     def acceleration_m_s2(self) -> Floats:
-        """The second difference of the position (time, axis); nothing moves before the first row."""
+        """The second derivative of the position (time, axis). The hand is at rest before the first row."""
         return np.diff(self.position_m, n=2, axis=0, prepend=self.position_m[[0, 0]]) * RATE_HZ**2
 
     @property
     def rise_m(self) -> Floats:
-        """How far the hand is above where it started (time,)."""
+        """The height of the hand above its start (time,)."""
         rise: Floats = self.position_m[:, 2] - self.position_m[0, 2]
         return rise
 
     @property
     def hand_acceleration_m_s2(self) -> Floats:
-        """The acceleration in the frame of the hand, turned by the yaw (time, axis)."""
+        """The acceleration in the hand frame, which is rotated by the yaw (time, axis)."""
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         x, y, z = self.acceleration_m_s2.T
         return np.column_stack([cos * x + sin * y, cos * y - sin * x, z])
 
 
 def trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.Generator) -> Trajectory:
-    """Return a random trajectory of a protocol whose lift begins at ``first_s``.
+    """Return a random trajectory of a protocol whose lift starts at ``first_s``.
 
-    Raises `TacpipeError` for a protocol that is not known, and for a trial too short to lift anything.
+    Raises `TacpipeError` for an unknown protocol, or if the trial is too short for the lift.
     """
     if protocol not in PROTOCOLS:
         raise TacpipeError(f"There is no protocol {protocol!r}; it must be {', '.join(PROTOCOLS)} or mixed.")
@@ -87,20 +87,20 @@ def trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.
 
 
 def rest(duration_s: float) -> Trajectory:
-    """Return a hand that hovers, lifted, from the first row to the last."""
+    """Return the trajectory of a lifted hand at rest."""
     rows = round(duration_s * RATE_HZ) + 1
     return Trajectory(_stamps(rows), np.tile(np.add(START_M, (0.0, 0.0, BOX_M[2][0])), (rows, 1)), np.zeros(rows))
 
 
 def controlled(rows: int, first: int, rng: np.random.Generator) -> Floats:
-    """Return the path of the controlled protocol from row ``first``, in metres from the start (time, axis)."""
+    """Return a path of the controlled protocol that starts in row ``first`` (time, axis), in metres from the start."""
     acceleration = smooth(_trapezoids(rows, first, rng))
     path: Floats = np.cumsum(np.cumsum(acceleration, axis=0), axis=0) / RATE_HZ**2
     return path
 
 
 def kinaesthetic(rows: int, first: int, rng: np.random.Generator) -> Floats:
-    """Return the path of the kinaesthetic protocol from row ``first``, in metres from the start (time, axis)."""
+    """Return a path of the kinaesthetic protocol that starts in row ``first`` (time, axis), in metres from the start."""
     path = np.zeros((rows, 3))
     low, high = np.array(BOX_M).T
     at, row = np.zeros(3), first
@@ -123,13 +123,13 @@ def kinaesthetic(rows: int, first: int, rng: np.random.Generator) -> Floats:
 
 
 def minimum_jerk(progress: Floats) -> Floats:
-    """Return the fraction of the way that a minimum-jerk movement has covered when ``progress`` of its time is over."""
+    """Return the fraction of the distance of a minimum-jerk movement after a fraction ``progress`` of its duration."""
     fraction: Floats = progress**3 * (10 - 15 * progress + 6 * progress**2)
     return fraction
 
 
 def smooth(acceleration: Floats) -> Floats:
-    """Return ``acceleration`` (time, axis) averaged over the `JERK_S` before, so that it never jumps."""
+    """Return ``acceleration`` (time, axis) averaged over the previous `JERK_S`, so that it has no steps."""
     width = round(JERK_S * RATE_HZ)
     total = np.cumsum(acceleration, axis=0)
     total[width:] -= total[:-width].copy()
@@ -137,7 +137,7 @@ def smooth(acceleration: Floats) -> Floats:
 
 
 def _trapezoids(rows: int, first: int, rng: np.random.Generator) -> Floats:
-    """Return the commanded acceleration (time, axis): trapezoids of velocity, one after another from row ``first``."""
+    """Return the commanded acceleration (time, axis): consecutive trapezoids of velocity from row ``first`` on."""
     acceleration = np.zeros((rows, 3))
     reach = np.zeros(3)  # position of the hand relative to its start, m
     row, leg = first, 0

@@ -46,7 +46,7 @@ class SlideTrack:
 
 def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.SlideRig) -> float:
     """Return the fraction of trials ``indices`` of the rig whose material is classified correctly."""
-    materials = [slide.place(index, rig).material for index in indices]
+    materials = [slide.slide_trial(index, rig).material for index in indices]
     return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(materials)))
 
 
@@ -57,7 +57,7 @@ def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.SlideRig)
 
 def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
     """Return Whittle's log-likelihood of each material for trial ``index`` (material,), but for a constant."""
-    sensor = slide.place(index, rig).sensor
+    sensor = slide.slide_trial(index, rig).sensor
     track = felt_track(seed, index, rig)
     size = 2 * len(track.taper)
     number = np.fft.rfftfreq(size, STEP_M)
@@ -79,7 +79,7 @@ def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
 def felt_track(seed: int, index: int, rig: slide.SlideRig) -> SlideTrack:
     """Return the track of trial ``index``: what each channel measured, less its mean, put together where it was measured."""
     scene = slide.perform(seed, index, rig)
-    sensor = scene.place.sensor
+    sensor = scene.trial.sensor
     table = slide.simulate_trial(seed, index, replace(rig, pac=False, arm_every=0)).streams[sensor]
     names = [name for name in table.column_names if name.startswith(("electrode", "triangle"))]
     gain, lean, along_m, _ = slide.sensitivity(scene)

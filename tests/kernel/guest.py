@@ -169,7 +169,7 @@ def camera() -> dict[str, Any]:
     entries = read(FRAMES + 1)
     result["busy_share"] = round((time.process_time() - busy) / (time.monotonic() - start_s), 3)
     result["settings"] = unpack_settings(entries[0][1])
-    result["options"] = variants.of("camera", Chunks.of(entries))[0]
+    result["options"] = variants.guess_options("camera", Chunks.from_pairs(entries))[0]
     frames = [frame for _, packet in entries if (frame := unpack_frame(packet)) is not None]
     result["numbers"] = [frame.number for frame in frames]
     result["stamps_ns"] = [t_ns for t_ns, _ in entries[1:]]
@@ -178,13 +178,13 @@ def camera() -> dict[str, Any]:
 
     complete = Camera(**result["options"])
     reading = LinkReader(complete)
-    batches = [reading.feed(Chunks.of(entries))]
-    controls = v4l2.V4l2Device(address.place)
+    batches = [reading.feed(Chunks.from_pairs(entries))]
+    controls = v4l2.V4l2Device(address.target)
     controls.write_control(DROPPED, 50)
-    batches.append(reading.feed(Chunks.of(read(FRAMES))))
+    batches.append(reading.feed(Chunks.from_pairs(read(FRAMES))))
     controls.write_control(DROPPED, 0)
     time.sleep(3.0)  # more frames come than the kernel has buffers for
-    batches.append(reading.feed(Chunks.of(read(FRAMES))))
+    batches.append(reading.feed(Chunks.from_pairs(read(FRAMES))))
     batches.append(reading.finish())
     numbers = [int(number) for batch in batches if batch.seq is not None for number in batch.seq]
     result["skipped"] = numbers[-1] - numbers[0] + 1 - len(numbers)

@@ -39,7 +39,7 @@ def main(count: int, *, until_lost: bool) -> None:
         lost = str(error)
     link.close()
     link.close()
-    samples = [sensor.decode(run.frames) for run in sensor.framer().feed(Chunks.of(reports))[0]]
+    samples = [sensor.decode(run.frames) for run in sensor.framer().feed(Chunks.from_pairs(reports))[0]]
     seq = [int(value) for sample in samples for value in (sample.seq if sample.seq is not None else [])]
     first = [int(value) for sample in samples for value in sample.values[0][:, 0]]
     stamps = [t_ns for t_ns, _ in reports]

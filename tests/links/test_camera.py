@@ -61,7 +61,7 @@ def connected(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_image_carries_depth_colours_and_how_its_rays_run(place: str) -> None:
     link = open_address(f"camera:{place}", Quiet())
     ((_, content),) = link.read(1)
-    frame = DepthFrame.of_bytes(content)
+    frame = DepthFrame.from_bytes(content)
 
     assert frame.depth.tolist() == DEPTH.tolist()
     assert frame.colours is not None and frame.colours.tolist() == COLOURS.tolist()

@@ -70,12 +70,12 @@ def device() -> Iterator[tuple[Link, Talk]]:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Await a reply that is to come for as long as a busy computer may take; limits of their own are kept."""
-    reply = dialogue_of._reply
+    reply = dialogue_of._wait_for_reply
 
     def longer(link: Link, ask: Ask, *args: Any) -> Any:
         return reply(link, replace(ask, timeout_s=SOON_S) if ask.timeout_s >= LEAST_S else ask, *args)
 
-    monkeypatch.setattr(dialogue_of, "_reply", longer)
+    monkeypatch.setattr(dialogue_of, "_wait_for_reply", longer)
 
 
 def until_all_came(link: Link, retained: Arrived, count: int) -> Arrived:
@@ -222,7 +222,7 @@ def test_what_came_instead_of_a_reply_is_told(device: tuple[Link, Talk]) -> None
         yield Ask(b"", ends_with_newline, timeout_s=0.1, what="the version")
 
     talk(b"?", [b"\xaa\x55\x00"])
-    with pytest.raises(DeviceError, match=r"3 bytes.*55 00"):
+    with pytest.raises(DeviceError, match=r"3 other bytes.*55 00"):
         run_dialogue(link, dialogue(), "pps")
 
 

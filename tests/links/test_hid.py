@@ -195,5 +195,5 @@ def test_numbered_reports_are_told_from_others_by_the_descriptor() -> None:
     reports = hid.parse_report_descriptor(bytes.fromhex(spoken))
 
     assert reports == hid.Reports(1, {1: 48, 3: 32})
-    assert (reports.numbered, reports.longest) == (True, 7)
-    assert hid.parse_report_descriptor(b"").longest == 64
+    assert (reports.has_numbers, reports.max_size) == (True, 7)
+    assert hid.parse_report_descriptor(b"").max_size == 64

@@ -158,7 +158,7 @@ def test_a_damaged_line_of_an_slcan_adapter_costs_the_bytes_of_that_line_only(
     stamps = [t_ns for t_ns, _ in entries]
     assert stamps == sorted(stamps)
     framer = IcubSkin().framer()
-    framer.feed(Chunks.of(entries))
+    framer.feed(Chunks.from_pairs(entries))
     assert (framer.account.framed, framer.account.lost) == (2 * 13, size)
 
 

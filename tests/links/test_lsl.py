@@ -105,7 +105,7 @@ def test_every_sample_that_was_sent_comes_with_its_stamp_and_the_correction_of_l
             with pytest.raises(LinkLostError, match="wrist"):
                 while True:
                     packets += link.read(0.1)
-    samples = LinkReader(build_lsl(FORCE)).feed(Chunks.of(packets))
+    samples = LinkReader(build_lsl(FORCE)).feed(Chunks.from_pairs(packets))
     forces, corrections = samples.values
     assert forces.tolist() == [[row, 2 * row, 3 * row] for row in range(sent)]
     assert samples.t_device_ns is not None and (np.diff(samples.t_device_ns) > 0).all()
@@ -125,9 +125,9 @@ def test_markers_are_events_as_text() -> None:
     name = unique()
     with outlet("markers", name), closing(opened(f"?type=Markers&name={name}")) as link:
         packets = read_until(link, lambda received: len(received) > 5)
-    (options,) = lsl.options(Chunks.of(packets))
+    (options,) = lsl.guess_options(Chunks.from_pairs(packets))
     sensor = build_lsl(options)
-    (texts, _) = LinkReader(sensor).feed(Chunks.of(packets)).values
+    (texts, _) = LinkReader(sensor).feed(Chunks.from_pairs(packets)).values
     assert texts[:, 0].tolist() == [f"trial {row} ✓" for row in range(len(texts))] and len(texts)
     assert next((field.name, field.type) for field in sensor.fields()) == ("event", pa.string())
 
@@ -178,7 +178,7 @@ def _collect_until(station: Station, blocks: list[Any], until: Any) -> None:
 
 
 def _values(blocks: list[Any]) -> Any:
-    chunks = Chunks.joined([block for block in blocks if isinstance(block, Chunks)])
+    chunks = Chunks.concatenate([block for block in blocks if isinstance(block, Chunks)])
     return (
         build_lsl(FORCE).decode(build_lsl(FORCE).framer().feed(chunks)[0][0].frames).values[0][:, 0]
         if len(chunks.size) > 1
@@ -221,7 +221,7 @@ def test_a_description_among_packets_is_recognised_with_its_options() -> None:
         + "</channels></desc></info>"
     )
     packets = [lsl.packet(np.full((1, 3), row, dtype=np.float32), np.array([row / 200]), math.nan) for row in range(50)]
-    data = Chunks.of(
+    data = Chunks.from_pairs(
         [(0, lsl.DESCRIPTION + text.encode()), *((row * 5_000_000, packet) for row, packet in enumerate(packets))]
     )
     (finding,) = recognise(data, "lsl")

@@ -30,7 +30,7 @@ def stream(sensor: Sensor, samples: Samples) -> Chunks:
     frames = sensor.encode(samples)
     period_ns = int(1e9 / sensor.rate_hz)
     stamped_frames = [(number * period_ns, bytes(frame)) for number, frame in enumerate(frames)]
-    return Chunks.of([(stamped_frames[0][0], stamped_frames[0][1][5:]), *stamped_frames[1:]])
+    return Chunks.from_pairs([(stamped_frames[0][0], stamped_frames[0][1][5:]), *stamped_frames[1:]])
 
 
 def rigged(kind: str, options: Mapping[str, Any]) -> Sensor:
@@ -89,7 +89,7 @@ def test_the_channels_of_a_board_that_sends_plain_floats_are_counted() -> None:
 
 def test_a_board_of_whole_numbers_with_spaces_is_not_taken_for_an_anyskin() -> None:
     text = "".join(" ".join(map(str, row)) + "\r\n" for row in taxels(8, 1024, "uint16").tolist())
-    first, *_ = recognise(Chunks.of([(0, text.encode())]), "serial")
+    first, *_ = recognise(Chunks.from_pairs([(0, text.encode())]), "serial")
     assert (first.name, first.candidate.options["separator"]) == ("lines", " ")
 
 
@@ -97,15 +97,15 @@ def test_noise_silence_and_text_of_a_boot_are_no_sensor() -> None:
     noise = RNG.integers(0, 256, 20_000, dtype=np.uint8).tobytes()
     boot = b"ets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nconfigsip: 0, SPIWP:0xee\r\n" * 20
 
-    assert recognise(Chunks.of([]), "serial") == []
-    assert recognise(Chunks.of([(0, noise)]), "serial") == []
-    assert recognise(Chunks.of([(0, boot)]), "serial") == []
+    assert recognise(Chunks.from_pairs([]), "serial") == []
+    assert recognise(Chunks.from_pairs([(0, noise)]), "serial") == []
+    assert recognise(Chunks.from_pairs([(0, boot)]), "serial") == []
 
 
 def test_packets_are_told_by_their_size_and_marks() -> None:
     sensor = rigged("rawhid", {})
     samples = Samples((taxels(12, 4096, "uint16"),), seq=np.arange(60))
-    data = Chunks.of([(number, bytes(frame)) for number, frame in enumerate(sensor.encode(samples))])
+    data = Chunks.from_pairs([(number, bytes(frame)) for number, frame in enumerate(sensor.encode(samples))])
 
     assert next(iter(recognise(data, "hid"))).name == "rawhid"
 
@@ -115,7 +115,7 @@ def test_every_driver_comes_first_for_its_own_frames(kind: str) -> None:
     sensor = rigged(kind, made.OPTIONS.get(kind, {}))
     pieces = made.pieces(sensor, sensor.encode(made.samples(kind, sensor, 200)))
     period_ns = int(1e9 / (sensor.rate_hz or 100) * 200 / len(pieces))  # a sample may be several packets
-    data = Chunks.of([(number * period_ns, piece) for number, piece in enumerate(pieces)])
+    data = Chunks.from_pairs([(number * period_ns, piece) for number, piece in enumerate(pieces)])
 
     for scheme in sensor.links:
         assert next(iter(recognise(data, scheme))).name == kind
@@ -125,4 +125,6 @@ def test_frames_of_a_board_of_ones_own_are_taken_for_no_product() -> None:
     sensor = rigged("generic", made.OPTIONS["generic"])
     pieces = made.pieces(sensor, sensor.encode(made.samples("generic", sensor, 200)))
 
-    assert recognise(Chunks.of([(number * 10**6, piece) for number, piece in enumerate(pieces)]), "serial") == []
+    assert (
+        recognise(Chunks.from_pairs([(number * 10**6, piece) for number, piece in enumerate(pieces)]), "serial") == []
+    )

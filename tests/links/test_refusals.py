@@ -50,7 +50,7 @@ def test_every_kind_of_address_has_an_opener() -> None:
 
 @pytest.mark.parametrize("scheme", ["tcp", "tcp+udp", "ws"])
 def test_a_port_that_nobody_serves_is_refused(scheme: str, closed_port: int) -> None:
-    message = rf"^Stream probe \(.+\): 127\.0\.0\.1 is there, but refuses port {closed_port}; start the program"
+    message = rf"^Stream probe \(.+\): 127\.0\.0\.1 is reachable, but refuses port {closed_port}; start the program"
     with pytest.raises(DeviceError, match=message):
         open_address(f"{scheme}:127.0.0.1:{closed_port}", Quiet())
 
@@ -59,7 +59,7 @@ def test_a_port_that_nobody_serves_is_refused(scheme: str, closed_port: int) -> 
     ("error", "message"),
     [
         (socket.gaierror(-2, "Name or service not known"), "the host arm.lab is not known; check its name"),
-        (TimeoutError(), "arm.lab did not answer on port 7 within 5 s; check that it is switched on"),
+        (TimeoutError(), "arm.lab did not respond on port 7 within 5 s; check that it is switched on"),
         (
             OSError(errno.EHOSTUNREACH, "No route to host"),
             "arm.lab cannot be reached from this computer; check the cable",

@@ -133,7 +133,7 @@ def test_a_missing_port_lists_those_that_are_there(monkeypatch: pytest.MonkeyPat
     ("number", "message"),
     [
         (errno.EACCES, r"you may not open .+; it belongs to the group \w+: run `sudo usermod -aG \w+ \$USER`"),
-        (errno.EBUSY, r"is in use by a process of another user; end it"),
+        (errno.EBUSY, r"is used by a process of another user; stop it"),
         (errno.EIO, r"cannot be opened: Input/output error\. Unplug it and plug it in again"),
     ],
 )

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
-from tacpipe.links.link import OLDEST_NS, Arrivals, LinkLostError
+from tacpipe.links.link import MAX_AGE_NS, Arrivals, LinkLostError
 from tests.links import peers
 from tests.links.peers import Listened, Quiet, open_address
 
@@ -41,7 +41,7 @@ def stamping() -> Iterator[None]:
             asking.sendto(b"", asking.getsockname())
             time.sleep(0.01)
             read_s = time.time()
-            _, ((_, _, stamp),), _, _ = asking.recvmsg(1, network.ROOM)
+            _, ((_, _, stamp),), _, _ = asking.recvmsg(1, network.ANCILLARY_BYTES)
             seconds, nanoseconds = struct.unpack("@ll", stamp)
             late = seconds + nanoseconds / 1e9 > read_s
         yield
@@ -70,7 +70,7 @@ def test_a_datagram_is_stamped_when_it_came_and_not_when_it_was_read() -> None:
 
 
 def test_datagrams_that_the_kernel_drops_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network, "QUEUE", 4096)
+    monkeypatch.setattr(network, "QUEUE_BYTES", 4096)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         port = free_port()
         link = open_address(f"udp::{port}", Quiet())
@@ -127,12 +127,12 @@ def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch
     for name in clocks:
         monkeypatch.setattr(f"tacpipe.links.link.time.{name}", lambda name=name: clocks[name])
 
-    arrivals.look()
+    arrivals.read_clocks()
     assert arrivals.to_monotonic(clocks["time_ns"] - 3_000) == 999_999_997_000
     assert arrivals.to_monotonic(clocks["time_ns"] + 10) == 1_000_000_000_000  # A stamp from the future becomes now
-    clocks["time_ns"] += 2 * OLDEST_NS  # the clock is set forward while a datagram waits
+    clocks["time_ns"] += 2 * MAX_AGE_NS  # the clock is set forward while a datagram waits
     clocks["monotonic_ns"] += 500
-    arrivals.look()
+    arrivals.read_clocks()
     assert arrivals.to_monotonic(5_000_000_000_000) == 1_000_000_000_500
     assert (
         arrivals.to_monotonic(clocks["time_ns"] - 1_000) == 1_000_000_000_501
@@ -201,7 +201,7 @@ def test_stamps_are_as_far_apart_as_the_kernel_s_and_equal_only_where_those_are(
             for apart_ns in batch:
                 clocks.now_ns += apart_ns
                 moments.append(clocks.now_ns)
-            arrivals.look()
+            arrivals.read_clocks()
             mapped += [arrivals.to_monotonic(t_ns + WALL_NS) for t_ns in moments]
             true += moments
 
@@ -268,10 +268,10 @@ def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hos
 
 def test_a_flood_is_left_to_the_next_read() -> None:
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
-        port.queued = [("192.0.2.1", b"x")] * (network.MOST_QUEUED + 10)
+        port.queued = [("192.0.2.1", b"x")] * (network.MAX_FETCHED + 10)
         link = network.UdpLink("flood", port, prompt=True)
 
-        assert [len(link._queued()), len(link._queued())] == [network.MOST_QUEUED, 10]
+        assert [len(link._queued()), len(link._queued())] == [network.MAX_FETCHED, 10]
         link.close()
 
 

@@ -25,7 +25,7 @@ def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
 def test_a_row_waits_for_what_arrived_by_then(arrived_ns: int, waits: bool) -> None:
     decoder, packets = decoder_and_packets("xela")
     assert not decoder.may_hold(ROW_NS)
-    decoder.take(Chunks.of([(arrived_ns, packets[0]), (ROW_NS + 5, packets[1])]))
+    decoder.take(Chunks.from_pairs([(arrived_ns, packets[0]), (ROW_NS + 5, packets[1])]))
     assert decoder.may_hold(ROW_NS) == waits
 
 
@@ -33,10 +33,10 @@ def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
     decoder, pieces = decoder_and_packets("tfmini")
     data = b"".join(pieces)
     cut = len(pieces[0]) // 2
-    decoder.take(Chunks.of([(ROW_NS - 1, data[:cut])]))
+    decoder.take(Chunks.from_pairs([(ROW_NS - 1, data[:cut])]))
     assert decoder.batches() == []
     assert not decoder.may_hold(ROW_NS)  # nothing more came
-    decoder.take(Chunks.of([(ROW_NS + 1, data[cut:])]))
+    decoder.take(Chunks.from_pairs([(ROW_NS + 1, data[cut:])]))
     assert decoder.may_hold(ROW_NS)
     stamps = np.concatenate([batch.t_ns for batch in decoder.batches()])
     assert stamps[0] <= ROW_NS + 1

@@ -46,7 +46,9 @@ class Session:
 
     def send(self, first: int, last: int) -> None:
         """Have frames arrive, one each period after the start."""
-        self.engine.take("skin", Chunks.of([(START_NS + n * PERIOD_NS, self.packets[n]) for n in range(first, last)]))
+        self.engine.take(
+            "skin", Chunks.from_pairs([(START_NS + n * PERIOD_NS, self.packets[n]) for n in range(first, last)])
+        )
 
     def at(self, periods: float) -> list[ForecastMessage]:
         """Return what is published so long after the start, once what belongs to it has settled."""
@@ -194,7 +196,7 @@ def test_the_latency_is_from_the_arrival_of_the_newest_sample(session: Session) 
 
 def test_bytes_that_are_no_frame_cost_no_forecast(session: Session) -> None:
     session.send(0, 1)
-    session.engine.take("skin", Chunks.of([(START_NS + PERIOD_NS, b"\xff not a frame")]))
+    session.engine.take("skin", Chunks.from_pairs([(START_NS + PERIOD_NS, b"\xff not a frame")]))
     session.send(2, 3)
     (message,) = session.at(2)
     assert message.values is not None and (message.values == session.values[2]).all()
@@ -222,7 +224,7 @@ def test_after_blocks_were_thrown_away_and_after_a_process_that_ended_the_grid_i
     restarted.engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
     restarted.begin()
     late = START_NS + 7 * PERIOD_NS + PERIOD_NS // 3
-    restarted.engine.take("skin", Chunks.of([(late, restarted.packets[7])]))
+    restarted.engine.take("skin", Chunks.from_pairs([(late, restarted.packets[7])]))
     (message,) = restarted.at(8)
     assert message.t_ns == START_NS + OFFSET_NS + 8 * PERIOD_NS and message.values is not None
     restarted.begin()  # another recording has a grid of its own

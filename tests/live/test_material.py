@@ -113,7 +113,7 @@ class Session:
         while self.sent < len(self.t_ns) and self.t_ns[self.sent] <= until_ns:
             stop = min(self.sent + cut, int(np.searchsorted(self.t_ns, until_ns, side="right")))
             chunks = [(int(self.t_ns[row]), self.packets[row]) for row in range(self.sent, stop)]
-            self.engine.take("finger", Chunks.of(chunks))
+            self.engine.take("finger", Chunks.from_pairs(chunks))
             self.sent = stop
             messages += self.engine.step(int(self.t_ns[stop - 1]) + SETTLE_NS)
         return messages

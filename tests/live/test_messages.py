@@ -58,7 +58,7 @@ def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None
 
 
 def decoded(sensor: Live, sent: bytes) -> tuple[list[list[float]], int, int]:
-    runs, losses = sensor.framer().feed(Chunks.of([(0, sent)]))
+    runs, losses = sensor.framer().feed(Chunks.from_pairs([(0, sent)]))
     assert not losses
     samples = sensor.decode(runs[0].frames)
     assert samples.seq is not None and samples.t_device_ns is not None
@@ -96,7 +96,9 @@ def test_packets_of_another_output_or_version_are_refused() -> None:
     other_version = sent[:4] + b"\x02" + sent[5:]
     for wrong in (other_version, sent[:-1], b"x" + sent[1:]):
         assert (
-            Live(task="forward", output="alarm", alarms=("load", "slip")).framer().feed(Chunks.of([(0, wrong)]))[0]
+            Live(task="forward", output="alarm", alarms=("load", "slip"))
+            .framer()
+            .feed(Chunks.from_pairs([(0, wrong)]))[0]
             == []
         )
 

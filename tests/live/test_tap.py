@@ -23,7 +23,7 @@ def pair() -> Iterator[Pair]:
 
 
 def chunk(number: int, size: int = 10) -> Chunks:
-    return Chunks.of([(number, bytes([number % 256]) * size)])
+    return Chunks.from_pairs([(number, bytes([number % 256]) * size)])
 
 
 def received(theirs: socket.socket, blocks: wire.Blocks) -> list[tuple[str, Chunks | StreamNote]]:

@@ -58,7 +58,7 @@ def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> 
         before += block_values.shape[1]
     assert samples.values[block].shape[0] == 40
     packets = made.pieces(sensor, sensor.encode(samples))
-    batch = LinkReader(sensor).feed(Chunks.of(list(zip(t_ns.tolist(), packets, strict=True))))
+    batch = LinkReader(sensor).feed(Chunks.from_pairs(list(zip(t_ns.tolist(), packets, strict=True))))
     from tacpipe.live.decoding import BatchColumns, batch_schema
 
     targets = Targets("robot", likely_schema(sensor))

@@ -80,7 +80,7 @@ class Session:
         """Have requests arrive, a millisecond apart."""
         for content in requests:
             self.t_ns += 1_000_000
-            self.engine.take("requests", Chunks.of([(self.t_ns, json.dumps(content).encode())]))
+            self.engine.take("requests", Chunks.from_pairs([(self.t_ns, json.dumps(content).encode())]))
 
     def ask(self, content: Any) -> TouchMessage:
         """Return the answer to a request."""

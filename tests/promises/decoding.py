@@ -59,7 +59,7 @@ def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: in
     lost_bytes = 0
     for start in range(0, len(pieces), at_once):
         stamped = [(1 + passing_ns * (start + row), piece) for row, piece in enumerate(pieces[start : start + at_once])]
-        new_runs, losses = framer.feed(Chunks.of(stamped))
+        new_runs, losses = framer.feed(Chunks.from_pairs(stamped))
         assert not passing_ns or framer.account.pending <= MOST_PENDING
         runs, lost_bytes = runs + new_runs, lost_bytes + sum(loss.bytes for loss in losses)
     new_runs, losses = framer.flush()

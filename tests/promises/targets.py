@@ -73,7 +73,7 @@ def targets() -> dict[str, Target]:
         Target("spool", _spool, _spools),
         Target("pcd", lambda data: point_files.parse_pcd(NAMED, data), _pcds),
         Target("ply", lambda data: point_files.parse_ply(NAMED, data), _plys),
-        Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
+        Target("depth-frame", lambda data: DepthFrame.from_bytes(data).points(), _frames),
         Target("report-descriptor", hid.parse_report_descriptor, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
     ]
@@ -178,7 +178,7 @@ def _spool(data: bytes) -> object:
 def _spools() -> list[bytes]:
     written_spool = spool.Spool(_folder(), HEADER, ["a", "b"])
     for number in range(5):
-        written_spool.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
+        written_spool.append("ab"[number % 2], Chunks.from_pairs([(number, bytes([number] * 9)), (number + 1, b"xy")]))
         written_spool.note(spool.StreamNote(number, "a", "lost", "unplugged"))
     written_spool.write()
     content = (written_spool.folder / "bytes").read_bytes()

@@ -98,7 +98,7 @@ def names(output: Path) -> list[str]:
 def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, complete: bool) -> Cost:
     """Compare a recovered stream with the ledger, sample by sample."""
     table, ledger = shard.table(name), emulator.ledger[name]
-    rows = ledger.whole
+    rows = ledger.intact_rows
     sent_ns = ledger.column("sent_ns")[rows]
     sent = ledger.samples(rows[sent_ns > killed_ns - 20_000_000_000])
     sent_ns = sent_ns[sent_ns > killed_ns - 20_000_000_000]

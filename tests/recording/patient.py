@@ -36,8 +36,8 @@ def relax(patch: pytest.MonkeyPatch) -> None:
         for limit in limits:
             patch.setattr(module, limit, getattr(module, limit) * TIMES)
     patch.setattr("tacpipe.recording.trials.clock", Samples(patch))
-    reply = opening._reply
-    patch.setattr(opening, "_reply", lambda link, ask, *args: reply(link, longer(ask), *args))
+    reply = opening._wait_for_reply
+    patch.setattr(opening, "_wait_for_reply", lambda link, ask, *args: reply(link, longer(ask), *args))
 
 
 class Samples:

@@ -73,7 +73,7 @@ class Station:
         if due and self._tally is not None:
             self._chunks, self._bytes = self._chunks + len(due), self._bytes + sum(len(data) for _, data in due)
             self._tally(self._chunks, self._bytes, due[-1][0])
-        return [Chunks.of(due)] if due else []
+        return [Chunks.from_pairs(due)] if due else []
 
     def begin(self, tally: Tally, early: list[Chunks | StreamNote] | None) -> list[Chunks | StreamNote]:
         """Return what came since the last call, and report to ``tally`` from now on."""

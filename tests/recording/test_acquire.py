@@ -55,7 +55,7 @@ def test_no_sample_arrives_before_it_was_sent_or_out_of_order(lab: Lab, rig: Emu
         rows = live.recorded(shard, name)
         start = live.place(rows, live.sent(rig, name))
         arrived_ns = shard.table(name).column("t_ns").to_numpy()
-        sent_ns = ledger.column("sent_ns")[ledger.whole][start : start + len(rows)] + to_utc_ns
+        sent_ns = ledger.column("sent_ns")[ledger.intact_rows][start : start + len(rows)] + to_utc_ns
 
         assert (np.diff(arrived_ns) >= 0).all()
         assert (arrived_ns - sent_ns > -20_000_000).all()  # two clocks are compared
@@ -95,15 +95,15 @@ def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recor
     folded = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name Same")  # one to a file system without case
 
     assert (single.code, trials.code, folded.code) == (2, 2, 2)
-    assert "names already: same." in folded.err
-    assert "names already: same." in single.err and "names already: press-001, press-002." in trials.err
+    assert "with these names: same." in folded.err
+    assert "with these names: same." in single.err and "with these names: press-001, press-002." in trials.err
     assert lab.manifest("rec") == before and not live.spools(lab.folder)
 
 
 def test_a_name_that_was_taken_while_it_was_recorded_gets_a_number_and_loses_nothing(
     lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.recording.appending.refuse_taken", lambda output, names: None)
+    monkeypatch.setattr("tacpipe.recording.appending.refuse_existing_names", lambda output, names: None)
     for name in ("same", "Same"):
         lab.run(f"acquire rig.toml -o rec --duration-s 0.3 --name {name}")
 
@@ -152,7 +152,9 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
     (lab.folder / "rig.toml").write_text(live.stream("force", "optoforce", "serial:/dev/there-is-none"))
     refused = lab.call("acquire rig.toml -o made --duration-s 1")
 
-    assert refused.code == 2 and "made was made by simulate.toy" in refused.err and "there-is-none" not in refused.err
+    assert (
+        refused.code == 2 and "made was written by simulate.toy" in refused.err and "there-is-none" not in refused.err
+    )
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ class Recorded:
             block = replace(block, seq=counter, t_device_ns=clock_ns[rows])
             arrivals = zip(arrival_ns[rows].tolist(), made.pieces(sensor, sensor.encode(block)), strict=True)
             received = [(t_ns, data) for t_ns, data in arrivals if not LOST_S[0] * 1e9 <= t_ns < LOST_S[1] * 1e9]
-            spool.append("device", Chunks.of(received))
+            spool.append("device", Chunks.from_pairs(received))
         spool.close()
         read = Spooled(spool.folder)
         read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}  # stamps then compare with the true time

@@ -94,7 +94,7 @@ def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, scrip
 
     assert 4.8 < lasts_s < 5
     assert described(lab) == ("recovered", 10.0, [("recovered", f"{lasts_s:.1f} s are there; 10 s were requested")])
-    line = f"not completed: one: recovered after a crash or a loss of power, {lasts_s:.1f} of 10 s"
+    line = f"not completed: one: recovered after a crash or a power failure, {lasts_s:.1f} of 10 s"
     assert line in lab.run("show rec").out.splitlines()
 
 
@@ -150,7 +150,7 @@ def test_a_note_on_the_recording_is_read_with_any_stream_and_given_out_with_none
 def kept_spool(lab: Lab, err: str) -> Path:
     """Return where a command says that it kept a spool."""
     (path,) = (lab.store.root / "kept-spools").iterdir()
-    assert err.endswith(f"; its spool is kept in {path}\n")
+    assert err.endswith(f"; its spool was moved to {path}\n")
     assert sorted(file.name for file in path.iterdir()) == ["bytes", "header.json", "tally"]
     return path
 

@@ -162,7 +162,7 @@ def test_a_second_signal_ends_a_sealing_that_hears_of_none(lab: Lab, rig: Emulat
     _, err = process.communicate()
 
     assert process.returncode == 130
-    assert err == f"tacpipe: interrupted. What was recorded is kept in {spool}; `tacpipe acquire --recover` seals it.\n"
+    assert err == f"tacpipe: interrupted. The recorded data is in {spool}; `tacpipe acquire --recover` seals it.\n"
     assert lab.run("acquire --recover").err.startswith("recovered one: ")
 
 
@@ -175,7 +175,7 @@ def test_a_second_signal_while_sealing_leaves_the_spool_and_it_is_recovered(
 
     assert interrupted.code == 130 and not (lab.folder / "rec").exists()
     assert without_created_store(interrupted.err) == (
-        f"tacpipe: interrupted. What was recorded is kept in {spool}; `tacpipe acquire --recover` seals it.\n"
+        f"tacpipe: interrupted. The recorded data is in {spool}; `tacpipe acquire --recover` seals it.\n"
     )
     recovered = lab.run("acquire --recover")
     assert recovered.err.startswith("recovered one: ") and recovered.err.count("\n") == 1

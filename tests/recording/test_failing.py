@@ -45,7 +45,7 @@ def frames(count: int) -> list[bytes]:
 
 
 def chunks(rows: range, all_frames: list[bytes], since_ns: int = 0) -> Chunks:
-    return Chunks.of([(since_ns + row * PERIOD_NS, all_frames[row]) for row in rows])
+    return Chunks.from_pairs([(since_ns + row * PERIOD_NS, all_frames[row]) for row in rows])
 
 
 def spooled(folder: Path, **streams: list[Chunks | StreamNote]) -> Spooled:
@@ -213,7 +213,7 @@ def test_a_disk_that_fails_a_sync_ends_the_recording_with_a_sentence(
 
 
 def test_bytes_of_which_no_sample_comes_are_not_removed(lab: Lab) -> None:
-    noise = Chunks.of([(row, os.urandom(50)) for row in range(100)])
+    noise = Chunks.from_pairs([(row, os.urandom(50)) for row in range(100)])
     folder = spooled(lab.folder / ".tacpipe", a=[noise], b=[]).folder
 
     ran = lab.call("acquire --recover")
@@ -234,7 +234,7 @@ def test_bytes_of_which_no_sample_comes_are_not_removed(lab: Lab) -> None:
         ("stream = 3", "lists no stream"),
         ("a = [", "not valid TOML"),
         (RIG.replace('"b"', '"a"', 1), "two streams named a"),
-        (RIG.replace('"a"', '"events"', 1), "cannot name a stream"),
+        (RIG.replace('"a"', '"events"', 1), "is not a valid stream name"),
         (RIG.replace("optoforce", "optoforte", 1), "no sensor optoforte"),
         (RIG.replace("axes", "axis", 1), "no option axis"),
         (RIG.replace("serial:", "ws:", 1), "cannot be reached by"),

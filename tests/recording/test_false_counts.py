@@ -60,11 +60,11 @@ def test_packets_of_other_senders_are_reported_once_a_second_and_at_the_end(
     link = Crowded([json.dumps({"seq": row, "width": 1.0}).encode() for row in range(200)])
     reader._link = link
     spool = Spool(tmp_path, {"rig": ""}, ["program"])
-    reader.begin(lambda *_: None, None)
+    reader.start_recording(lambda *_: None, None)
     reader._thread.start()
     live.awaited(lambda: not link.incoming)
     live.awaited(lambda: link.foreign == 600)
-    for block in reader.end():
+    for block in reader.end_recording():
         spool.note(block) if isinstance(block, StreamNote) else spool.append("program", block)
     reader.stop()
     spool.close()

@@ -25,7 +25,7 @@ def frames(count: int, first: int = 0) -> list[bytes]:
 
 
 def chunks(parts: list[tuple[int, bytes]]) -> Chunks:
-    return Chunks.of([(row * PERIOD_NS, data) for row, data in parts])
+    return Chunks.from_pairs([(row * PERIOD_NS, data) for row, data in parts])
 
 
 def read(parts: list[tuple[int, bytes]], reading: LinkReader | None = None) -> tuple[list[Batch], LinkReader]:
@@ -92,7 +92,7 @@ def test_a_link_that_was_lost_costs_what_the_counter_says() -> None:
     reading = LinkReader(SENSOR)
     sent = frames(2000)
     reading.feed(chunks(list(enumerate(sent[:500]))))
-    broken = reading.broken()
+    broken = reading.end_link()
     after = reading.feed(chunks([(row, sent[row]) for row in range(1400, 2000)]))
 
     assert described([broken, after]) == [("link", 900, 0)]
@@ -126,7 +126,7 @@ def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[i
     parts, place, step = [], 0, 0
     while place < len(sent):
         size = sizes[step % len(sizes)]
-        parts.append(reading.feed(Chunks.of([(0, sent[place : place + size])])))
+        parts.append(reading.feed(Chunks.from_pairs([(0, sent[place : place + size])])))
         place, step = place + size, step + 1
     parts.append(reading.finish())
 

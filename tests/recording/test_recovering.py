@@ -51,7 +51,7 @@ def spooled(lab: Lab, name: str = "one", text: str = RIG, unread: int = 0, count
     size = sum(len(frame) for _, frame in sent)
     spool.tally(0, count, size, sent[-1][0])
     if sent[: count - unread]:
-        spool.append("force", Chunks.of(sent[: count - unread]))
+        spool.append("force", Chunks.from_pairs(sent[: count - unread]))
     spool.close()
     return spool.folder
 
@@ -155,7 +155,7 @@ def test_a_spool_whose_parsed_rig_no_longer_parses_stays_and_is_told(lab: Lab) -
 
         assert ran.code == 1 and stays.exists()
         assert (
-            line.startswith(f"tacpipe: The spool {stays} stays as it is. The rig file in {stays}") and "axles" in line
+            line.startswith(f"tacpipe: The spool {stays} was not sealed. The rig file in {stays}") and "axles" in line
         )
     assert list(live.shards(lab.folder)) == ["new"]
 
@@ -169,7 +169,7 @@ def test_a_spool_with_half_a_header_keeps_nobody_from_recording(
     (stays / "header.json").write_text(json.dumps(header))
     ran = lab.run("acquire rig.toml -o rec --duration-s 0.3 --name new")
 
-    assert f"The spool {stays} stays as it is. Its clock is None" in ran.err
+    assert f"The spool {stays} was not sealed. Its clock is None" in ran.err
     assert list(live.shards(lab.folder)) == ["new"] and stays.exists()
 
 
@@ -262,7 +262,7 @@ def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
     assert ran.code == 1 and not (lab.folder / "rec").exists()
     err = without_created_store(ran.err)
     assert err.startswith("tacpipe: The disk under ") and err.count("\n") == 1
-    sentence = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is fixed.\n"
+    sentence = f"The recorded data is in {folder}; `tacpipe acquire --recover` seals it once that is fixed.\n"
     assert err.endswith(sentence)
     lab.run("acquire --recover")
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))

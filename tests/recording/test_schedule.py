@@ -110,7 +110,7 @@ def test_a_stream_that_gives_nothing_is_awaited_for_three_seconds(lab: Lab, scri
     refused = lab.call("acquire rig.toml -o rec --duration-s 1")
 
     assert refused.code == 5 and 3.0 <= script.t_s < 3.1
-    assert "a frame of optoforce was awaited for 3 s, but nothing came." in refused.err
+    assert "a frame of optoforce was awaited for 3 s, but nothing was received." in refused.err
     assert not (lab.folder / "rec").exists()
 
 
@@ -122,7 +122,7 @@ def test_a_stream_that_was_silent_for_two_seconds_at_the_end_is_lost(
     ran = lab.call("acquire rig.toml -o rec --duration-s 4")
 
     assert ran.code == code
-    assert bool(re.search(r"nothing came for 2\.[12] s, though it is open\.", ran.err)) == (code == 5)
+    assert bool(re.search(r"nothing was received for 2\.[12] s, though it is open\.", ran.err)) == (code == 5)
     assert counts(live.only(lab.folder))[-1] == len(script.sent["force"]) - 1  # all samples are kept
 
 

@@ -85,8 +85,10 @@ def test_a_port_that_another_program_holds_is_told_with_that_program(lab: Lab, s
         (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
         holder.stdin.close()
 
-    about = re.escape(f"Stream force (serial:{silent}): {silent} is in use by ")
-    assert re.fullmatch(rf"{about}.+ \(process {holder.pid}\).*; end it, because two readers share no bytes\.", message)
+    about = re.escape(f"Stream force (serial:{silent}): {silent} is used by ")
+    assert re.fullmatch(
+        rf"{about}.+ \(process {holder.pid}\).*; stop it, because two programs cannot read the same port\.", message
+    )
 
 
 def test_a_port_that_is_forbidden_is_told_with_the_group_that_may(
@@ -111,8 +113,8 @@ def test_a_silent_port_is_told_with_its_rate(lab: Lab, silent: str) -> None:
     (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
 
     assert message == (
-        f"Stream force (serial:{silent}): a frame of optoforce was awaited for 1 s, but nothing came. Check power and "
-        f"cable, and that it is optoforce, set to 1000000 baud as we are; `tacpipe sensors probe serial:{silent}` tries all "
+        f"Stream force (serial:{silent}): a frame of optoforce was awaited for 1 s, but nothing was received. Check power "
+        f"and cable, and that it is optoforce, set to 1000000 baud; `tacpipe sensors probe serial:{silent}` tries all "
         "rates."
     )
 
@@ -121,7 +123,7 @@ def test_a_device_that_does_not_answer_at_all_is_told_with_what_was_awaited(lab:
     (message,) = refused(lab, live.stream("range", "tfmini", f"serial:{silent}"))
 
     assert message.startswith(
-        f"Stream range (serial:{silent}): the reply to command 0x05 was awaited for 2 s, but nothing came."
+        f"Stream range (serial:{silent}): the reply to command 0x05 was awaited for 2 s, but nothing was received."
     )
 
 
@@ -132,9 +134,9 @@ def test_a_port_at_another_rate_is_told_as_a_possibility(lab: Lab, served: Emula
 
     assert re.fullmatch(
         re.escape(f"Stream range ({at}): the reply to command 0x05 was awaited for 2 s, but ")
-        + r"[\d,]+ bytes came that hold none\. "
-        + re.escape(f"Either the device is set to another rate than {baud} baud, or speaks another protocol; ")
-        + re.escape(f"`tacpipe sensors probe {at}` tries what is known."),
+        + r"the [\d,]+ bytes received contain none\. "
+        + re.escape(f"The device is set to another rate than {baud} baud, or uses another protocol; ")
+        + re.escape(f"`tacpipe sensors probe {at}` tries all supported sensors."),
         message,
     )
 
@@ -145,8 +147,8 @@ def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
 
     assert re.fullmatch(
         re.escape(f"Stream force ({at}): a frame of optoforce was awaited for 3 s, but ")
-        + r"[\d,]+ bytes came that hold none\. They are frames of tfmini: name that in the rig file, or plug in the other "
-        r"device\.",
+        + r"the [\d,]+ bytes received contain none\. They are frames of tfmini: set that sensor in the rig file, or plug "
+        r"in the other device\.",
         message,
     )
 
@@ -154,15 +156,15 @@ def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
 def test_another_sensor_than_the_one_that_should_answer_is_named(lab: Lab, served: Emulator) -> None:
     (message,) = refused(lab, live.stream("pad", "paxini", place(served, "range"), "{ baud = 115200 }"))
 
-    assert "They are frames of tfmini: name that in the rig file" in message
+    assert "They are frames of tfmini: set that sensor in the rig file" in message
 
 
 def test_a_sensor_that_sends_and_does_not_answer_is_told_from_another_one(lab: Lab, served: Emulator) -> None:
     (message,) = refused(lab, live.stream("range", "tfmini", place(served, "plain")))
 
     assert message.endswith(
-        "bytes came that hold none. They are frames of tfmini, so the device does not hear us or is another model: check "
-        "the wire that we send on, and the model in the rig file."
+        "bytes received contain none. They are frames of tfmini, so the device does not receive our requests or is another "
+        "model: check the transmit wire, and the model in the rig file."
     )
 
 
@@ -178,7 +180,7 @@ def test_the_option_that_is_wrong_is_named(
 ) -> None:
     (message,) = refused(lab, live.stream("load", sensor, place(served, stream), options))
 
-    assert message.endswith(f"They are frames of {expected_options}: set that among the options in the rig file.")
+    assert message.endswith(f"They are frames of {expected_options}: set these options in the rig file.")
 
 
 def test_a_port_that_nobody_serves_is_told(lab: Lab) -> None:
@@ -190,9 +192,9 @@ def test_a_port_that_nobody_serves_is_told(lab: Lab) -> None:
         live.stream("robot", "ur-rtde", f"tcp:127.0.0.1:{port}"),
     )
 
-    end = f"127.0.0.1 is there, but refuses port {port}; start the program or the mode of the device that serves it, "
-    assert skin == f"Stream skin (ws:127.0.0.1:{port}): {end}and let no other client hold it."
-    assert robot == f"Stream robot (tcp:127.0.0.1:{port}): {end}and let no other client hold it."
+    end = f"127.0.0.1 is reachable, but refuses port {port}; start the program or device mode that serves it, "
+    assert skin == f"Stream skin (ws:127.0.0.1:{port}): {end}and disconnect other clients."
+    assert robot == f"Stream robot (tcp:127.0.0.1:{port}): {end}and disconnect other clients."
 
 
 def test_a_box_that_refuses_datagrams_is_told(lab: Lab) -> None:
@@ -202,8 +204,8 @@ def test_a_box_that_refuses_datagrams_is_told(lab: Lab) -> None:
     (message,) = refused(lab, live.stream("wrench", "ati-netft", f"udp:127.0.0.1:{port}"))
 
     assert message == (
-        f"Stream wrench (udp:127.0.0.1:{port}) is lost: the host is there, but refuses the port. Check the port, and that "
-        f"it streams."
+        f"Stream wrench (udp:127.0.0.1:{port}) is lost: the host refuses the port. Check the port, and that the "
+        f"device streams."
     )
 
 
@@ -214,8 +216,8 @@ def test_a_box_that_sends_no_datagram_is_told(lab: Lab) -> None:
         (message,) = refused(lab, live.stream("wrench", "ati-netft", at))
 
     assert message == (
-        f"Stream wrench ({at}): a frame of ati-netft was awaited for 1 s, but nothing came. Check power and cable, and that "
-        f"it is ati-netft. The box sends to one program: once another asks for records, they stop here."
+        f"Stream wrench ({at}): a frame of ati-netft was awaited for 1 s, but nothing was received. Check power and "
+        f"cable, and that it is ati-netft. The box sends to one program: if another requests records, they stop here."
     )
 
 

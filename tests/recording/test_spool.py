@@ -41,7 +41,7 @@ def written_spool(folder: Path, blocks: int = 20) -> tuple[Path, list[tuple[str,
     for number in range(blocks):
         name = STREAMS[number % 2]
         chunks = [(number * 10 + k, rng.bytes(int(rng.integers(0, 40)))) for k in range(3)]
-        spool.append(name, Chunks.of(chunks))
+        spool.append(name, Chunks.from_pairs(chunks))
         spool.write()
         expected += [(name, t_ns, data) for t_ns, data in chunks]
     spool.close()
@@ -62,7 +62,7 @@ def test_what_was_appended_is_read_in_its_order(
 ) -> None:
     spool = Spool(tmp_path, HEADER, STREAMS)
     for name, chunks in parts:
-        spool.append(name, Chunks.of(chunks))
+        spool.append(name, Chunks.from_pairs(chunks))
     spool.note(StreamNote(7, "b", "lost", "unplugged"))
     spool.close()
 
@@ -148,9 +148,9 @@ from tacpipe.recording.spool import Spool
 from tacpipe.sensors.framing import Chunks
 made = Spool(Path({str(tmp_path)!r}), {HEADER!r}, ["a"])
 made.tally(0, 7, 70, 123)
-made.append("a", Chunks.of([(1, b"one"), (2, b"two")]))
+made.append("a", Chunks.from_pairs([(1, b"one"), (2, b"two")]))
 made.write()
-made.append("a", Chunks.of([(3, b"three")]))
+made.append("a", Chunks.from_pairs([(3, b"three")]))
 print("ready", flush=True)
 time.sleep(60)
 """

@@ -15,7 +15,7 @@ from tacpipe.links import network
 from tacpipe.plugins import registry
 from tacpipe.recording import clock, pace, sealing
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
+from tacpipe.recording.pace import MIN_CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
@@ -107,7 +107,7 @@ def test_a_link_is_drained_when_a_read_found_nothing_waiting(tmp_path: Path, mon
     read, reads = device.read, []
 
     def noted(timeout_s: float) -> list[tuple[int, bytes]]:
-        reads.append((len(chunks := read(timeout_s)), device.station.drained(START_NS + 3000 * MS)))
+        reads.append((len(chunks := read(timeout_s)), device.station.is_drained(START_NS + 3000 * MS)))
         return chunks
 
     device.read = noted  # type: ignore[method-assign]
@@ -131,7 +131,7 @@ def test_what_waited_while_the_recorder_was_stopped_has_an_uncertain_arrival(
     assert at_ms == 1000 + lasts_ms and f"stamped up to {lasts_ms / 1000 + 0.001:.3f} s late" in detail
     assert late.sum() >= lasts_ms - 2 and (uncertain_ns[late] > 0).all()
     assert (sent_ns >= t_ns - np.maximum(uncertain_ns, MS)).all()  # when it truly came lies within what is given
-    assert sealed.uncertain == np.count_nonzero(uncertain_ns) <= lasts_ms + CATCH_UP_NS // MS + 5
+    assert sealed.uncertain == np.count_nonzero(uncertain_ns) <= lasts_ms + MIN_CATCH_UP_NS // MS + 5
     assert sealed.lost == 0
 
 
@@ -169,9 +169,9 @@ def test_a_device_that_takes_its_time_is_no_stall() -> None:
 def test_a_datagram_says_whether_the_kernel_stamped_it() -> None:
     link = network.UdpLink("x", network.bind_port("127.0.0.1", 0, "x"), prompt=True)
     try:
-        link._arrival([])
+        link._arrival_ns([])
         assert not link.kernel_stamped
-        link._arrival([(1, network.STAMPS, bytes(16))])
+        link._arrival_ns([(1, network.STAMPS, bytes(16))])
         assert link.kernel_stamped
     finally:
         link.close()
@@ -259,7 +259,7 @@ def test_a_device_that_is_silent_is_blamed_though_the_disk_is_slow_too(
     slow_to_finish(script, monkeypatch)
     ran = lab.call("acquire rig.toml -o rec --duration-s 5")
 
-    assert ran.code == 5 and "nothing came for 3." in ran.err
+    assert ran.code == 5 and "nothing was received for 3." in ran.err
 
 
 def test_time_is_told_by_two_clocks_that_agree() -> None:

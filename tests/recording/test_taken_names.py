@@ -21,8 +21,8 @@ def test_a_name_that_a_recording_has_but_for_case_is_refused_and_numbered_where_
     name: str, existing_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = Manifest(ACQUIRE, 1, recordings={existing_name: ENTRY, "another": ENTRY})
-    monkeypatch.setattr(appending, "existing", lambda output: before)
-    with pytest.raises(UsageError, match=f"names already: {existing_name}"):
-        appending.refuse_taken(Path("rec"), ["bowl", name])
-    appending.refuse_taken(Path("rec"), ["bowl", f"{name}-2"])
+    monkeypatch.setattr(appending, "existing_manifest", lambda output: before)
+    with pytest.raises(UsageError, match=f"with these names: {existing_name}"):
+        appending.refuse_existing_names(Path("rec"), ["bowl", name])
+    appending.refuse_existing_names(Path("rec"), ["bowl", f"{name}-2"])
     assert appending._free_name(name, before.recordings) == f"{name}-2"

@@ -32,8 +32,8 @@ def plug(rig: Emulator, name: str, *, back: bool) -> None:
 
 
 def enough(rig: Emulator, name: str, frames: int) -> None:
-    before = len(rig.ledger[name].whole)
-    live.awaited(lambda: len(rig.ledger[name].whole) > before + frames)
+    before = len(rig.ledger[name].intact_rows)
+    live.awaited(lambda: len(rig.ledger[name].intact_rows) > before + frames)
 
 
 def start_recording(lab: Lab, rig: Emulator) -> subprocess.Popen[str]:
@@ -59,7 +59,7 @@ def numbers(rig: Emulator, shard: Any, name: str) -> list[int]:
     rows = live.sent(rig, name)
     rows_by_seq = {
         int(seq): (row, int(number))
-        for seq, row, number in zip(samples.seq, rows, ledger.column("number")[ledger.whole], strict=True)
+        for seq, row, number in zip(samples.seq, rows, ledger.column("number")[ledger.intact_rows], strict=True)
     }
     counts = shard.table(name).column("seq").to_numpy() % modulus
     sent_samples = [rows_by_seq[int(seq)] for seq in counts]

@@ -40,7 +40,7 @@ def refused(lab: Lab, folder: Path) -> str:
     ran = lab.call("acquire --recover")
     assert ran.code == 1 and files_outside_store(lab) == before
     assert sorted(folder.iterdir()) == files
-    prefix = f"tacpipe: The spool {folder} stays as it is. "
+    prefix = f"tacpipe: The spool {folder} was not sealed. "
     assert ran.err.startswith(prefix) and ran.err.endswith("\n") and ran.err[:-1].isprintable()
     return ran.err.removeprefix(prefix)
 
@@ -67,7 +67,7 @@ def test_a_header_that_names_no_recording_is_refused(lab: Lab, name: Any) -> Non
     folder = spooled(lab)
     declare(folder, recording=name)
 
-    assert refused(lab, folder).startswith("Its recording is called ")
+    assert refused(lab, folder).startswith("Its recording is named ")
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_spool_that_is_none_stays_and_keeps_nobody_from_recording(
     files = sorted(folder.iterdir())
     ran = lab.run("acquire rig.toml -o rec --duration-s 1 --name new")
 
-    assert f"The spool {folder} stays as it is. " in ran.err
+    assert f"The spool {folder} was not sealed. " in ran.err
     assert sorted(folder.iterdir()) == files
     assert list(live.shards(lab.folder)) == ["new"]
 
@@ -160,7 +160,7 @@ def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypa
     monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: (_ for _ in ()).throw(PermissionError()))
     ran = lab.run("acquire --recover")
 
-    mine = spool_folders.user(folder.stat().st_uid)
+    mine = spool_folders.user_name(folder.stat().st_uid)
     for spool in (folder, unfinished):
         assert f"The spool {spool} belongs to {mine}. Only this user can seal it.\n" in ran.err
         assert (spool / "bytes").exists()

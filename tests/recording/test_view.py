@@ -28,7 +28,7 @@ def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
     """A force sensor of 1 kHz of which 7 samples of 400 were lost, at the end of these 0.4 s."""
     watch = Watch(RigStream("force", "optoforce", OptoForce(axes=3), Address("serial", "/dev/ttyACM0")))
     sent = list(enumerate(frames(400)))
-    watch.feed([Chunks.of([(row * 1_000_000, frame) for row, frame in sent[:100] + sent[107:]])])
+    watch.feed([Chunks.from_pairs([(row * 1_000_000, frame) for row, frame in sent[:100] + sent[107:]])])
     monkeypatch.setattr(clock, "now_ns", lambda: 400_000_000)
     return watch
 
@@ -39,11 +39,11 @@ def pad(touched: int | None = None) -> Watch:
     watch = Watch(RigStream("pad", "generic", sensor, Address("udp", ":4000")))
     idle = np.full(TAXELS, 100, "<u2")
     for tick in range(20):
-        watch.feed([Chunks.of([(tick * 10_000_000, idle.tobytes())])])
+        watch.feed([Chunks.from_pairs([(tick * 10_000_000, idle.tobytes())])])
     pressed = idle.copy()
     if touched is not None:
         pressed[touched] = 900
-    watch.feed([Chunks.of([(200_000_000, pressed.tobytes())])])
+    watch.feed([Chunks.from_pairs([(200_000_000, pressed.tobytes())])])
     return watch
 
 
@@ -51,7 +51,7 @@ def rendered(view: RigView, watches: dict[str, Watch], *, colours: bool = False)
     """Return what the view draws on a terminal."""
     console = Console(file=io.StringIO(), width=100, force_terminal=colours, color_system="256" if colours else None)
     figures = {name: watch.figures(clock.now_ns()) for name, watch in watches.items()}
-    console.print(view._picture("recording one, 3 s", figures))
+    console.print(view._render("recording one, 3 s", figures))
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return text
 
@@ -127,7 +127,7 @@ def test_a_terminal_shows_the_view_and_is_left_clean(force: Watch, monkeypatch: 
     screen = io.StringIO()
     monkeypatch.setattr(terminal, "is_visible", lambda: True)
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr(view_of, "FRAMES_HZ", 1000.0)
+    monkeypatch.setattr(view_of, "REFRESH_HZ", 1000.0)
     monkeypatch.setattr("rich.console.Console.is_terminal", True)
     with RigView({"force": force}).open() as view:
         view._shown_s = 0.0

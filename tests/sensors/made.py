@@ -83,7 +83,7 @@ def through(
     runs: list[FrameRun] = []
     losses: list[FramingLoss] = []
     for start in range(0, len(stamped), at_once):
-        new_runs, lost = framer.feed(Chunks.of(stamped[start : start + at_once]))
+        new_runs, lost = framer.feed(Chunks.from_pairs(stamped[start : start + at_once]))
         runs, losses = runs + new_runs, losses + lost
     new_runs, lost = framer.flush()
     return runs + new_runs, losses + lost

@@ -23,7 +23,7 @@ def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[lis
     place, step = 0, 0
     while place < len(data):
         piece = data[place : place + sizes[step % len(sizes)]]
-        runs, lost = framer.feed(Chunks.of([(step, piece)]))
+        runs, lost = framer.feed(Chunks.from_pairs([(step, piece)]))
         samples += [sensor.decode(run.frames) for run in runs]
         losses += lost
         place, step = place + len(piece), step + 1
@@ -62,7 +62,9 @@ def hold_dialogue(dialogue: Dialogue, device: Device, between: bytes = b"", size
         incoming = between + b"".join(device.hear(ask.send))
         reply = b""
         if ask.until is not None:
-            span = next((n for stop in range(0, len(incoming) + size, size) if (n := ask.found(incoming[:stop]))), None)
+            span = next(
+                (n for stop in range(0, len(incoming) + size, size) if (n := ask.find_reply(incoming[:stop]))), None
+            )
             assert span is not None, f"no {ask.what} among {incoming.hex(' ')}"
             reply = incoming[slice(*span)]
 

@@ -17,7 +17,7 @@ def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> by
         if ask.until is None:
             reply = b""
             continue
-        span = ask.found(incoming)
+        span = ask.find_reply(incoming)
         assert span is not None, f"no reply to {ask.send.hex(' ')}, only {incoming.hex(' ')}"
         unrelated += incoming[: span[0]]
         reply, incoming = incoming[slice(*span)], incoming[span[1] :]
@@ -25,7 +25,7 @@ def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> by
 
 def reply_of(ask: Ask, incoming: bytes) -> bytes:
     """Return the reply that a question finds in what came."""
-    span = ask.found(incoming)
+    span = ask.find_reply(incoming)
     assert span is not None
     return incoming[slice(*span)]
 

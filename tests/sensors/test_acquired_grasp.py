@@ -26,7 +26,7 @@ from tests.fake_recordings import FakeRecording
 def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
     """Return the table of a stream of which one chunk came."""
     reading = LinkReader(sensor)
-    batch = reading.feed(Chunks.of([(5, chunk)]))
+    batch = reading.feed(Chunks.from_pairs([(5, chunk)]))
     assert not reading.account.lost
     columns = [column for block in batch.values for column in block.T]
     return schema.stream(batch.t_ns, columns, sensor.fields())

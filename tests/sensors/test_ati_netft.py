@@ -52,7 +52,9 @@ def test_a_lost_packet_and_a_sample_that_the_box_skipped_are_told_apart() -> Non
     sample_counts = {1: 703, 2: 710, 4: 724, 5: 738, 6: 745}  # packet 3 is lost; before packet 5 the box skipped one
     reading = LinkReader(sensor)
 
-    batch = reading.feed(Chunks.of([(1_000_000 * sent, record(sent, count)) for sent, count in sample_counts.items()]))
+    batch = reading.feed(
+        Chunks.from_pairs([(1_000_000 * sent, record(sent, count)) for sent, count in sample_counts.items()])
+    )
 
     assert [(event.cause, event.frames, event.t_ns) for event in batch.events] == [
         (LINK, 1, 4_000_000),
@@ -88,7 +90,9 @@ def test_the_box_sends_as_many_records_as_it_was_asked_for_once() -> None:
 
 def test_a_packet_of_another_size_is_malformed() -> None:
     runs, losses = (
-        AtiNetFT().framer().feed(Chunks.of([(1, record(1, 1)[:-1]), (2, record(2, 2)), (3, record(3, 3) + b"\0")]))
+        AtiNetFT()
+        .framer()
+        .feed(Chunks.from_pairs([(1, record(1, 1)[:-1]), (2, record(2, 2)), (3, record(3, 3) + b"\0")]))
     )
 
     assert [run.t_ns.tolist() for run in runs] == [[2]]
@@ -102,7 +106,7 @@ def test_what_is_encoded_is_decoded(seed: int, rate_hz: float, scale: float) -> 
     sensor = AtiNetFT(rate_hz=rate_hz, counts_per_force=scale, counts_per_torque=scale)
     counts = rng.integers(-(1 << 31), 1 << 31, (9, 6)).astype(np.int32)
     status = rng.integers(0, 1 << 32, (9, 1)).astype(np.uint32)
-    device = rng.integers(0, (1 << 32) // sensor.every, 9)
+    device = rng.integers(0, (1 << 32) // sensor.decimation, 9)
     original = Samples(
         (status, counts / scale if scale else counts), seq=rng.integers(0, 1 << 32, 9), device_seq=device
     )

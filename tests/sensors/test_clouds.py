@@ -49,7 +49,7 @@ def frame() -> DepthFrame:
 
 
 def test_each_point_of_a_cloud_is_a_row_with_the_clouds_stamp() -> None:
-    batch = LinkReader(Clouds()).feed(Chunks.of([(100, TEXT_PLY), (200, PCD)]))
+    batch = LinkReader(Clouds()).feed(Chunks.from_pairs([(100, TEXT_PLY), (200, PCD)]))
 
     assert batch.t_ns.tolist() == [100, 100, 200]  # the point that is not a number was not seen
     np.testing.assert_allclose(batch.values[0], [[0.1, 0.2, 0.7], [0.3, -0.2, 0.8], [0.1, 0.2, 0.7]], rtol=1e-6)
@@ -117,14 +117,14 @@ def test_a_depth_image_becomes_the_points_that_were_measured() -> None:
 
 
 def test_a_depth_image_is_what_its_bytes_say() -> None:
-    restored = DepthFrame.of_bytes(frame().to_bytes())
+    restored = DepthFrame.from_bytes(frame().to_bytes())
 
     assert restored.depth.tolist() == frame().depth.tolist()
     assert restored.colours is not None and restored.colours.tolist() == np.arange(18).reshape(2, 3, 3).tolist()
     assert (restored.focal, restored.centre) == ((100.0, 200.0), (1.0, 0.5))
     for content in (b"", frame().to_bytes()[:-1], b"X" + frame().to_bytes()[1:]):
         with pytest.raises(TacpipeError):
-            DepthFrame.of_bytes(content)
+            DepthFrame.from_bytes(content)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_depth_image_is_what_its_bytes_say() -> None:
     ],
 )
 def test_what_is_no_whole_cloud_is_malformed(content: bytes) -> None:
-    runs, losses = Clouds().framer().feed(Chunks.of([(1, content), (2, TEXT_PLY)]))
+    runs, losses = Clouds().framer().feed(Chunks.from_pairs([(1, content), (2, TEXT_PLY)]))
 
     assert [run.t_ns.tolist() for run in runs] == [[2]]
     assert [(loss.t_ns, loss.cause) for loss in losses] == [(1, "malformed")]
@@ -156,7 +156,7 @@ def test_a_cloud_without_the_colours_that_the_rig_tells_of_is_refused() -> None:
     bare, coloured = point_files.pack_ply(points, None), point_files.pack_ply(points, colours)
 
     for sensor, right in ((Clouds(colour=False), bare), (Clouds(), coloured)):
-        runs, losses = sensor.framer().feed(Chunks.of([(1, bare), (2, coloured)]))
+        runs, losses = sensor.framer().feed(Chunks.from_pairs([(1, bare), (2, coloured)]))
         assert [run.frames for run in runs] == [[right]]
         assert len(losses) == 1
 
@@ -171,7 +171,7 @@ def test_what_is_encoded_is_decoded(seed: int, sizes: list[int], colour: bool) -
     frames = sensor.encode(Samples((points, colours) if colour else (points,), rows=rows)) if sizes else []
     decoded = sensor.decode(frames)
 
-    assert not sensor.framer().feed(Chunks.of(list(enumerate(frames))))[1]
+    assert not sensor.framer().feed(Chunks.from_pairs(list(enumerate(frames))))[1]
     np.testing.assert_array_equal(decoded.values[0], points)
     if colour:
         np.testing.assert_array_equal(decoded.values[1], colours)

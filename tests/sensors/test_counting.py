@@ -8,24 +8,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.arrays import Int64s
-from tacpipe.recording.reading import Counted, Counting
+from tacpipe.recording.reading import CounterUnroller, UnrolledCounters
 
 WRAP = 1 << 16
 RATE_HZ = 1000.0
 PERIOD_NS = 1_000_000
 
 
-def counted(counting: Counting, first: int, count: int, at_s: float) -> Counted:
+def counted(counting: CounterUnroller, first: int, count: int, at_s: float) -> UnrolledCounters:
     """Feed counters from ``first`` on, one a period from ``at_s`` on, as a device sends them that wraps."""
     rows: Int64s = np.arange(count, dtype=np.int64)
     return counting.feed((first + rows) * counting.step % counting.modulus, round(at_s * 1e9) + rows * PERIOD_NS)
 
 
-def interrupted(first: int, outage_s: float, after: int, modulus: int = WRAP, rate_hz: float = RATE_HZ) -> Counted:
+def interrupted(
+    first: int, outage_s: float, after: int, modulus: int = WRAP, rate_hz: float = RATE_HZ
+) -> UnrolledCounters:
     """Return what is made of 10 counters from ``after`` on, behind one of ``first`` and an outage."""
-    counting = Counting(modulus, rate_hz)
+    counting = CounterUnroller(modulus, rate_hz)
     counted(counting, first, 1, 0)
-    counting.reopened()
+    counting.note_reopened()
     return counted(counting, after, 10, outage_s)
 
 
@@ -70,10 +72,10 @@ def test_a_counter_that_stands_or_is_a_little_back_after_an_outage_began_anew(af
 
 
 def test_only_the_first_sample_after_an_outage_is_doubted() -> None:
-    counting = Counting(WRAP, RATE_HZ)
-    counting.reopened()  # Before the first sample there is nothing to doubt.
+    counting = CounterUnroller(WRAP, RATE_HZ)
+    counting.note_reopened()  # Before the first sample there is nothing to doubt.
     assert not counted(counting, 500, 3, 0).reset.any()
-    counting.reopened()
+    counting.note_reopened()
     assert len(counted(counting, 0, 0, 1).seq) == 0  # nothing came yet
     assert counted(counting, 0, 3, 1).reset.tolist() == [True, False, False]
     lost = counted(counting, 38, 2, 1.004)  # 36 in 2 ms: a burst may bring so many, but no outage was before
@@ -88,11 +90,11 @@ def test_where_no_rate_is_known_a_counter_that_grew_is_believed() -> None:
 
 
 def test_a_counter_that_grows_by_more_than_one_is_doubted_in_samples() -> None:
-    counting = Counting(1 << 16, RATE_HZ, step=4)
+    counting = CounterUnroller(1 << 16, RATE_HZ, step=4)
     counted(counting, 0, 1, 0)
-    counting.reopened()
+    counting.note_reopened()
     went_on = counted(counting, 3_000, 2, 3)
-    counting.reopened()
+    counting.note_reopened()
     off = counting.feed(np.array([(6_000 * 4 + 1) % WRAP]), np.array([6_001_000_000]))
 
     assert went_on.missing.tolist() == [2_999, 0] and not went_on.reset.any()
@@ -109,7 +111,7 @@ FALSE = 999_999_999_999
 def test_a_count_that_jumps_beyond_what_time_allows_is_a_reset_and_no_loss(
     rate_hz: float, modulus: int, place: int, halves: int
 ) -> None:
-    counting = Counting(modulus, rate_hz)
+    counting = CounterUnroller(modulus, rate_hz)
     raw = np.arange(300, 400, dtype=np.int64)
     raw[place] = FALSE % modulus if modulus > 1 << 16 else 30_000
     t_ns = np.arange(100, dtype=np.int64) * PERIOD_NS
@@ -129,10 +131,10 @@ def test_a_program_of_unknown_rate_loses_what_its_count_says_up_to_what_time_all
 ) -> None:
     elapsed_count = max(1, round(gap_s * rate_hz))
     for reopened in (False, True):
-        counting = Counting(1 << 62, 0.0)
+        counting = CounterUnroller(1 << 62, 0.0)
         counting.feed(np.array([7]), np.array([0]))
         if reopened:
-            counting.reopened()
+            counting.note_reopened()
         counters = counting.feed(np.array([7 + elapsed_count]), np.array([round(gap_s * 1e9)]))
 
         assert counters.missing.tolist() == [elapsed_count - 1] and not counters.reset.any()
@@ -141,7 +143,7 @@ def test_a_program_of_unknown_rate_loses_what_its_count_says_up_to_what_time_all
 def test_a_false_count_behind_a_lost_sample_costs_that_one_alone() -> None:
     raw = np.array([9911, 9912, 999_914, 9915, 9916])  # 9913 is lost, 9914 garbled
     t_ns = np.array([0, 10, 30, 40, 50]) * 1_000_000
-    counting = Counting(1 << 32, 100.0)
+    counting = CounterUnroller(1 << 32, 100.0)
 
     batches = [counting.feed(raw[row : row + 1], t_ns[row : row + 1]) for row in range(len(raw))]
 

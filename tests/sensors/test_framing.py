@@ -35,9 +35,9 @@ SUMMED = Framing(marker=b"\x59\x59", size=9, check=sum_is_right, confirm=1)
 STRONG = Framing(marker=b"\xaa\x07\x08", size=16, check=sum16_is_right)
 TAILED = Framing(tail=b"\r\n", size=42, lock=3)
 TOLD = Framing(
-    marker=b"\x9a\x00", header=5, sizes=lambda head: head[:, 2].astype(np.int64) + 3, most=40, check=sum16_is_right
+    marker=b"\x9a\x00", header=5, sizes=lambda head: head[:, 2].astype(np.int64) + 3, max_size=40, check=sum16_is_right
 )
-ENCLOSED = Framing(marker=b"\x55\x66\x77\x88", tail=b"\xaa\xbb\xcc\xdd", most=200, check=inner_sum_is_right)
+ENCLOSED = Framing(marker=b"\x55\x66\x77\x88", tail=b"\xaa\xbb\xcc\xdd", max_size=200, check=inner_sum_is_right)
 KINDS = {"plain": PLAIN, "summed": SUMMED, "strong": STRONG, "tailed": TAILED, "told": TOLD, "enclosed": ENCLOSED}
 
 
@@ -74,7 +74,7 @@ def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[Fra
     place, step = 0, 0
     while place < len(data):
         piece = data[place : place + sizes[step % len(sizes)]]
-        new_runs, lost = framer.feed(Chunks.of([(step, piece)]))
+        new_runs, lost = framer.feed(Chunks.from_pairs([(step, piece)]))
         runs, losses = runs + new_runs, losses + lost
         place, step = place + len(piece), step + 1
     new_runs, lost = framer.flush()
@@ -170,7 +170,7 @@ def test_after_every_piece_each_byte_is_framed_lost_or_pending_and_frames_stand_
         start = ends[-1] if ends else 0
         piece = stream[start : start + sizes[step % len(sizes)]]
         ends.append(start + len(piece))
-        new_runs, lost = framer.feed(Chunks.of([(step, piece)])) if piece else framer.flush()
+        new_runs, lost = framer.feed(Chunks.from_pairs([(step, piece)])) if piece else framer.flush()
         runs, losses = runs + new_runs, losses + lost
         assert framer.account.received == ends[-1]
         assert framer.account.framed == sum(map(len, frames_of(runs)))
@@ -217,7 +217,7 @@ def test_lines_too_account_for_every_byte_and_are_the_same_however_they_are_cut(
 @given(st.lists(st.binary(max_size=20) | st.integers(0, 9).map(lambda row: numbered_frames("strong", 10, 0)[row])))
 def test_packets_are_frames_or_losses_one_for_one(packets: list[bytes]) -> None:
     framer = PacketFramer([16], sum16_is_right)
-    runs, losses = framer.feed(Chunks.of(list(enumerate(packets))))
+    runs, losses = framer.feed(Chunks.from_pairs(list(enumerate(packets))))
     good = [number for number, packet in enumerate(packets) if packet in numbered_frames("strong", 10, 0)]
     assert [t_ns for run in runs for t_ns in run.t_ns.tolist()] == good
     assert frames_of(runs) == [packets[number] for number in good]
@@ -259,7 +259,7 @@ def test_a_frame_arrives_when_its_last_byte_does() -> None:
     data = b"".join(sent)
 
     runs, _ = ByteFramer(STRONG).feed(
-        Chunks.of([(100, data[:15]), (200, data[15:17]), (300, data[17:40]), (400, data[40:])])
+        Chunks.from_pairs([(100, data[:15]), (200, data[15:17]), (300, data[17:40]), (400, data[40:])])
     )
 
     assert runs[0].t_ns.tolist() == [200, 300, 400]
@@ -270,7 +270,7 @@ def test_marks_in_a_payload_that_holds_still_give_nothing_until_it_moves() -> No
     moving = numbered_frames("plain", 30, 0)
     framer = ByteFramer(PLAIN)
 
-    quiet, _ = framer.feed(Chunks.of([(0, repeating[0][7:] + b"".join(repeating[1:]))]))
+    quiet, _ = framer.feed(Chunks.from_pairs([(0, repeating[0][7:] + b"".join(repeating[1:]))]))
     runs, losses = fed(framer, b"".join(moving), [50])
 
     assert not quiet
@@ -282,9 +282,9 @@ def test_garbage_without_end_is_thrown_away_and_not_kept() -> None:
     rng = np.random.default_rng(0)
     framer = ByteFramer(SUMMED)
     for step in range(200):
-        framer.feed(Chunks.of([(step, rng.integers(0, 80, 1000, dtype=np.uint8).tobytes())]))
+        framer.feed(Chunks.from_pairs([(step, rng.integers(0, 80, 1000, dtype=np.uint8).tobytes())]))
 
-    assert framer.account.pending <= SUMMED.most + 1000
+    assert framer.account.pending <= SUMMED.max_size + 1000
     assert framer.account.framed == 0
 
 
@@ -293,7 +293,7 @@ def test_packets_of_another_size_or_sum_are_malformed() -> None:
     framer = PacketFramer([16], sum16_is_right)
     bad = good[1][:-1] + b"\x00"
 
-    runs, losses = framer.feed(Chunks.of([(1, good[0]), (2, bad), (3, b"xy"), (4, good[2]), (5, good[3])]))
+    runs, losses = framer.feed(Chunks.from_pairs([(1, good[0]), (2, bad), (3, b"xy"), (4, good[2]), (5, good[3])]))
 
     assert frames_of(runs) == [good[0], good[2], good[3]]
     assert [t_ns for run in runs for t_ns in run.t_ns] == [1, 4, 5]
@@ -314,17 +314,20 @@ def test_a_lock_needs_as_many_frames_as_the_framing_says() -> None:
     sent = numbered_frames("plain", 3, 0)
     eager, careful = ByteFramer(replace(PLAIN, lock=2)), ByteFramer(replace(PLAIN, lock=4))
 
-    assert frames_of(eager.feed(Chunks.of([(0, b"".join(sent))]))[0]) == sent[:2]
-    assert frames_of(careful.feed(Chunks.of([(0, b"".join(sent))]))[0]) == []
+    assert frames_of(eager.feed(Chunks.from_pairs([(0, b"".join(sent))]))[0]) == sent[:2]
+    assert frames_of(careful.feed(Chunks.from_pairs([(0, b"".join(sent))]))[0]) == []
 
 
 def test_the_first_frame_behind_garbage_is_found_wherever_the_bytes_are_cut() -> None:
     framing = Framing(
-        tail=b"\r\n", size=10, most=64, check=lambda rows: np.asarray((rows[:, :8] > 100).all(axis=1)), lock=3
+        tail=b"\r\n", size=10, max_size=64, check=lambda rows: np.asarray((rows[:, :8] > 100).all(axis=1)), lock=3
     )
     frames = b"".join(bytes([101 + number]) * 8 + b"\r\n" for number in range(6))
-    data = b"x" * (framing.most + 50) + b"\r\n" + frames
+    data = b"x" * (framing.max_size + 50) + b"\r\n" + frames
     for cut in range(1, len(data)):
         framer = ByteFramer(framing)
-        runs = [*framer.feed(Chunks.of([(1, data[:cut])]))[0], *framer.feed(Chunks.of([(2, data[cut:])]))[0]]
+        runs = [
+            *framer.feed(Chunks.from_pairs([(1, data[:cut])]))[0],
+            *framer.feed(Chunks.from_pairs([(2, data[cut:])]))[0],
+        ]
         assert b"".join(run.frames.tobytes() for run in [*runs, *framer.flush()[0]]) == frames, cut

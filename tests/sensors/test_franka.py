@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.franka import STATE, Franka, whole
+from tacpipe.sensors.franka import STATE, Franka, message_size
 from tacpipe.sensors.sensor import Samples
 from tests.sensors.talking import carried_out, opened, reply_of
 
@@ -71,7 +71,7 @@ def test_a_state_by_hand_gives_its_numbers() -> None:
 def test_the_number_of_a_state_is_its_counter_and_its_time_in_milliseconds() -> None:
     reading = LinkReader(Franka())
 
-    batch = reading.feed(Chunks.of([(1_000_000 * number, state(9000 + number)) for number in (1, 2, 5, 6)]))
+    batch = reading.feed(Chunks.from_pairs([(1_000_000 * number, state(9000 + number)) for number in (1, 2, 5, 6)]))
 
     assert batch.t_device_ns is not None
     assert batch.t_device_ns.tolist() == [(9000 + number) * 1_000_000 for number in (1, 2, 5, 6)]
@@ -83,7 +83,9 @@ def test_a_packet_that_is_no_state_is_malformed() -> None:
     sheared[3, 0] = 0.5
     broken = [state()[:-1], state() + b"\0", state(success_rate=float("nan")), state(pose=sheared), bytes(1377)]
 
-    runs, losses = Franka().framer().feed(Chunks.of([(row, packet) for row, packet in enumerate([*broken, state()])]))
+    runs, losses = (
+        Franka().framer().feed(Chunks.from_pairs([(row, packet) for row, packet in enumerate([*broken, state()])]))
+    )
 
     assert [run.t_ns.tolist() for run in runs] == [[5]]
     assert len(losses) == 5
@@ -129,7 +131,7 @@ def test_an_older_library_is_told_the_arms_version() -> None:
     assert arm.hear(struct.pack("<IIIHH", 0, 1, 16, 5, 4000)) == [struct.pack("<IIIHHI", 0, 1, 20, 1, 10, 0)]
     assert not arm.streaming
     with pytest.raises(DeviceError, match="0 bytes"):
-        whole(bytes(12))
+        message_size(bytes(12))
     assert carried_out(Franka().taring(), arm) == b""
 
 
@@ -151,7 +153,7 @@ def test_what_is_encoded_is_decoded_to_the_width_of_a_float32(seed: int, rows: i
     encoded = sensor.encode(Samples(values, seq=seq, t_device_ns=seq * 1_000_000))
     decoded = sensor.decode(encoded)
 
-    assert not sensor.framer().feed(Chunks.of([(row, frame.tobytes()) for row, frame in enumerate(encoded)]))[1]
+    assert not sensor.framer().feed(Chunks.from_pairs([(row, frame.tobytes()) for row, frame in enumerate(encoded)]))[1]
     np.testing.assert_array_equal(
         np.delete(decoded.values[0], range(3, 7), axis=1), np.delete(values[0], range(3, 7), axis=1)
     )

@@ -45,7 +45,7 @@ def feed_in_batches(
     runs: list[FrameRun] = []
     losses: list[FramingLoss] = []
     for start in range(0, len(chunks), at_once):
-        new_runs, lost = framer.feed(Chunks.of(chunks[start : start + at_once]))
+        new_runs, lost = framer.feed(Chunks.from_pairs(chunks[start : start + at_once]))
         runs, losses = runs + new_runs, losses + lost
     new_runs, lost = framer.flush()
     assert framer.account.pending == 0

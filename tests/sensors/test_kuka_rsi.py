@@ -62,7 +62,7 @@ def test_a_controllers_text_is_read_in_metres_and_rad() -> None:
 def test_ipoc_grows_by_the_cycle_and_a_gap_is_a_lost_text(rate_hz: float, step: int) -> None:
     reading = LinkReader(KukaRsi(rate_hz=rate_hz))
 
-    batch = reading.feed(Chunks.of([(step * 1_000_000 * n, TEXT % (1000 + step * n)) for n in (1, 2, 3, 5, 6)]))
+    batch = reading.feed(Chunks.from_pairs([(step * 1_000_000 * n, TEXT % (1000 + step * n)) for n in (1, 2, 3, 5, 6)]))
 
     assert [(event.cause, event.frames) for event in batch.events] == [(LINK, 1)]
     assert np.diff(batch.seq if batch.seq is not None else []).tolist() == [1, 1, 2, 1]
@@ -83,7 +83,7 @@ def test_ipoc_grows_by_the_cycle_and_a_gap_is_a_lost_text(rate_hz: float, step: 
     ],
 )
 def test_what_is_no_text_of_the_controller_is_malformed(packet: bytes) -> None:
-    runs, losses = KukaRsi().framer().feed(Chunks.of([(1, packet)]))
+    runs, losses = KukaRsi().framer().feed(Chunks.from_pairs([(1, packet)]))
 
     assert not runs
     assert [loss.cause for loss in losses] == ["malformed"]
@@ -135,7 +135,7 @@ def test_rsipis_server_takes_our_answers_and_we_read_its_texts(rsipi: Any) -> No
     for number in range(20):
         server.send_once()
         accepted.append(server.process_reply(sensor.answer(sent[-1]).decode()))
-        batch = reading.feed(Chunks.of([(4_000_000 * number, sent[-1])]))
+        batch = reading.feed(Chunks.from_pairs([(4_000_000 * number, sent[-1])]))
 
     assert accepted == [True] * 20
     assert server.faulty_packets == 0
@@ -175,7 +175,7 @@ def test_what_is_encoded_is_decoded_to_the_four_digits_of_a_controller(seed: int
     frames = sensor.encode(samples)
     decoded = sensor.decode(frames)
 
-    assert not sensor.framer().feed(Chunks.of(list(enumerate(frames))))[1]
+    assert not sensor.framer().feed(Chunks.from_pairs(list(enumerate(frames))))[1]
     np.testing.assert_array_equal(decoded.seq, samples.seq)
     for name, block, expected in zip(EVERY, decoded.values, samples.values, strict=True):
         if name in ("RIst", "RSol"):

@@ -170,7 +170,7 @@ def test_lost_lines_are_counted_by_their_counter_and_garbage_costs_no_more() -> 
     text = "".join(f"{row % 256},{row}\n" for row in range(300) if row not in (100, 255, 256)).replace(
         "\n50,50", "\n5#0,50"
     )
-    batches = [reading.feed(Chunks.of([(10**7, b"x\n" + text.encode())])), reading.finish()]
+    batches = [reading.feed(Chunks.from_pairs([(10**7, b"x\n" + text.encode())])), reading.finish()]
     assert sum(map(len, batches)) == 296
     assert reading.lost == 4
     assert sorted({event.cause for batch in batches for event in batch.events}) == ["garbled", "link", "start"]
@@ -201,7 +201,7 @@ def test_lines_read_together_are_what_each_is_by_itself(rows: list[list[str]], s
     singly = [sensor.decode([text]) for text in texts if sensor._is_frame(text)]
     text = b"x\n" + b"".join(line + b"\n" for line in texts)
 
-    runs, losses = sensor.framer().feed(Chunks.of([(0, text)]))
+    runs, losses = sensor.framer().feed(Chunks.from_pairs([(0, text)]))
 
     joint_batches = [sensor.decode(run.frames) for run in runs]
     assert [len(batch) for batch in joint_batches] == ([sum(map(len, singly))] if singly else [])
@@ -286,9 +286,9 @@ def test_a_guess_finds_the_options_that_wrote_the_lines(board: str) -> None:
     )
     count = np.arange(200)
     encoded = sensor.encode(Samples(values, seq=count, t_device_ns=count * 10**7))
-    data = Chunks.of([(int(row) * 10**7, line + b"\r\n") for row, line in zip(count, encoded, strict=True)])
+    data = Chunks.from_pairs([(int(row) * 10**7, line + b"\r\n") for row, line in zip(count, encoded, strict=True)])
 
-    (guessed,) = lines_guess.of(data)
+    (guessed,) = lines_guess.guess_options(data)
 
     assert guessed == options | {"columns": [{"type": "f32", **column} for column in options["columns"]]}
     assert lines(**guessed) == sensor
@@ -296,7 +296,9 @@ def test_a_guess_finds_the_options_that_wrote_the_lines(board: str) -> None:
 
 def test_a_header_that_the_board_prints_names_the_columns() -> None:
     text = "boot\n# n, Fx (N), fy\n" + "".join(f"{row},{row / 7:.3f},{row / 3:.2f}\n" for row in range(40))
-    (guessed,) = lines_guess.of(Chunks.of([(row, part.encode() + b"\n") for row, part in enumerate(text.split("\n"))]))
+    (guessed,) = lines_guess.guess_options(
+        Chunks.from_pairs([(row, part.encode() + b"\n") for row, part in enumerate(text.split("\n"))])
+    )
     columns: Any = guessed["columns"]
     assert [column["name"] for column in columns] == ["n", "fx_n", "fy"]
     assert guessed["comments"] == ["#"]
@@ -306,7 +308,7 @@ def test_a_header_that_the_board_prints_names_the_columns() -> None:
     "text", [b"", b"hello\nworld\n" * 20, bytes(range(256)) * 20, b"<a x='1'/>\n" * 50, b'{"a": 1}\n' * 50]
 )
 def test_what_is_no_lines_of_numbers_gives_no_guess(text: bytes) -> None:
-    assert lines_guess.of(Chunks.of([(0, text)] if text else [])) == []
+    assert lines_guess.guess_options(Chunks.from_pairs([(0, text)] if text else [])) == []
 
 
 def test_what_a_probe_prints_is_a_rig_file_that_reads_the_board_and_says_what_is_a_guess() -> None:
@@ -314,7 +316,7 @@ def test_what_a_probe_prints_is_a_rig_file_that_reads_the_board_and_says_what_is
     count = np.arange(200)
     counts = np.random.default_rng(1).integers(-500, 500, (200, 2)).astype(np.int32)
     encoded = [b"# boot of the board", *board.encode(Samples((counts,), seq=count, t_device_ns=count * 10**7))]
-    data = Chunks.of([(row * 10**7, line + b"\r\n") for row, line in enumerate(encoded)])
+    data = Chunks.from_pairs([(row * 10**7, line + b"\r\n") for row, line in enumerate(encoded)])
 
     text = sensors._text(Report("serial:/dev/ttyACM0", recognise(data, "serial"), 9600, heard=len(data.data)))
 

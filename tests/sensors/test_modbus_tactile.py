@@ -107,9 +107,9 @@ def test_another_number_of_taxels_is_told() -> None:
 def test_a_refusal_is_told() -> None:
     opening = SENSOR.opening({})
     ask = next(opening)
-    assert ask.found(with_crc(b"\x01\x86\x03")[:4]) is None
+    assert ask.find_reply(with_crc(b"\x01\x86\x03")[:4]) is None
     with pytest.raises(DeviceError, match="0x06"):
-        ask.found(with_crc(b"\x01\x86\x03"))
+        ask.find_reply(with_crc(b"\x01\x86\x03"))
 
 
 def test_an_address_that_is_none_is_refused() -> None:

@@ -40,7 +40,7 @@ def test_numbers_of_lines_are_those_that_python_reads_in_each(rows: list[list[st
     wide = max(1, len(lines[0].split()))
     expected = [read(line.split()) for line in lines]
 
-    numbers = number_texts.of_lines(lines, wide)
+    numbers = number_texts.parse_lines(lines, wide)
 
     if numbers is not None and np.isfinite(numbers).all():
         assert numbers.tolist() == expected
@@ -51,7 +51,7 @@ def test_numbers_of_lines_are_those_that_python_reads_in_each(rows: list[list[st
 
 @pytest.mark.parametrize("line", [b"1 2", b"1 2 3 4", b"", b"1 2\x0b3", b"1 two 3"])
 def test_lines_of_which_one_has_other_numbers_are_not_read(line: bytes) -> None:
-    assert number_texts.of_lines([b"1 2 3", line, b"4 5 6"], 3) is None
+    assert number_texts.parse_lines([b"1 2 3", line, b"4 5 6"], 3) is None
 
 
 @given(st.lists(st.tuples(WRITTEN, WRITTEN, WRITTEN), min_size=1, max_size=5))
@@ -60,7 +60,7 @@ def test_numbers_of_texts_are_those_that_python_reads_between_the_same_marks(row
     pattern = number_texts.pattern(TEXT % (b"1", b"2.5", b"-3"))
     assert pattern is not None
 
-    words = pattern.written(texts)
+    words = pattern.extract(texts)
 
     assert words is not None
     assert words.to_pylist() == [word for row in rows for word in row]
@@ -85,7 +85,7 @@ def test_texts_that_differ_in_more_than_their_numbers_are_not_read(texts: list[b
     assert pattern is not None
     filled = [text.replace(b"%b", b"7") for text in texts]
 
-    assert pattern.written([TEXT % (b"1", b"2", b"3"), *filled]) is None
+    assert pattern.extract([TEXT % (b"1", b"2", b"3"), *filled]) is None
 
 
 def test_whole_numbers_are_told_from_others() -> None:
@@ -93,14 +93,14 @@ def test_whole_numbers_are_told_from_others() -> None:
     assert pattern is not None
 
     for text, expected in [(b"4208163634", [4208163634]), (b"1.5", None), (b"1e3", None), (b"", None)]:
-        numbers = number_texts.wholes(pattern.written([b"<n>%b</n>" % text]))
+        numbers = number_texts.integers(pattern.extract([b"<n>%b</n>" % text]))
         assert (numbers is None and expected is None) or (numbers is not None and numbers.tolist() == expected)
 
 
 @given(st.lists(st.sampled_from([b"12", b"x"]), max_size=60))
 def test_looking_at_many_texts_at_once_finds_the_frames_that_looking_at_each_does(texts: list[bytes]) -> None:
-    packets = Chunks.of(list(enumerate(texts)))
-    lines = Chunks.of([(0, b"\n" + b"".join(text + b"\n" for text in texts))])
+    packets = Chunks.from_pairs(list(enumerate(texts)))
+    lines = Chunks.from_pairs([(0, b"\n" + b"".join(text + b"\n" for text in texts))])
 
     for kind, chunks in ((TextFramer, packets), (LineFramer, lines)):
         single, batched = (

@@ -12,7 +12,7 @@ from paxini_sdk import protocol, registers, sensor_registry
 from paxini_sdk.boards.high_speed import AutoPushConfig, AutoPushFrame, HighSpeedHandBoard
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.paxini import REPLY, SLOTS, VARIANTS, Paxini, message, pushed, write
+from tacpipe.sensors.paxini import REPLY, SLOTS, VARIANTS, Paxini, find_push_reply, message, write
 from tacpipe.sensors.paxini import read as asked
 from tacpipe.sensors.sensor import Samples
 from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
@@ -85,15 +85,15 @@ def test_the_vendor_reads_the_same_values(data: Any) -> None:
     config = AutoPushConfig(list(slots), data != "distributed", data != "resultant", slots)
     for row, frame in enumerate(sensor.encode(samples)):
         parsed = protocol.parse_auto_push(frame.tobytes())
-        pushed = AutoPushFrame(config, parsed.error_code, parsed.valid_data, parsed.raw)
+        find_push_reply = AutoPushFrame(config, parsed.error_code, parsed.valid_data, parsed.raw)
         ours = dict(
             zip(names, np.concatenate([block[row].astype(int) for block in samples.values]).tolist(), strict=True)
         )
         theirs = {"status": parsed.error_code}
-        for name, force in pushed.resultant_forces.items():
+        for name, force in find_push_reply.resultant_forces.items():
             slot = SLOTS[registers.MODULE_NAMES.index(name)]
             theirs |= {f"{slot}_force_{axis}": value for axis, value in zip("xyz", force, strict=True)}
-        for name, points in pushed.distributed_forces.items():
+        for name, points in find_push_reply.distributed_forces.items():
             slot = SLOTS[registers.MODULE_NAMES.index(name)]
             for number, force in enumerate(points, start=1):
                 theirs |= {f"{slot}_taxel{number:02d}_{axis}": value for axis, value in zip("xyz", force, strict=True)}
@@ -143,8 +143,8 @@ def test_other_modules_than_in_the_rig_file_are_told_with_what_to_write() -> Non
         hold_dialogue(sensor.opening({}), HAND.device())
     assert str(caught.value) == (
         "The board (PX-HS V1.0.0) has thumb_tip of 52 points, index_tip of 31 points, palm1 of 9 points; the rig file "
-        "states "
-        'index_tip of 52 points. Correct modules and variants there: modules = ["thumb_tip", "index_tip", "palm1"], '
+        "declares "
+        'index_tip of 52 points. Correct the rig file: modules = ["thumb_tip", "index_tip", "palm1"], '
         'variants = ["DP-S2015-Elite", "DP-S1813-Elite", "MC-M2020-Elite"].'
     )
 
@@ -162,19 +162,19 @@ def test_a_refusal_and_a_write_without_data_are_understood() -> None:
     with pytest.raises(DeviceError, match="error 3"):
         taring.send(message(0x17, 0x02, b"\x03", REPLY))
     with pytest.raises(DeviceError, match=r"0x17.*0x0002"):
-        ask.found(message(0x97, 0x02, b"\x03", REPLY))
+        ask.find_reply(message(0x97, 0x02, b"\x03", REPLY))
     head = b"\xaa\x55\x00\x17\x02\x00\x01\x00"
-    assert ask.found(head + bytes([protocol.lrc(head)])) == (0, 9)
+    assert ask.find_reply(head + bytes([protocol.lrc(head)])) == (0, 9)
 
 
 def test_the_first_forces_that_are_pushed_are_looked_at_and_stay_a_sample() -> None:
     frame = stream(HAND.encode(random_samples(HAND, 1, 6)))
     success, error = (head + bytes([protocol.lrc(head)]) for head in (DONE + b"\x00", DONE + b"\x05"))
-    assert pushed(frame[:-1]) == 0
-    assert pushed(frame) == (0, 0)
-    assert pushed(frame[9:] + success + frame) == (len(frame) - 9, len(frame) - 9 + len(success))
+    assert find_push_reply(frame[:-1]) == 0
+    assert find_push_reply(frame) == (0, 0)
+    assert find_push_reply(frame[9:] + success + frame) == (len(frame) - 9, len(frame) - 9 + len(success))
     with pytest.raises(DeviceError, match="error 5"):
-        pushed(error)
+        find_push_reply(error)
 
 
 @pytest.mark.rig
@@ -186,11 +186,11 @@ def test_the_vendors_client_is_served() -> None:
         board.disable_auto_push()
         assert board.read_version() == "PX-HS V1.0.0"
         config = board.read_auto_push_config()
-        pushed = list(board.stream_auto_push(max_frames=5, config=config))
+        find_push_reply = list(board.stream_auto_push(max_frames=5, config=config))
         board.calibrate()
     assert {SLOTS[slot]: count for slot, count in config.point_counts.items()} == HAND.points
     sent = {frame.tobytes() for frame in frames}
-    assert len(pushed) == 5 and all(frame.raw in sent for frame in pushed)
+    assert len(find_push_reply) == 5 and all(frame.raw in sent for frame in find_push_reply)
 
 
 @pytest.mark.parametrize(

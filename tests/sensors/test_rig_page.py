@@ -75,7 +75,7 @@ def test_three_lines_of_python_send_what_a_tap_takes() -> None:
         packet = listener.recv(4096)
         space["tap"].close()
 
-    batch = LinkReader(Tap(numbers=("width_m:m",), counted=True)).feed(Chunks.of([(1, packet)]))
+    batch = LinkReader(Tap(numbers=("width_m:m",), counted=True)).feed(Chunks.from_pairs([(1, packet)]))
 
     assert batch.values[1].tolist() == [[0.031]]
     assert json.loads(batch.values[0][0, 1])["phase"] == "lift"

@@ -77,7 +77,7 @@ def test_what_is_encoded_is_decoded(split: bool, seed: int) -> None:
 @pytest.mark.parametrize("report", [b"", b"\x01\x02", BOTH + b"\0", b"\x04\0\0\0\0\0\0", b"\x02" + BOTH[1:]])
 def test_what_is_no_report_is_malformed_and_leaves_the_state(report: bytes) -> None:
     framer = SpaceMouse().framer()
-    runs, losses = framer.feed(Chunks.of([(1, BOTH), (2, report), (3, PRESSED)]))
+    runs, losses = framer.feed(Chunks.from_pairs([(1, BOTH), (2, report), (3, PRESSED)]))
 
     assert [loss.cause for loss in losses] == ["malformed"]
     assert made.decoded(SpaceMouse(), runs).values[0].tolist() == [[350, -350, 0, 1, -1, 10]] * 2

@@ -27,7 +27,7 @@ def line(**record: Any) -> bytes:
 
 
 def malformed(sensor: Tap, packet: bytes) -> bool:
-    runs, losses = sensor.framer().feed(Chunks.of([(1, packet)]))
+    runs, losses = sensor.framer().feed(Chunks.from_pairs([(1, packet)]))
     assert len(runs) + len(losses) == 1
     return bool(losses)
 
@@ -53,7 +53,7 @@ def test_a_packet_of_several_lines_holds_as_many_records_with_its_stamp() -> Non
     sensor = Tap(numbers=("n",))
     packet = b"\n".join([line(n=1), b"", line(n=2)]) + b"\r\n"
 
-    batch = LinkReader(sensor).feed(Chunks.of([(5, line(n=0)), (7, packet)]))
+    batch = LinkReader(sensor).feed(Chunks.from_pairs([(5, line(n=0)), (7, packet)]))
 
     assert batch.values[1].tolist() == [[0.0], [1.0], [2.0]]
     assert batch.t_ns.tolist() == [5, 7, 7]
@@ -68,7 +68,7 @@ def test_an_event_stands_in_a_column_of_its_own() -> None:
 def test_a_counted_program_shows_what_was_lost_and_its_clock_is_kept() -> None:
     reading = LinkReader(Tap(counted=True, timed=True))
 
-    batch = reading.feed(Chunks.of([(n, line(seq=n, t_ns=1000 * n)) for n in (4, 5, 7)]))
+    batch = reading.feed(Chunks.from_pairs([(n, line(seq=n, t_ns=1000 * n)) for n in (4, 5, 7)]))
 
     assert [(event.cause, event.frames) for event in batch.events] == [(LINK, 1)]
     assert batch.t_device_ns is not None and batch.t_device_ns.tolist() == [4000, 5000, 7000]

@@ -74,11 +74,11 @@ def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
 
 def test_a_save_that_failed_is_an_error() -> None:
     ask = next(ask for ask in TfMini().opening({}) if ask.send == command(0x11))
-    assert ask.found(PLUS + bytes.fromhex("5A 05 11 00 70") + PLUS) == (9, 14)
+    assert ask.find_reply(PLUS + bytes.fromhex("5A 05 11 00 70") + PLUS) == (9, 14)
     # The sum is wrong: these bytes occur in a frame by chance.
-    assert ask.found(bytes.fromhex("5A 05 11 01 70")) is None
+    assert ask.find_reply(bytes.fromhex("5A 05 11 01 70")) is None
     with pytest.raises(DeviceError):
-        ask.found(bytes.fromhex("5A 05 11 01 71"))
+        ask.find_reply(bytes.fromhex("5A 05 11 01 71"))
 
 
 def test_the_original_is_told_nothing() -> None:

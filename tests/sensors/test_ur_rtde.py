@@ -93,7 +93,7 @@ def test_texts_among_the_data_are_frames_without_samples_however_the_bytes_are_c
     reading, place, step, batches = LinkReader(sensor), 0, 0, []
     while place < len(data):
         size = sizes[step % len(sizes)]
-        batches.append(reading.feed(Chunks.of([(step, data[place : place + size])])))
+        batches.append(reading.feed(Chunks.from_pairs([(step, data[place : place + size])])))
         place, step = place + size, step + 1
     batches.append(reading.finish())
 
@@ -108,7 +108,7 @@ def test_a_text_as_long_as_a_data_package_holds_no_sample() -> None:
     text = struct.pack(">HB", 20, ord("M")) + bytes(17)
     reading = LinkReader(sensor)
 
-    batch = reading.feed(Chunks.of([(1, package(1.0, 2.0) + text + package(1.1, 3.0) + text)]))
+    batch = reading.feed(Chunks.from_pairs([(1, package(1.0, 2.0) + text + package(1.1, 3.0) + text)]))
 
     assert batch.values[0].tolist() == [[2.0], [3.0]]
 
@@ -119,7 +119,7 @@ def test_a_package_with_a_wrong_size_is_none_and_those_after_it_are_found() -> N
     sent[5] = sent[5][:-8]
     reading = LinkReader(sensor)
 
-    batch, last_batch = reading.feed(Chunks.of([(1, b"".join(sent))])), reading.finish()
+    batch, last_batch = reading.feed(Chunks.from_pairs([(1, b"".join(sent))])), reading.finish()
 
     values = [row[0] for part in (batch, last_batch) if len(part) for row in part.values[0].tolist()]
     assert set(values) <= set(range(1, 20)) - {6}

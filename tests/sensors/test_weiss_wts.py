@@ -79,17 +79,17 @@ def test_the_device_answers_the_opening_while_it_still_streams() -> None:
 
 
 def test_a_sensor_with_another_matrix_is_named() -> None:
-    with pytest.raises(DeviceError, match=r"2 rows of 3 columns.*14 of 6"):
+    with pytest.raises(DeviceError, match=r"2 rows and 3 columns.*14 and 6"):
         described.hold(WeissWts().opening({}), SMALL.device())
 
 
 def test_a_refusal_is_an_error() -> None:
     ask = next(WeissWts().taring())
-    assert ask.found(message(0x23, b"\0\0")) == (0, 10)
-    assert ask.found(PLAIN + message(0x23, b"\0\0") + PLAIN) == (len(PLAIN), len(PLAIN) + 10)
-    assert ask.found(PLAIN) is None
+    assert ask.find_reply(message(0x23, b"\0\0")) == (0, 10)
+    assert ask.find_reply(PLAIN + message(0x23, b"\0\0") + PLAIN) == (len(PLAIN), len(PLAIN) + 10)
+    assert ask.find_reply(PLAIN) is None
     with pytest.raises(DeviceError, match="error 14"):
-        ask.found(PLAIN + message(0x23, b"\x0e\0"))
+        ask.find_reply(PLAIN + message(0x23, b"\x0e\0"))
 
 
 def test_a_tare_is_answered_and_a_closing_stops() -> None:

@@ -64,7 +64,7 @@ def test_forces_are_nan_where_the_server_sends_none() -> None:
 def test_the_welcome_and_texts_of_other_sensors_hold_no_sample_and_are_no_loss() -> None:
     reading = LinkReader(Xela(sensor=1))
 
-    batch = reading.feed(Chunks.of([(1, WELCOME), (2, text(5)), (3, text(6, sensors=(2,))), (4, text(7))]))
+    batch = reading.feed(Chunks.from_pairs([(1, WELCOME), (2, text(5)), (3, text(6, sensors=(2,))), (4, text(7))]))
 
     assert batch.t_ns.tolist() == [2, 4]
     assert reading.account.lost == 0
@@ -73,7 +73,7 @@ def test_the_welcome_and_texts_of_other_sensors_hold_no_sample_and_are_no_loss()
 def test_a_number_that_is_missing_is_a_lost_message() -> None:
     reading = LinkReader(Xela())
 
-    reading.feed(Chunks.of([(10_000_000 * number, text(number)) for number in (1, 2, 4, 5)]))
+    reading.feed(Chunks.from_pairs([(10_000_000 * number, text(number)) for number in (1, 2, 4, 5)]))
 
     assert reading.lost == 1
 
@@ -99,7 +99,7 @@ def test_a_number_that_is_missing_is_a_lost_message() -> None:
     ],
 )
 def test_what_is_no_reading_is_malformed(packet: bytes) -> None:
-    runs, losses = Xela(forces=True).framer().feed(Chunks.of([(1, packet)]))
+    runs, losses = Xela(forces=True).framer().feed(Chunks.from_pairs([(1, packet)]))
 
     assert not runs
     assert [loss.cause for loss in losses] == ["malformed"]
@@ -121,7 +121,7 @@ def test_what_is_encoded_is_decoded(seed: int, rows: int, forces: bool, taxels: 
     frames = sensor.encode(original)
     decoded = sensor.decode(frames)
 
-    _, losses = sensor.framer().feed(Chunks.of([(row, frame) for row, frame in enumerate(frames)]))
+    _, losses = sensor.framer().feed(Chunks.from_pairs([(row, frame) for row, frame in enumerate(frames)]))
     assert not losses
     for block, expected in zip(decoded.values, values, strict=True):
         np.testing.assert_array_equal(block, expected)

@@ -62,7 +62,7 @@ def test_no_point_is_hidden_by_the_body_itself(index: int) -> None:
     facing = (view.placed.normal(points) * points).sum(axis=1)
     assert (facing < 1e-4).all()
     before = points[:, None] * np.linspace(0.8, 0.998, 60)[:, None]  # (point, step, xyz)
-    for row in view.placed.inward(before.reshape(-1, 3)).reshape(before.shape):
+    for row in view.placed.to_body_frame(before.reshape(-1, 3)).reshape(before.shape):
         assert not inside(view, row).any()
 
 

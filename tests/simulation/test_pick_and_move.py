@@ -87,7 +87,7 @@ def test_a_contact_that_stays_spans_six_dimensions(seed: int) -> None:
     taken_ns = scene.path.t_ns[scene.grasp.grip_n > 0][::20]
     parts = []
     for finger, skin in enumerate(scene.skins):
-        counts = taxels.digitised(skin.base_count + taxels.signal(skin, touch(scene, finger, taken_ns)))
+        counts = taxels.digitise(skin.base_count + taxels.signal(skin, touch(scene, finger, taken_ns)))
         parts.append(counts.astype(float))
     counts_of_both = np.hstack(parts)  # (time, channel)
     power = np.linalg.svd(counts_of_both - counts_of_both.mean(axis=0), compute_uv=False) ** 2

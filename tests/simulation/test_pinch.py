@@ -21,7 +21,7 @@ MADE = fingertip_sp.sensors(np.random.default_rng(1))
 
 def noiseless_readings(situation: Situation, force_n: np.ndarray) -> np.ndarray:
     """Return noiseless readings (draw, finger, channel) under forces (draw, finger)."""
-    contact, skin = pinch.pressed(situation, force_n)
+    contact, skin = pinch.deformation(situation, force_n)
     centre = np.broadcast_to(pinch.centre(situation, NOTHING), (len(force_n), 2, 2))
     return fingertip_sp.signal(MADE, force_n, contact, skin, centre)
 
@@ -50,9 +50,9 @@ def test_an_untouched_sensor_shows_its_rest() -> None:
 
 
 def test_of_what_pressed_electrodes_fall_by_the_others_rise_by_the_share_of_the_bulge() -> None:
-    contact, skin = pinch.pressed(FLAT, np.full((1, 2), 2.0))
+    contact, skin = pinch.deformation(FLAT, np.full((1, 2), 2.0))
     centre = pinch.centre(FLAT, NOTHING)
-    change = fingertip_sp.pressed(contact, skin, centre)[0, 0]
+    change = fingertip_sp.electrode_change(contact, skin, centre)[0, 0]
     way2 = ((biotac_sp.unrolled_m() - centre[0, 0]) ** 2).sum(axis=1)
     fall = 2600 * (1 - np.exp(-skin[0, 0] / 0.6e-3)) * np.exp(-way2 / (2 * (1.1 * contact[0, 0]) ** 2))
     assert change.sum() == pytest.approx(-0.65 * fall.sum())
@@ -62,7 +62,7 @@ def test_of_what_pressed_electrodes_fall_by_the_others_rise_by_the_share_of_the_
 def test_a_sharper_object_makes_the_contact_smaller_and_deeper_and_presses_fewer_electrodes() -> None:
     sharp = replace(FLAT, curvatures_1_m=np.full((2, 2), 160.0))
     force = np.full((1, 2), 2.0)
-    (wide, shallow), (narrow, deep) = (pinch.pressed(situation, force) for situation in (FLAT, sharp))
+    (wide, shallow), (narrow, deep) = (pinch.deformation(situation, force) for situation in (FLAT, sharp))
     assert 1e3 * wide[0, 0] == pytest.approx(2.16, abs=0.005)
     assert 1e3 * narrow[0, 0] == pytest.approx(1.69, abs=0.005)
     assert deep[0, 0] > shallow[0, 0]
@@ -155,7 +155,7 @@ def test_drift_has_the_rate_that_was_asked_for() -> None:
 
 
 def test_readings_stay_whole_and_within_their_limits() -> None:
-    counts = fingertip_sp.counted(np.array([[-5e3] * 25, [9e3] * 25, [1500.4] * 25]))
+    counts = fingertip_sp.to_counts(np.array([[-5e3] * 25, [9e3] * 25, [1500.4] * 25]))
     assert counts.dtype == np.uint16
     assert counts[:, 0].tolist() == [100, 3800, 1500]
     assert counts[:, -1].tolist() == [0, 4095, 1500]

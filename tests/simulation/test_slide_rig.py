@@ -18,7 +18,7 @@ from tacpipe.formats.roboskin import is_time, lag_one, scramble, unscramble
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.registry import load
 from tacpipe.simulation import fingertip, forearm
-from tacpipe.simulation.slide import SENSORS, SlideRig, material, nuisance, place, simulate_trial
+from tacpipe.simulation.slide import SENSORS, SlideRig, material, nuisance, simulate_trial, slide_trial
 from tests.fake_recordings import column
 
 PLAIN = SlideRig(pac=False, arm_every=0)
@@ -191,7 +191,7 @@ def test_time_of_roboskin_is_the_axis_that_the_rule_finds_until_it_is_scrambled(
 
 @given(st.integers(0, 2000), st.integers(1, 25), st.integers(1, 4))
 def test_trials_take_turns_over_sensors_then_materials_then_sessions(index: int, materials: int, sessions: int) -> None:
-    placed = place(index, SlideRig(materials=materials, sessions=sessions))
+    placed = slide_trial(index, SlideRig(materials=materials, sessions=sessions))
     assert placed.sensor == ("biotac", "roboskin")[index % 2]
     assert placed.material == index // 2 % materials + 1
     assert placed.number == index // (2 * materials)

@@ -60,7 +60,7 @@ def test_counts_give_back_the_force_on_each_taxel() -> None:
     force = RNG.normal(size=(40, 16, 3))
     counts = skin().base_count + taxels.signal(skin(), force)
     np.testing.assert_allclose(taxels.forces(skin(), counts), force, atol=1e-9)
-    rounded = taxels.digitised(counts)
+    rounded = taxels.digitise(counts)
     assert rounded.dtype == np.uint16
     assert np.abs(taxels.forces(skin(), rounded.astype(float)) - force).max() < 0.001
 
@@ -75,7 +75,7 @@ def test_a_force_on_one_taxel_shows_on_its_neighbours_by_the_cross_talk() -> Non
 
 def test_what_creeps_follows_by_a_first_order_lag() -> None:
     step = np.where(np.arange(4000) < 1000, 2.0, 3.0)
-    lagged_force = taxels.lagged(step, 1000.0)
+    lagged_force = taxels.lag(step, 1000.0)
     np.testing.assert_allclose(lagged_force[:1000], 2.0, atol=1e-12)
     assert lagged_force[1500] == pytest.approx(3 - np.exp(-1), abs=0.002)
     assert lagged_force[-1] == pytest.approx(3 - np.exp(-6), abs=0.002)

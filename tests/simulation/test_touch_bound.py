@@ -47,11 +47,11 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
     rng = np.random.default_rng(index)
     repeated_counts = []
     for _ in range(3_000):
-        hidden = pinch.unseen(rng, 1, RIG.effort_spread)
+        hidden = pinch.draw_unseen(rng, 1, RIG.effort_spread)
         t_ns = stamp_ns(int(rng.integers(200_000)), RIG)
         repeated_touch = read_sensors(sensor_pair, replace(scene, hidden=hidden), t_ns, RIG)
         repeated_counts.append(
-            fingertip_sp.counted(repeated_touch.signal + sensor_pair.noise * rng.normal(size=(2, 25)))
+            fingertip_sp.to_counts(repeated_touch.signal + sensor_pair.noise * rng.normal(size=(2, 25)))
         )
     mean, variance = grasp.mean_and_variance(np.array(repeated_counts))
     expected_mean, spread = grasp.mean_and_variance(grasp.draw_readings(scene.situation, sensor_pair, rng, draws=3_000))

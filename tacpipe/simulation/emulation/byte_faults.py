@@ -1,7 +1,7 @@
-"""Harm a stream on its way: change, add or lose bytes and frames, and pause or unplug the device.
+"""Inject faults into a stream: change, add or drop bytes and frames, and pause or unplug the device.
 
-`Harm` takes the frames of a stream, with the times at which they are due, and gives what goes out instead. It knows
-nothing of links: whatever it does to a stream is the same for the same seed, however the stream is sent.
+`Harm` replaces the frames of a stream, with the times at which they are due, by the items to send. It is independent of
+links: with the same seed, the faults are the same for every link.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Frames, Sensor
 
 CAN_BYTES = 13  # size of a CAN frame of a link
-NEIGHBOURS = 8  # sound frames on either side: more than any framer needs to lock
+NEIGHBOURS = 8  # good frames on both sides: more than any framer needs to lock
 
 
-def passes(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: bytes) -> bool:
-    """Return whether ``harmed``, sent instead of ``frames[row]``, makes the framer give out what it would not have."""
+def is_undetectable(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: bytes) -> bool:
+    """Return whether the framer returns a wrong frame if ``harmed`` is sent instead of ``frames[row]``."""
     before = _sample(frames, range(row - NEIGHBOURS, row), row)
     after = _sample(frames, range(row + 1, row + 1 + NEIGHBOURS), row)
-    sound = set(_given_out(sensor, [*before, frames[row], *after]))
-    return any(frame not in sound for frame in _given_out(sensor, [*before, harmed, *after]))
+    expected = set(_framed(sensor, [*before, frames[row], *after]))
+    return any(frame not in expected for frame in _framed(sensor, [*before, harmed, *after]))
 
 
-def _given_out(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
+def _framed(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
     framer = sensor.framer()
     chunks = [chunk for piece in pieces for chunk in _chunks(sensor, piece)]
-    runs, _ = framer.feed(Chunks.of(list(enumerate(chunks))))
-    return [frame for run in runs + framer.flush()[0] for frame in of_run(run)]
+    runs, _ = framer.feed(Chunks.from_pairs(list(enumerate(chunks))))
+    return [frame for run in runs + framer.flush()[0] for frame in frames_of_run(run)]
 
 
 def _chunks(sensor: Sensor, piece: bytes) -> list[bytes]:
-    """Return what a link gives of a frame: of a CAN bus, frames of 13 bytes."""
+    """Return the chunks in which a link returns a frame: frames of 13 bytes for a CAN bus."""
     if sensor.links != ("can",):
         return [piece]
     return [piece[start : start + CAN_BYTES] for start in range(0, len(piece), CAN_BYTES)]
 
 
-def of_run(run: FrameRun) -> list[bytes]:
-    """Return the frames of a run one by one."""
+def frames_of_run(run: FrameRun) -> list[bytes]:
+    """Return the frames of a run as bytes."""
     return [bytes(frame) for frame in run.frames]
 
 
-def one_by_one(sensor: Sensor, frames: Frames) -> list[bytes]:
-    """Return what `Sensor.encode` gave as one piece of bytes a frame, as they go out: lines with their ends."""
+def split_frames(sensor: Sensor, frames: Frames) -> list[bytes]:
+    """Return the encoded frames as bytes, as they are sent: lines with their line ends."""
     if isinstance(frames, np.ndarray):
         size, content = frames.shape[1], np.ascontiguousarray(frames).tobytes()
         return [content[start : start + size] for start in range(0, len(content), size)]
@@ -60,14 +60,14 @@ def one_by_one(sensor: Sensor, frames: Frames) -> list[bytes]:
     return list(frames)
 
 
-def _sample(frames: Sequence[bytes], rows: range, but: int) -> list[Any]:
-    """Return the frames in these rows, others of the block where they reach beyond it."""
+def _sample(frames: Sequence[bytes], rows: range, excluded: int) -> list[Any]:
+    """Return the frames in these rows, modulo the size of the block, without the ``excluded`` row."""
     count = len(frames)
-    return [frames[row % count] for row in rows if row % count != but % count]
+    return [frames[row % count] for row in rows if row % count != excluded % count]
 
 
-class Happening:
-    """Moments, ns, at which something happens ``rate_hz`` times a second on average; the same seed gives the same."""
+class RandomEvents:
+    """Random times in ns of events with an average rate of ``rate_hz``. The same generator gives the same times."""
 
     def __init__(self, rate_hz: float, rng: np.random.Generator) -> None:
         self._rate_hz, self._rng = rate_hz, rng
@@ -76,8 +76,8 @@ class Happening:
     def _step(self, now_ns: float) -> float:
         return now_ns + self._rng.exponential(1e9 / self._rate_hz) if self._rate_hz > 0 else float("inf")
 
-    def until(self, t_ns: int) -> list[int]:
-        """Return the moments before ``t_ns`` that were not asked for yet."""
+    def pop_until(self, t_ns: int) -> list[int]:
+        """Return the times before ``t_ns`` that were not returned before."""
         events = []
         while self._next_ns < t_ns:
             events.append(int(self._next_ns))
@@ -90,8 +90,8 @@ SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRU
     "gone",
 )  # fmt: skip
 CAUSES = (SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE)
-CHANGED = (CUT, FLIP, BURST)  # faults whose frame goes out with other bytes
-LONGEST_NOISE, LONGEST_BURST = 40, 60  # bytes
+CHANGED = (CUT, FLIP, BURST)  # faults that change the bytes of a frame
+MAX_NOISE, MAX_BURST = 40, 60  # bytes
 SEPARATION_NS = 1_000  # time between a frame and an item that is inserted before or after it
 
 
@@ -99,32 +99,32 @@ SEPARATION_NS = 1_000  # time between a frame and an item that is inserted befor
 class Faults:
     """The faults and their frequencies. Rates are per second, probabilities are per frame."""
 
-    noise: float = 0.0  # a second: some bytes between two frames, or a packet of nonsense
-    cut: float = 0.0  # a second: a frame of which the beginning or the end is missing
-    flip: float = 0.0  # a second: a bit that is inverted
-    burst: float = 0.0  # a second: up to 60 bytes in a row that are random
-    drop: float = 0.0  # probability: the frame does not go out
-    duplicate: float = 0.0  # probability: the packet goes out twice; nothing on links of bytes
-    reorder: float = 0.0  # probability: the packet goes out behind the next; nothing on links of bytes
-    stall: float = 0.0  # a second: nothing comes for a while, and then all of it
-    stall_s: float = 0.2  # duration of a stall
-    unplug: float = 0.0  # a second: the device goes away
+    noise: float = 0.0  # rate of random bytes between two frames, or of packets of random bytes
+    cut: float = 0.0  # rate of frames without their start or end
+    flip: float = 0.0  # rate of inverted bits
+    burst: float = 0.0  # rate of runs of up to 60 random bytes
+    drop: float = 0.0  # probability that a frame is not sent
+    duplicate: float = 0.0  # probability that a packet is sent twice; no effect on byte streams
+    reorder: float = 0.0  # probability that a packet is sent after the next one; no effect on byte streams
+    stall: float = 0.0  # rate of pauses after which all delayed frames are sent at once
+    stall_s: float = 0.2  # duration of a pause
+    unplug: float = 0.0  # rate of disconnections
     unplug_s: float = 1.0  # duration of a disconnection
-    clock_step: float = 0.0  # a second: the device's clock is set
-    clock_step_ms: float = 50.0  # size of a step, forward or back
-    wrap_s: float | None = None  # counters go round so long after the start
+    clock_step: float = 0.0  # rate of steps of the device's clock
+    clock_step_ms: float = 50.0  # size of a step, forward or backward
+    wrap_s: float | None = None  # time after the start at which counters wrap
 
     def __post_init__(self) -> None:
         for name in ("noise", "cut", "flip", "burst", "stall", "stall_s", "unplug", "unplug_s", "clock_step"):
             if getattr(self, name) < 0:
-                raise UsageError(f"faults: {name} is {getattr(self, name):g}; it cannot be below 0.")
+                raise UsageError(f"faults: {name} is {getattr(self, name):g}; it must be at least 0.")
         for name in ("drop", "duplicate", "reorder"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"faults: {name} is {getattr(self, name):g}; a probability is 0 to 1.")
+                raise UsageError(f"faults: {name} is {getattr(self, name):g}; it must be between 0 and 1.")
 
 
 def parse(text: str) -> Faults:
-    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is not a number.
+    """Parse the faults of a command line. Raises `UsageError` for an unknown fault or an invalid number.
 
     >>> parse("noise=0.5,drop=0.01").drop
     0.01
@@ -135,71 +135,71 @@ def parse(text: str) -> Faults:
         try:
             values[name.strip()] = float(value)
         except ValueError:
-            raise UsageError(f"--faults: {part!r} is not a fault; each reads like noise=0.5, with a number.") from None
+            raise UsageError(f"--faults: {part!r} is not a fault; write NAME=NUMBER, such as noise=0.5.") from None
     faults: Faults = params.filled(Faults, values, "--faults", "fault")
     return faults
 
 
 class SentItem(NamedTuple):
-    """An item that is sent at a moment: a frame, harmed or not, noise, or the device that is unplugged or comes back."""
+    """An item to send: a frame, with or without a fault, noise, or an event that unplugs or replugs the device."""
 
     due_ns: int
-    data: bytes  # empty: nothing goes out
-    number: int  # number of the sample, -1 for none
+    data: bytes  # empty: nothing is sent
+    number: int  # number of the sample; -1 if there is none
     cause: str = SOUND
-    invisible: bool = False  # harmed, and still takes the protocol's own test for a frame
+    invisible: bool = False  # has a fault that the protocol's own checks do not detect
 
 
 class Harm:
-    """Does to the frames of one stream what its faults state."""
+    """Apply faults to the frames of one stream."""
 
     def __init__(self, faults: Faults, sensor: Sensor, seed: Sequence[int], *, packets: bool) -> None:
         self.faults, self.sensor, self.packets = faults, sensor, packets
         self._rng = np.random.default_rng([*seed, 3])
         rates = (faults.noise, faults.cut, faults.flip, faults.burst, faults.stall, faults.unplug)
         rngs = [np.random.default_rng([*seed, 4, number]) for number in range(len(rates))]
-        happenings = [Happening(rate, rng) for rate, rng in zip(rates, rngs, strict=True)]
-        self._noise, self._cut, self._flip, self._burst, self._stall, self._unplug = happenings
+        events = [RandomEvents(rate, rng) for rate, rng in zip(rates, rngs, strict=True)]
+        self._noise, self._cut, self._flip, self._burst, self._stall, self._unplug = events
         self._stalls: list[tuple[int, int]] = []  # start and end of the last stalls
-        self._away: list[tuple[int, int]] = []
-        self._later: list[SentItem] = []  # items delayed beyond the present frames
-        self._quiet = faults == Faults(wrap_s=faults.wrap_s)
+        self._unplugged: list[tuple[int, int]] = []
+        self._delayed: list[SentItem] = []  # items delayed beyond the current frames
+        self._has_no_faults = faults == Faults(wrap_s=faults.wrap_s)
 
     def apply(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[SentItem]:
-        """Return what goes out instead of ``frames``, in order; ``first`` is the number of the first one's sample."""
+        """Return the items to send instead of ``frames``, in order. ``first`` is the sample number of the first frame."""
         items = [SentItem(due, data, first + row) for row, (data, due) in enumerate(zip(frames, due_ns, strict=True))]
-        if self._quiet or not items:
+        if self._has_no_faults or not items:
             return items
         until_ns = items[-1].due_ns + 1
-        self._change(items, until_ns)
+        self._change_bytes(items, until_ns)
         self._mark_undetectable(items, frames)
-        items = self._lose(items)
-        items = self._move(items) if self.packets else items
+        items = self._drop_frames(items)
+        items = self._move_packets(items) if self.packets else items
         items = self._add_noise(items, until_ns)
-        items = self._stay_away(items, until_ns)
-        items = sorted([*self._later, *self._hold_up(items, until_ns)], key=lambda item: item.due_ns)
-        self._later = [item for item in items if item.due_ns >= until_ns]
-        return items[: len(items) - len(self._later)]
+        items = self._disconnect(items, until_ns)
+        items = sorted([*self._delayed, *self._delay(items, until_ns)], key=lambda item: item.due_ns)
+        self._delayed = [item for item in items if item.due_ns >= until_ns]
+        return items[: len(items) - len(self._delayed)]
 
-    def _change(self, items: list[SentItem], until_ns: int) -> None:
-        for at_ns in self._flip.until(until_ns):
+    def _change_bytes(self, items: list[SentItem], until_ns: int) -> None:
+        for at_ns in self._flip.pop_until(until_ns):
             row = _row(items, at_ns)
             changed = bytearray(items[row].data)
             bit = int(self._rng.integers(8 * len(changed)))
             changed[bit // 8] ^= 1 << bit % 8
             items[row] = items[row]._replace(data=bytes(changed), cause=FLIP)
-        for at_ns in self._cut.until(until_ns):
+        for at_ns in self._cut.pop_until(until_ns):
             row = _row(items, at_ns)
             length = int(self._rng.integers(1, max(2, len(items[row].data))))
             data = items[row].data[:length] if self._rng.random() < 0.5 else items[row].data[-length:]
             items[row] = items[row]._replace(data=data, cause=CUT)
-        for at_ns in self._burst.until(until_ns):
+        for at_ns in self._burst.pop_until(until_ns):
             row = _row(items, at_ns)
             start = int(self._rng.integers(len(items[row].data)))
-            self._replace_bytes(items, row, start, int(self._rng.integers(2, LONGEST_BURST + 1)))
+            self._replace_bytes(items, row, start, int(self._rng.integers(2, MAX_BURST + 1)))
 
     def _replace_bytes(self, items: list[SentItem], row: int, start: int, count: int) -> None:
-        """Replace ``count`` bytes from ``start`` of a frame by random ones, into the frames behind it where they reach."""
+        """Replace ``count`` bytes, starting at ``start`` in a frame and continuing in the next ones, by random bytes."""
         while count > 0 and row < len(items):
             data = items[row].data
             size = min(count, len(data) - start)
@@ -211,9 +211,9 @@ class Harm:
     def _mark_undetectable(self, items: list[SentItem], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
-                items[row] = item._replace(invisible=passes(self.sensor, frames, row, item.data))
+                items[row] = item._replace(invisible=is_undetectable(self.sensor, frames, row, item.data))
 
-    def _lose(self, items: list[SentItem]) -> list[SentItem]:
+    def _drop_frames(self, items: list[SentItem]) -> list[SentItem]:
         if not self.faults.drop:
             return items
         lost = self._rng.random(len(items)) < self.faults.drop
@@ -222,8 +222,8 @@ class Harm:
             for item, is_lost in zip(items, lost, strict=True)
         ]
 
-    def _move(self, items: list[SentItem]) -> list[SentItem]:
-        """Return packets of which some come twice, and some behind the next."""
+    def _move_packets(self, items: list[SentItem]) -> list[SentItem]:
+        """Reorder and duplicate packets."""
         faults, moved = self.faults, list(items)
         for row in np.flatnonzero(self._rng.random(len(items) - 1) < faults.reorder) if faults.reorder else ():
             before, after = moved[row], moved[row + 1]
@@ -232,43 +232,43 @@ class Harm:
         if not faults.duplicate:
             return moved
         duplicated = self._rng.random(len(moved)) < faults.duplicate
-        doubled: list[SentItem] = []
+        with_duplicates: list[SentItem] = []
         for item, is_duplicate in zip(moved, duplicated, strict=True):
-            doubled.append(item)
+            with_duplicates.append(item)
             if is_duplicate and item.data:
-                doubled.append(item._replace(due_ns=item.due_ns + SEPARATION_NS, cause=DUPLICATE))
-        return doubled
+                with_duplicates.append(item._replace(due_ns=item.due_ns + SEPARATION_NS, cause=DUPLICATE))
+        return with_duplicates
 
     def _add_noise(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         noise = []
-        for at_ns in self._noise.until(until_ns):
-            count = int(self._rng.integers(1, LONGEST_NOISE + 1))
+        for at_ns in self._noise.pop_until(until_ns):
+            count = int(self._rng.integers(1, MAX_NOISE + 1))
             before = items[_row(items, at_ns)].due_ns - SEPARATION_NS
             noise.append(SentItem(before, self._rng.integers(0, 256, count, dtype=np.uint8).tobytes(), -1, NOISE))
         return sorted([*items, *noise], key=lambda item: item.due_ns) if noise else items
 
-    def _stay_away(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
+    def _disconnect(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         away_ns = round(self.faults.unplug_s * 1e9)
-        back_ns = self._away[-1][1] if self._away else -1
-        signs = []
-        for at_ns in self._unplug.until(until_ns):
+        back_ns = self._unplugged[-1][1] if self._unplugged else -1
+        events = []
+        for at_ns in self._unplug.pop_until(until_ns):
             if at_ns >= back_ns:
                 back_ns = at_ns + away_ns
-                self._away = [*self._away[-1:], (at_ns, back_ns)]
-                signs += [SentItem(at_ns, b"", -1, UNPLUG), SentItem(back_ns, b"", -1, REPLUG)]
-        if not self._away:
+                self._unplugged = [*self._unplugged[-1:], (at_ns, back_ns)]
+                events += [SentItem(at_ns, b"", -1, UNPLUG), SentItem(back_ns, b"", -1, REPLUG)]
+        if not self._unplugged:
             return items
         remaining = [
             item._replace(data=b"", cause=UNPLUG, invisible=False)
-            if any(start <= item.due_ns < stop for start, stop in self._away)
+            if any(start <= item.due_ns < stop for start, stop in self._unplugged)
             else item
             for item in items
         ]
-        return sorted([*remaining, *signs], key=lambda item: item.due_ns)
+        return sorted([*remaining, *events], key=lambda item: item.due_ns)
 
-    def _hold_up(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
+    def _delay(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
         stall_ns = round(self.faults.stall_s * 1e9)
-        self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.until(until_ns)]
+        self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.pop_until(until_ns)]
         if not self._stalls:
             return items
         delayed = []
@@ -281,7 +281,7 @@ class Harm:
 
 
 def _row(items: Sequence[SentItem], at_ns: int) -> int:
-    """Return the row of the frame that is due at ``at_ns`` or next."""
+    """Return the row of the first frame that is due at or after ``at_ns``."""
     low, high = 0, len(items) - 1
     while low < high:
         middle = (low + high) // 2
@@ -290,23 +290,23 @@ def _row(items: Sequence[SentItem], at_ns: int) -> int:
 
 
 def no_steps(t_ns: Times) -> Times:
-    """Return by how much a clock that is never set has been set until ``t_ns`` (time,): 0."""
+    """Return zeros (time,): the total of steps of a clock that is never set."""
     return np.zeros_like(t_ns)
 
 
 class ClockSteps:
-    """Steps of one size at random moments; calling it states by how much the clock has been set until then."""
+    """Clock steps of one size at random times. Calling it returns the total of the steps so far."""
 
     def __init__(self, rate_hz: float, step_ms: float, seed: Sequence[int]) -> None:
-        self._happening = Happening(rate_hz, np.random.default_rng([*seed, 5]))
+        self._events = RandomEvents(rate_hz, np.random.default_rng([*seed, 5]))
         self._rng = np.random.default_rng([*seed, 6])
         self._step_ns = round(step_ms * 1e6)
         self.moments_ns: list[int] = []
         self._sums = np.zeros(1, dtype=np.int64)
 
     def __call__(self, t_ns: Times) -> Times:
-        """Return the sum of the steps before ``t_ns`` (time,), ns."""
-        for moment in self._happening.until(int(t_ns.max(initial=0))):
+        """Return the sum of the steps before ``t_ns`` (time,) in ns."""
+        for moment in self._events.pop_until(int(t_ns.max(initial=0))):
             self.moments_ns.append(moment)
             step_ns = self._step_ns if self._rng.random() < 0.5 else -self._step_ns
             self._sums = np.append(self._sums, self._sums[-1] + step_ns)

@@ -1,8 +1,8 @@
-"""A device on a CAN bus: python-can's virtual bus within one process, or an slcan adapter on a pseudo-terminal.
+"""Emulate a device on a CAN bus: python-can's virtual bus within one process, or an slcan adapter on a pseudo-terminal.
 
 A frame of a sensor is one or more CAN frames of 13 bytes: identifier (u32, bit 31: extended), length, 8 bytes. slcan is
-text: ``tIIILDD…`` for a frame with a short identifier, ``TIIIIIIIIL…`` with a long one, ended by CR; ``S``, ``O`` and ``C``
-set the bit rate, open and close. Source: CAN232 manual, Lawicel; python-can's driver of that name is the other side.
+a text protocol: ``tIIILDD…`` for a frame with a short identifier, ``TIIIIIIIIL…`` for a long one, ended by CR; ``S``,
+``O`` and ``C`` set the bit rate, open and close. Source: CAN232 manual, Lawicel. Hosts use python-can's slcan driver.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ EXTENDED = 1 << 31
 
 
 def split(piece: bytes) -> list[tuple[int, bytes]]:
-    """Return identifier and data of the CAN frames that a sensor's frame is made of; what is cut off at its end is none."""
+    """Return (identifier, data) of the CAN frames in a sensor's frame. An incomplete CAN frame at the end is dropped."""
     complete = len(piece) - len(piece) % FRAME.size
     return [(identifier, data[: min(count, 8)]) for identifier, count, data in FRAME.iter_unpack(piece[:complete])]
 
 
-def joined(identifier: int, data: bytes) -> bytes:
-    """Return the 13 bytes of a CAN frame."""
+def pack(identifier: int, data: bytes) -> bytes:
+    """Return a CAN frame as 13 bytes."""
     return FRAME.pack(identifier, len(data), data)
 
 
 class BusMember:
-    """All others on the virtual bus."""
+    """All hosts on the virtual bus."""
 
     fault = byte_faults.SOUND
 
@@ -42,7 +42,7 @@ class BusMember:
         self.pending_frames = 0
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Put the CAN frames of each piece on the bus."""
+        """Send the CAN frames of each piece."""
         import can
 
         for piece in pieces:
@@ -54,7 +54,7 @@ class BusMember:
 
 
 class VirtualCan:
-    """A virtual bus, which hosts in this process can join under the same name."""
+    """A virtual bus that hosts in this process can join under the same name."""
 
     def __init__(self, sensor: Sensor, channel: str) -> None:
         import can
@@ -62,11 +62,11 @@ class VirtualCan:
         self.sensor = sensor
         self.address = Address("can", f"virtual:{channel}")
         self._bus = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-        self._away = False
+        self._unplugged = False
         self.peers = [BusMember(self._bus, sensor)]
 
     def descriptors(self) -> list[int]:
-        """Return nothing: a virtual bus has no descriptor."""
+        """Return nothing, because a virtual bus has no descriptor."""
         return []
 
     def ready(self, descriptor: int) -> list[tuple[BusMember, bytes]]:
@@ -74,20 +74,20 @@ class VirtualCan:
         return []
 
     def look(self) -> list[tuple[BusMember, bytes]]:
-        """Return the CAN frames that others sent."""
+        """Return the CAN frames of hosts."""
         heard = []
         while (message := self._bus.recv(0)) is not None:
             identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-            heard.append((self.peers[0], joined(identifier, bytes(message.data))))
-        return [] if self._away else heard
+            heard.append((self.peers[0], pack(identifier, bytes(message.data))))
+        return [] if self._unplugged else heard
 
     def unplug(self) -> None:
-        """Hear and send nothing."""
-        self._away = True
+        """Stop receiving and sending."""
+        self._unplugged = True
 
     def replug(self) -> None:
-        """Begin anew."""
-        self._away = False
+        """Restart the device."""
+        self._unplugged = False
         self.peers[0].device = self.sensor.device()
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class VirtualCan:
 
 
 class Slcan(Pty):
-    """An slcan adapter with the device behind it."""
+    """An slcan adapter with a device on its bus."""
 
     def __init__(self, sensor: Sensor, link: Path) -> None:
         self._pending = b""
@@ -104,21 +104,21 @@ class Slcan(Pty):
         self.address = Address("can", f"slcan:{link}")
 
     def wrong_baud(self) -> bool:
-        """Any speed will do: it is a USB adapter."""
+        """Return False: the baud rate of a USB adapter does not matter."""
         return False
 
-    def on_the_line(self, piece: bytes) -> bytes:
-        """Return the lines of the CAN frames of a piece."""
+    def to_wire(self, piece: bytes) -> bytes:
+        """Return the slcan lines of the CAN frames in a piece."""
         return b"".join(line(identifier, data) for identifier, data in split(piece))
 
-    def understood(self, data: bytes) -> list[bytes]:
-        """Return the CAN frames that the host has the adapter send."""
+    def from_wire(self, data: bytes) -> list[bytes]:
+        """Return the CAN frames that the host sends through the adapter."""
         *lines, self._pending = (self._pending + data).split(b"\r")
         return [frame for line in lines if (frame := frame_of(line))]
 
 
 def line(identifier: int, data: bytes) -> bytes:
-    r"""Return the line of a CAN frame.
+    r"""Return the slcan line of a CAN frame.
 
     >>> line(0x440, b"\x40\xf0")
     b't440240F0\r'
@@ -128,7 +128,7 @@ def line(identifier: int, data: bytes) -> bytes:
 
 
 def frame_of(text: bytes) -> bytes:
-    """Return the 13 bytes of the CAN frame that a line has sent; nothing for any other command."""
+    """Return the CAN frame in an slcan line as 13 bytes, or b"" for another command."""
     digits = {b"t": 3, b"T": 8}.get(text[:1])
     if digits is None or len(text) < digits + 2:
         return b""
@@ -136,4 +136,4 @@ def frame_of(text: bytes) -> bytes:
         identifier, data = int(text[1 : digits + 1], 16), bytes.fromhex(text[digits + 2 :].decode())
     except ValueError:
         return b""
-    return joined(identifier | (EXTENDED if digits == 8 else 0), data[:8])
+    return pack(identifier | (EXTENDED if digits == 8 else 0), data[:8])

@@ -1,7 +1,7 @@
-"""The emulator: every stream of a rig, served without hardware, all driven by one physical simulation.
+"""Emulate all streams of a rig without hardware, driven by one physical simulation.
 
-One thread sends everything when it is due and hears the hosts; another plans ahead. So a rig of 1 kHz costs little, and
-what is sent does not depend on when the threads run: only when it is sent does.
+One thread sends frames when they are due and receives from hosts; another plans frames ahead. This keeps the load low at
+1 kHz, and the sent bytes do not depend on the timing of the threads.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from tacpipe.simulation.emulation.source import Sampled, SampleSource, Timing
 from tacpipe.simulation.emulation.transmission import FramePace, Transmission, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
-PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "mjpeg", "v4l2")  # links that keep frames apart
+PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "mjpeg", "v4l2")  # packet-based links
 
 
 def endpoint(stream: RigStream, folder: Path) -> Endpoint:
-    """Return the device's end of a stream's link, served from now on; ``folder`` is for pseudo-terminals and files.
+    """Start the device's end of a stream's link. ``folder`` is for pseudo-terminals and files.
 
-    Raises `DeviceError` for a link that cannot be emulated.
+    Raises `DeviceError` if the link cannot be emulated.
     """
     scheme = stream.address.scheme
     if scheme == "serial":
@@ -60,8 +60,8 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
     if scheme == "can":
         from tacpipe.simulation.emulation.can import Slcan, VirtualCan
 
-        if stream.address.place.startswith("virtual:"):
-            return VirtualCan(stream.sensor, stream.address.place.removeprefix("virtual:"))
+        if stream.address.target.startswith("virtual:"):
+            return VirtualCan(stream.sensor, stream.address.target.removeprefix("virtual:"))
         return Slcan(stream.sensor, _device(folder, stream.name))
     if scheme == "folder":
         from tacpipe.simulation.emulation.endpoint import Folder
@@ -76,14 +76,14 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
 
         return Hid(stream.sensor, stream.address, folder / "hid")
     raise DeviceError(
-        f"{stream.name}: {stream.address} cannot be emulated; clouds can be, by a folder: folder:{folder / 'files'}."
+        f"{stream.name}: {stream.address} cannot be emulated. Clouds can be emulated with folder:{folder / 'files'}."
     )
 
 
 def _udp(stream: RigStream) -> Endpoint:
     from tacpipe.simulation.emulation.network import HOST, Udp, free_port
 
-    host, _, _ = stream.address.place.partition("?")[0].rpartition(":")
+    host, _, _ = stream.address.target.partition("?")[0].rpartition(":")
     if stream.sensor.listens or not host:
         return Udp(stream.sensor, (HOST if host else "", free_port()))
     return Udp(stream.sensor)
@@ -95,18 +95,18 @@ def _device(folder: Path, name: str) -> Path:
     return devices / name
 
 
-LOOK_NS = 20_000_000  # period of checks for events without a descriptor
-FILL_S = 0.1  # period of checks whether to plan more frames
+POLL_NS = 20_000_000  # period of polling for events without a descriptor
+FILL_S = 0.1  # period of planning frames ahead
 MAX_WAIT_S = 0.02  # longest wait
-CAMERA_HZ = 25.0  # rate of cameras whose rig file states none
-UNPACED_HZ = 2.0  # rate of sensors that state none, such as clouds
+CAMERA_HZ = 25.0  # default rate of cameras
+DEFAULT_HZ = 2.0  # rate of sensors without a declared rate, such as clouds
 
 
 class Emulator:
-    """A rig that is served while the ``with`` statement lasts.
+    """An emulated rig, which runs during a ``with`` statement.
 
-    ``rig`` is the same rig with the addresses that were made, ``ledger`` states for each stream what was sent and what was
-    harmed, ``folder`` holds pseudo-terminals and files. With ``patient`` no frame is lost because a host fetches it late.
+    ``rig`` is the rig with the addresses of the emulated devices, ``ledger`` has the sent and faulty frames of each stream,
+    ``folder`` contains pseudo-terminals and files. With ``patient``, no frame is lost because a host reads too late.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Emulator:
 
     @property
     def rig(self) -> Rig:
-        """The rig as hosts find it; its recordings are marked as simulated."""
+        """The rig with the addresses for hosts. Recordings are labelled as simulated."""
         streams = {
             name: replace(stream, address=self._transmissions[name].endpoint.address)
             for name, stream in self.rig_file.streams.items()
@@ -141,7 +141,7 @@ class Emulator:
         return replace(self.rig_file, streams=streams, labels={**self.rig_file.labels, "simulated": True})
 
     def __enter__(self) -> Self:
-        paces = {name: pace(self.rig_file, name) for name in self.rig_file.streams}
+        paces = {name: frame_pace(self.rig_file, name) for name in self.rig_file.streams}
         with contextlib.ExitStack() as resources:
             if self._temporary:
                 self.folder = Path(resources.enter_context(tempfile.TemporaryDirectory(prefix="tacpipe-")))
@@ -155,7 +155,8 @@ class Emulator:
         for name, stream in self.rig_file.streams.items():
             self._transmissions[name] = self._transmission(stream, paces[name], endpoints[name])
         self._threads = [
-            threading.Thread(target=self._until_stopped, args=(work,), daemon=True) for work in (self._pace, self._fill)
+            threading.Thread(target=self._run_thread, args=(work,), daemon=True)
+            for work in (self._send_due, self._fill)
         ]
         for thread in self._threads:
             thread.start()
@@ -171,52 +172,52 @@ class Emulator:
         if self._errors and error is None:
             raise self._errors[0]
 
-    def _until_stopped(self, work: Callable[[], None]) -> None:
+    def _run_thread(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except BaseException as error:  # an error of the thread, which the ``with`` statement raises
+        except BaseException as error:  # the ``with`` statement raises errors of the thread
             self._errors.append(error)
             self._stopped.set()
 
     def unplug(self, name: str) -> None:
-        """Take the device of a stream away."""
+        """Unplug the device of a stream."""
         self._commands.append((name, False))
 
     def replug(self, name: str) -> None:
-        """Bring it back, under the same address."""
+        """Plug the device of a stream in again, at the same address."""
         self._commands.append((name, True))
 
-    def _transmission(self, stream: RigStream, its_pace: FramePace, endpoint: Endpoint) -> Transmission:
+    def _transmission(self, stream: RigStream, stream_pace: FramePace, endpoint: Endpoint) -> Transmission:
         packets = stream.address.scheme in PACKETS
-        rate_hz = stream.sensor.rate_hz or (CAMERA_HZ if isinstance(stream.sensor, Camera) else UNPACED_HZ)
+        rate_hz = stream.sensor.rate_hz or (CAMERA_HZ if isinstance(stream.sensor, Camera) else DEFAULT_HZ)
 
-        def planned(rate: float, start_ns: int) -> TransmissionPlan:
-            source = self.source(stream.name, its_pace, rate, start_ns)
+        def make_plan(rate: float, start_ns: int) -> TransmissionPlan:
+            source = self.source(stream.name, stream_pace, rate, start_ns)
             seed = [*self._seed(stream.name), start_ns]
-            return TransmissionPlan(source, its_pace, self.faults, seed, packets=packets)
+            return TransmissionPlan(source, stream_pace, self.faults, seed, packets=packets)
 
         ledger, patient = self.ledger[stream.name], self.patient
-        return Transmission(endpoint, stream.sensor, ledger, planned, rate_hz, self.epoch_ns, patient=patient)
+        return Transmission(endpoint, stream.sensor, ledger, make_plan, rate_hz, self.epoch_ns, patient=patient)
 
-    def source(self, name: str, its_pace: FramePace, rate_hz: float, start_ns: int = 0) -> Sampled:
-        """Return the source of a stream."""
+    def source(self, name: str, stream_pace: FramePace, rate_hz: float, start_ns: int = 0) -> Sampled:
+        """Return the source of samples of a stream."""
         seed, sensor = self._seed(name), self.rig_file.streams[name].sensor
         steps = (
             ClockSteps(self.faults.clock_step, self.faults.clock_step_ms, seed) if self.faults.clock_step else no_steps
         )
-        timing = Timing(rate_hz, start_ns, clock(its_pace, seed), steps, self.faults.wrap_s)
-        if its_pace.slides:
+        timing = Timing(rate_hz, start_ns, clock(stream_pace, seed), steps, self.faults.wrap_s)
+        if stream_pace.slides:
             from tacpipe.simulation.emulation.source import SlideSource
 
             return SlideSource(sensor, timing, self.seed)
         last = name[-1] if name[-1] in "12" else "1"
-        finger = (its_pace.finger or int(last)) - 1
+        finger = (stream_pace.finger or int(last)) - 1
         if isinstance(sensor, Camera):
             from tacpipe.simulation.emulation.http_camera import CameraSource, complete_camera
 
-            camera = complete_camera(sensor, its_pace.video)
-            return CameraSource(camera, self.world, timing, seed, finger, its_pace.video)
-        if stream_of_clouds(sensor):
+            camera = complete_camera(sensor, stream_pace.video)
+            return CameraSource(camera, self.world, timing, seed, finger, stream_pace.video)
+        if has_points(sensor):
             from tacpipe.simulation.emulation.source import CloudSource
 
             return CloudSource(sensor, timing, seed)
@@ -230,10 +231,10 @@ class Emulator:
             for transmission in self._transmissions.values():
                 transmission.fill(time.monotonic_ns() - self.epoch_ns)
 
-    def _pace(self) -> None:
+    def _send_due(self) -> None:
         transmissions = list(self._transmissions.values())
         owners: dict[int, Transmission] = {}  # transmissions by descriptor
-        look_ns, changed = 0, True
+        poll_ns, changed = 0, True
         while not self._stopped.is_set():
             if changed:
                 owners = {
@@ -247,43 +248,43 @@ class Emulator:
             ready, _, _ = select.select(owners, [], [], wait_s)
             now_ns = time.monotonic_ns()
             for number in ready:
-                self._hear(owners[number], owners[number].endpoint.ready(number), now_ns)
+                self._receive(owners[number], owners[number].endpoint.ready(number), now_ns)
             changed = bool(ready)
             for transmission in transmissions:
                 if transmission.next_ns <= now_ns:
                     changed |= transmission.run(now_ns)
-            if now_ns >= look_ns:
-                look_ns, changed = now_ns + LOOK_NS, True
-                self._obey(now_ns)
+            if now_ns >= poll_ns:
+                poll_ns, changed = now_ns + POLL_NS, True
+                self._run_commands(now_ns)
                 for transmission in transmissions:
-                    self._hear(transmission, transmission.endpoint.look(), now_ns)
+                    self._receive(transmission, transmission.endpoint.look(), now_ns)
 
-    def _hear(self, transmission: Transmission, heard: Iterable[tuple[Peer, bytes]], now_ns: int) -> None:
+    def _receive(self, transmission: Transmission, heard: Iterable[tuple[Peer, bytes]], now_ns: int) -> None:
         for peer, data in heard:
-            transmission.heard(peer, data, now_ns)
+            transmission.receive(peer, data, now_ns)
 
-    def _obey(self, now_ns: int) -> None:
+    def _run_commands(self, now_ns: int) -> None:
         while self._commands:
-            name, back = self._commands.pop(0)
-            self._transmissions[name].plug(back, now_ns)
+            name, is_replugged = self._commands.pop(0)
+            self._transmissions[name].plug(is_replugged, now_ns)
 
 
-def stream_of_clouds(sensor: Sensor) -> bool:
+def has_points(sensor: Sensor) -> bool:
     """Return whether a sensor's samples are points of clouds."""
     return [field.name for field in sensor.fields()][:3] == ["x_m", "y_m", "z_m"]
 
 
-def pace(rig: Rig, name: str) -> FramePace:
-    """Return the pace of a stream: what the rig file states under ``emulate``, of the stream over that of the rig."""
+def frame_pace(rig: Rig, name: str) -> FramePace:
+    """Return the pace of a stream from ``emulate`` in the rig file. Keys of the stream override those of the rig."""
     source = f"stream {name}, emulate"
-    stream_pace: FramePace = params.filled(FramePace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
-    return stream_pace
+    pace: FramePace = params.filled(FramePace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
+    return pace
 
 
-def clock(its_pace: FramePace, seed: list[int]) -> clocks.DeviceClock:
-    """Return a device's clock: as its pace states, or as far off as those of the simulated rig may be."""
-    rng, usual = np.random.default_rng([*seed, 8]), pick_and_move.PickRig()
+def clock(stream_pace: FramePace, seed: list[int]) -> clocks.DeviceClock:
+    """Return a device's clock with the offset and skew of its pace, or random ones as in the simulated rig."""
+    rng, default_rig = np.random.default_rng([*seed, 8]), pick_and_move.PickRig()
     offset, skew = rng.uniform(-1, 1, 2)
-    offset_ms = its_pace.offset_ms if its_pace.offset_ms is not None else offset * usual.clock_offset_ms
-    skew_ppm = its_pace.skew_ppm if its_pace.skew_ppm is not None else skew * usual.clock_skew_ppm
+    offset_ms = stream_pace.offset_ms if stream_pace.offset_ms is not None else offset * default_rig.clock_offset_ms
+    skew_ppm = stream_pace.skew_ppm if stream_pace.skew_ppm is not None else skew * default_rig.clock_skew_ppm
     return clocks.DeviceClock(round(offset_ms * 1e6), float(skew_ppm * 1e-6))

@@ -1,4 +1,4 @@
-"""The device's end of a link: where hosts come and go, what they write, and what is sent to them."""
+"""Define the device's end of an emulated link: its hosts, the bytes that they write, and the frames sent to them."""
 
 from __future__ import annotations
 
@@ -12,51 +12,51 @@ from tacpipe.simulation.emulation import byte_faults
 
 
 class Peer(Protocol):
-    """A host at the other end, and the device as it is to this host."""
+    """A host, and the state of the device for this host."""
 
     device: Device
-    pending_frames: int  # frames that the host asked for and did not get yet
+    pending_frames: int  # number of requested frames that were not sent yet
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send frames or replies; return how many bytes of each went out."""
+        """Send frames or replies, and return the number of sent bytes of each."""
 
     @property
     def fault(self) -> str:
-        """The cause, of `byte_faults.CAUSES`, that harms bytes to this host; empty for none."""
+        """The cause in `byte_faults.CAUSES` that damages bytes to this host; empty if there is none."""
 
 
 class Endpoint(Protocol):
-    """One stream's end of its link. All is called by the one thread that paces."""
+    """The device's end of a stream's link. Only the sending thread calls its methods."""
 
     address: Address  # address for the host's rig file
 
     @property
     def peers(self) -> Sequence[Peer]:
-        """The hosts that there are."""
+        """The connected hosts."""
 
     def descriptors(self) -> Sequence[int]:
-        """Return what the pacing thread waits on: something came there, or a host did."""
+        """Return the file descriptors that become readable when a host connects or writes."""
 
     def ready(self, descriptor: int) -> Sequence[tuple[Peer, bytes]]:
-        """Return what hosts wrote, after ``descriptor`` became readable; a new host has written nothing."""
+        """Return (host, bytes) after ``descriptor`` became readable. The bytes of a new host are empty."""
 
     def look(self) -> Sequence[tuple[Peer, bytes]]:
-        """Manage what no descriptor states, a few times a tenth of a second; as `ready`."""
+        """Poll for events without a descriptor, every 20 ms. Returns like `ready`."""
 
     def unplug(self) -> None:
-        """Take the device away; hosts lose their link."""
+        """Unplug the device. Hosts lose their link."""
 
     def replug(self) -> None:
-        """Bring it back, under the same address."""
+        """Plug the device in again, at the same address."""
 
     def close(self) -> None:
-        """End."""
+        """Release the link."""
 
 
-def stretched(sizes: Sequence[int], sent: int) -> list[int]:
-    """Return how many bytes of pieces of these sizes are among the first ``sent`` of all.
+def sent_sizes(sizes: Sequence[int], sent: int) -> list[int]:
+    """Return the number of bytes of each piece among the first ``sent`` bytes. ``sizes`` are the sizes of the pieces.
 
-    >>> stretched([4, 4, 4], 6)
+    >>> sent_sizes([4, 4, 4], 6)
     [4, 2, 0]
     """
     parts = []
@@ -68,7 +68,7 @@ def stretched(sizes: Sequence[int], sent: int) -> list[int]:
 
 
 class Writer:
-    """Whoever watches the folder."""
+    """The host of a folder."""
 
     fault = byte_faults.SOUND
 
@@ -79,7 +79,7 @@ class Writer:
         self._count = 0
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Write a file each; it has another name until it is whole."""
+        """Write each piece to a file, under a temporary name until it is complete."""
         for piece in pieces:
             self._count += 1
             path = self.folder / f"frame{self._count:06d}{self.suffix}"
@@ -90,7 +90,7 @@ class Writer:
 
 
 class Folder:
-    """A folder that fills with files."""
+    """A folder to which files are written."""
 
     def __init__(self, sensor: Sensor, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ class Folder:
         self.peers = [Writer(folder, sensor)]
 
     def descriptors(self) -> list[int]:
-        """Return nothing: nobody writes to the device."""
+        """Return nothing, because hosts do not write to the device."""
         return []
 
     def ready(self, descriptor: int) -> list[tuple[Writer, bytes]]:
@@ -111,10 +111,10 @@ class Folder:
         return []
 
     def unplug(self) -> None:
-        """Do nothing: no files come, which the faults see to."""
+        """Do nothing: the faults suppress files."""
 
     def replug(self) -> None:
         """Do nothing."""
 
     def close(self) -> None:
-        """Do nothing: what was written stays."""
+        """Do nothing: files are retained."""

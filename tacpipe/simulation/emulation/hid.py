@@ -1,8 +1,8 @@
-"""A USB HID device that umockdev plays to hosts which are started with it: the kernel needs no device and no driver.
+"""Emulate USB HID devices with umockdev, without a kernel driver, for hosts that are started under it.
 
-Hosts run as ``UMOCKDEV_DIR=… umockdev-wrapper PROGRAM``; the folder stands in FOLDER/hid/root. All devices of an emulator
-are in one folder. A report is written at once, but two that a slow host left lying come as one, and an unplugged device
-falls silent without its host being informed: the mock has neither the kernel's queue nor its hang-up.
+Hosts run as ``UMOCKDEV_DIR=… umockdev-wrapper PROGRAM``; FOLDER/hid/root contains that directory. All devices of an emulator
+share one directory. umockdev has no queue and no hang-up: two reports that a slow host did not read are merged, and an
+unplugged device is silent without notifying its host.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults, hid_server
 
 SYSTEM_PYTHON = "/usr/bin/python3"
-RAW = "06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0"  # 64 bytes in and out, as Teensy's RawHID
-SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in report 3, as a SpaceMouse's
+RAW = (
+    "06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0"  # 64 bytes in and out, like Teensy's RawHID
+)
+SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in report 3, like a SpaceMouse
     "0501 0908 a101 a100 8501 16a2fe 265e01 7510 9506 0930 0931 0932 0933 0934 0935 8102 c0 "
     "a100 8502 16a2fe 265e01 7510 9503 0933 0934 0935 8102 c0 a102 8503 0509 1901 2920 1500 2501 7501 9520 8102 c0 c0"
 )
@@ -29,13 +31,13 @@ _servers: dict[Path, Server] = {}
 
 
 class Server:
-    """The one umockdev of an emulator's folder, with its devices."""
+    """The umockdev process of an emulator's folder, with its devices."""
 
     def __init__(self, folder: Path) -> None:
         if shutil.which("umockdev-wrapper") is None or not Path(SYSTEM_PYTHON).exists():
             raise DeviceError(
                 "HID devices are emulated by umockdev, which is not installed. Install umockdev, gir1.2-umockdev-1.0 and "
-                "python3-gi, or leave the hid streams out."
+                "python3-gi, or remove the hid streams."
             )
         self.process = subprocess.Popen(
             ["umockdev-wrapper", SYSTEM_PYTHON, hid_server.__file__],
@@ -56,7 +58,7 @@ class Server:
         self._pending = b""
 
     def line(self) -> bytes:
-        """Return the next line that the server states, waiting for it."""
+        """Wait for the next line of the server and return it."""
         assert self.process.stdout is not None
         line = b""
         while not line.endswith(b"\n"):
@@ -67,13 +69,13 @@ class Server:
         return line.strip()
 
     def send(self, command: str) -> None:
-        """Give the server a command."""
+        """Send a command to the server."""
         assert self.process.stdin is not None
         self.process.stdin.write(command.encode() + b"\n")
         self.process.stdin.flush()
 
-    def heard(self) -> None:
-        """Hand each device what hosts wrote to it."""
+    def receive(self) -> None:
+        """Pass reports of hosts to their devices."""
         assert self.process.stdout is not None
         data = os.read(self.process.stdout.fileno(), 65_536)
         *lines, self._pending = (self._pending + data).split(b"\n")
@@ -82,7 +84,7 @@ class Server:
             self.devices[int(number)].reports.append(bytes.fromhex(report))
 
     def close(self) -> None:
-        """End the server."""
+        """Terminate the server."""
         for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
             if stream is not None:
                 stream.close()
@@ -91,7 +93,7 @@ class Server:
 
 
 class Host:
-    """Whoever has the device open; the mock does not state."""
+    """The host of a device. umockdev does not report whether there is one."""
 
     fault = byte_faults.SOUND
 
@@ -117,39 +119,39 @@ class Hid:
         self.number = len(self.server.devices)
         self.server.devices.append(self)
         self.reports: list[bytes] = []
-        usb_id = address.place.partition("?")[0] if ":" in address.place else (*sensor.usb_ids, "16c0:0486")[0]
+        usb_id = address.target.partition("?")[0] if ":" in address.target else (*sensor.usb_ids, "16c0:0486")[0]
         vendor, _, product = usb_id.lower().partition(":")
         descriptor = bytes.fromhex(DESCRIPTORS.get(usb_id.lower(), RAW)).hex()
         self.server.send(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
         self.server.line()
-        self._away = False
+        self._unplugged = False
         self.peers = [Host(self)]
 
     def descriptors(self) -> list[int]:
-        """Return where the server states what hosts wrote, of the first device alone."""
+        """Return the server's output for the first device, and nothing for the others."""
         assert self.server.process.stdout is not None
         return [self.server.process.stdout.fileno()] if self.number == 0 else []
 
     def ready(self, descriptor: int) -> list[tuple[Host, bytes]]:
-        """Take what hosts wrote, for all devices."""
-        self.server.heard()
+        """Receive the reports of hosts for all devices."""
+        self.server.receive()
         return self.look()
 
     def look(self) -> list[tuple[Host, bytes]]:
-        """Return what hosts wrote to this one: reports, behind a number that is 0 where there is none."""
+        """Return the reports of hosts to this device, without the report number 0."""
         reports, self.reports = self.reports, []
-        return [(self.peers[0], report.removeprefix(b"\0")) for report in reports if not self._away]
+        return [(self.peers[0], report.removeprefix(b"\0")) for report in reports if not self._unplugged]
 
     def unplug(self) -> None:
-        """Fall silent."""
-        self._away, self.peers = True, []
+        """Stop receiving and sending."""
+        self._unplugged, self.peers = True, []
 
     def replug(self) -> None:
-        """Begin anew."""
-        self._away, self.peers = False, [Host(self)]
+        """Restart the device."""
+        self._unplugged, self.peers = False, [Host(self)]
 
     def close(self) -> None:
-        """End, and the server with the last device."""
+        """Close the server of all devices."""
         if _servers.get(self._folder) is self.server:
             del _servers[self._folder]
             self.server.close()

@@ -1,8 +1,8 @@
-"""USB HID devices as umockdev plays them: a program for the system's Python, which has GObject introspection.
+"""Serve emulated USB HID devices with umockdev. The program runs under the system's Python, for GObject introspection.
 
-It is run by itself and imports nothing of tacpipe. Standard input has a line a command: ``add NUMBER VENDOR PRODUCT
-DESCRIPTOR NAME`` plugs a device in, ``send NUMBER REPORT`` has it send a report, all numbers but the first in hexadecimal.
-Standard output has the folder that hosts need in UMOCKDEV_DIR, and then a line ``NUMBER REPORT`` for what a host writes.
+It imports nothing from tacpipe. Standard input has one command per line: ``add NUMBER VENDOR PRODUCT DESCRIPTOR NAME``
+plugs a device in, ``send NUMBER REPORT`` sends a report; all numbers except NUMBER are hexadecimal. The first line of
+standard output is the directory for UMOCKDEV_DIR. Each report of a host adds a line ``NUMBER REPORT``.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any
 
 GET_SIZE, GET_DESCRIPTOR = 0x80044801, 0x90044802  # HIDIOCGRDESCSIZE and HIDIOCGRDESC of <linux/hidraw.h>
 MAX_REPORT_BYTES = 4096  # bytes of a descriptor or a report
-LOOK_S = 0.02  # period of checks of a device that no host has open
+POLL_S = 0.02  # period of polling a device that no host has open
 
 
-def described(number: int, vendor: str, product: str, descriptor: str, name: str) -> str:
-    """Return a device as umockdev reads it: USB device, interface, HID device and its hidraw node."""
+def describe_device(number: int, vendor: str, product: str, descriptor: str, name: str) -> str:
+    """Return umockdev's description of a device: USB device, interface, HID device and hidraw node."""
     usb = f"/devices/pci0000:00/0000:00:14.0/usb1/1-{number + 1}"
-    place = f"0003:{vendor.upper()}:{product.upper()}.{number + 1:04d}"
-    hid = f"{usb}/1-{number + 1}:1.0/{place}"
+    hid_name = f"0003:{vendor.upper()}:{product.upper()}.{number + 1:04d}"
+    hid = f"{usb}/1-{number + 1}:1.0/{hid_name}"
     identity = f"0003:0000{vendor.upper()}:0000{product.upper()}"
     usb_lines = ["E: SUBSYSTEM=usb", "E: DEVTYPE=usb_device", rf"A: idVendor={vendor}\n", rf"A: idProduct={product}\n"]
     usb_lines += [r"A: manufacturer=tacpipe\n", rf"A: product={name}\n", rf"A: serial=emulated{number}\n"]
@@ -35,12 +35,12 @@ def described(number: int, vendor: str, product: str, descriptor: str, name: str
         [f"P: {hid}", *hid_lines, f"H: report_descriptor={descriptor}"],
         [f"P: {hid}/hidraw/hidraw{number}", f"N: hidraw{number}", "E: SUBSYSTEM=hidraw"],
     ]
-    parts[3] += [f"E: DEVNAME=/dev/hidraw{number}", f"L: device=../../../{place}"]
+    parts[3] += [f"E: DEVNAME=/dev/hidraw{number}", f"L: device=../../../{hid_name}"]
     return "".join("\n".join(part) + "\n\n" for part in parts)
 
 
-def answering(descriptor: bytes) -> Any:
-    """Return what answers the kernel's questions for a report descriptor."""
+def ioctl_handler(descriptor: bytes) -> Any:
+    """Return a handler of the ioctl requests for a report descriptor."""
 
     def answer(_: Any, client: Any) -> bool:
         request = client.get_request()
@@ -56,20 +56,23 @@ def answering(descriptor: bytes) -> Any:
     return answer
 
 
-def hear(number: int, board: int) -> None:
-    """Report what hosts write to a device."""
+def print_reports(number: int, board: int) -> None:
+    """Print the reports that hosts write to a device."""
     while select.select([board], [], []):
         try:
             data = os.read(board, MAX_REPORT_BYTES)
-        except OSError:  # taken by another, or no host has it open
-            time.sleep(LOOK_S)
+        except OSError:  # another thread read it, or no host has the device open
+            time.sleep(POLL_S)
             continue
         if data:
             print(number, data.hex(), flush=True)
 
 
 def append_report(board: int, buffered: bytes, report: bytes) -> bytes:
-    """Send a report behind the buffered of the one before, or drop it as the kernel does; return what is left to be sent."""
+    """Send a report after the remaining bytes of the previous one, and return the unsent bytes.
+
+    If the previous one cannot be sent, the report is dropped, as in the kernel.
+    """
     data = buffered or report
     try:
         data = data[os.write(board, data) :]
@@ -81,28 +84,28 @@ def append_report(board: int, buffered: bytes, report: bytes) -> bytes:
 
 
 def serve(mock: Any, testbed: Any, loop: Any) -> None:
-    """Carry out the commands of standard input."""
+    """Run the commands from standard input."""
     boards: dict[str, int] = {}
-    rests: dict[str, bytes] = {}
+    unsent: dict[str, bytes] = {}
     handlers = []
     for line in sys.stdin:
         command, number, *words = line.strip().split(maxsplit=5)
         if command == "add":
-            testbed.add_from_string(described(int(number), *words))
+            testbed.add_from_string(describe_device(int(number), *words))
             handlers.append(mock.IoctlBase.new())
-            handlers[-1].connect("handle-ioctl", answering(bytes.fromhex(words[2])))
+            handlers[-1].connect("handle-ioctl", ioctl_handler(bytes.fromhex(words[2])))
             testbed.attach_ioctl(f"/dev/hidraw{number}", handlers[-1])
             boards[number] = testbed.get_dev_fd(f"/dev/hidraw{number}")
             os.set_blocking(boards[number], False)
-            threading.Thread(target=hear, args=(int(number), boards[number]), daemon=True).start()
+            threading.Thread(target=print_reports, args=(int(number), boards[number]), daemon=True).start()
             print(number, flush=True)
         elif number in boards:
-            rests[number] = append_report(boards[number], rests.get(number, b""), bytes.fromhex(words[0]))
+            unsent[number] = append_report(boards[number], unsent.get(number, b""), bytes.fromhex(words[0]))
     loop.quit()
 
 
 def main() -> None:
-    """Play devices until standard input ends."""
+    """Serve devices until standard input ends."""
     import gi
 
     gi.require_version("UMockdev", "1.0")

@@ -19,7 +19,7 @@ from tacpipe.sensors.camera import Camera, read_shape, unpack_frame
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, gel
 from tacpipe.simulation.emulation.network import HOST, Connection, Tcp
-from tacpipe.simulation.emulation.source import BLOCK_S, KEPT, Timing
+from tacpipe.simulation.emulation.source import BLOCK_S, CACHED, Timing
 from tacpipe.simulation.emulation.world import Cycle, World
 from tacpipe.video import files
 from tacpipe.video.decoding import jpeg_images
@@ -65,7 +65,7 @@ class CameraSource:
         self._format = jpeg_format(sensor.width_px, sensor.height_px, None, sensor.pixel_format)
         self._images = list(_video_images(video)) if video else []
         self._camera = gel.GelCamera(np.random.default_rng([*seed, 1]))
-        self._samples = functools.lru_cache(KEPT)(self._generate)
+        self._samples = functools.lru_cache(CACHED)(self._generate)
 
     def block(self, number: int) -> Samples:
         """Return the images of block ``number``, `rows` of them."""
@@ -77,7 +77,7 @@ class CameraSource:
 
     def _generate(self, block: int) -> Samples:
         numbers = self.numbers(block)
-        taken_ns = self.timing.taken_ns(numbers)
+        taken_ns = self.timing.sample_ns(numbers)
         packets = np.empty((len(numbers), 1), object)
         if self._images:
             packets[:, 0] = [self._images[number % len(self._images)] for number in numbers.tolist()]

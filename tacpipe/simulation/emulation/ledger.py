@@ -1,4 +1,4 @@
-"""Record the frames that an emulated stream sent and those that were harmed, to compare with a recording."""
+"""Log the frames that an emulated stream sent, with their faults, to compare them with a recording."""
 
 from __future__ import annotations
 
@@ -15,41 +15,45 @@ from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import CAUSES, SentItem, one_by_one
+from tacpipe.simulation.emulation.byte_faults import CAUSES, SentItem, split_frames
 from tacpipe.simulation.emulation.source import Sampled
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def decoded(sensor: Sensor, frames: Frames) -> Samples:
-    """Return the samples of what `Sensor.encode` gave; ``rows`` reports on which frame each is."""
-    parts = list(_alike(frames)) if isinstance(frames, list) and isinstance(sensor.framer(), ByteFramer) else [frames]
+def decode_frames(sensor: Sensor, frames: Frames) -> Samples:
+    """Return the samples of encoded frames. ``rows`` has the index of the frame of each sample."""
+    parts = (
+        list(_group_by_size(frames))
+        if isinstance(frames, list) and isinstance(sensor.framer(), ByteFramer)
+        else [frames]
+    )
     decoded_parts = []
     for part in parts:
         samples = sensor.decode(part)
         rows = np.arange(len(samples), dtype=np.int64) if samples.rows is None else samples.rows
         decoded_parts.append(replace(samples, rows=rows, t_device_ns=samples.t_device_ns))
-    return joined(decoded_parts, [len(part) for part in parts])
+    return concatenate(decoded_parts, [len(part) for part in parts])
 
 
-def joined(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Samples:
-    """Return samples one behind the other, which are of so many frames each; by default of as many as they state."""
+def concatenate(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Samples:
+    """Concatenate samples. ``frames`` are the numbers of frames of the parts, by default those in their ``rows``."""
     counts = frames or [int(part.rows.max(initial=-1)) + 1 for part in parts if part.rows is not None]
     values = tuple(np.concatenate(blocks) for blocks in zip(*(part.values for part in parts), strict=True))
     starts = np.cumsum([0, *counts])
     rows = [part.rows + start for part, start in zip(parts, starts, strict=False) if part.rows is not None]
-    seq, t_device_ns, device_seq = (_joined_column(parts, name) for name in ("seq", "t_device_ns", "device_seq"))
+    seq, t_device_ns, device_seq = (_concatenate_column(parts, name) for name in ("seq", "t_device_ns", "device_seq"))
     return Samples(values, seq, t_device_ns, device_seq, np.concatenate(rows) if rows else None)
 
 
-def _joined_column(parts: Sequence[Samples], name: str) -> Int64s | None:
+def _concatenate_column(parts: Sequence[Samples], name: str) -> Int64s | None:
     columns = [column for part in parts if (column := getattr(part, name)) is not None]
     return np.concatenate(columns) if columns else None
 
 
-def _alike(frames: Sequence[bytes]) -> Iterator[Any]:
-    """Yield neighbours of one size as arrays (frame, byte)."""
+def _group_by_size(frames: Sequence[bytes]) -> Iterator[Any]:
+    """Yield runs of frames of one size as arrays (frame, byte)."""
     start = 0
     for stop in range(1, len(frames) + 1):
         if stop == len(frames) or len(frames[stop]) != len(frames[start]):
@@ -64,33 +68,33 @@ CODES = {cause: code for code, cause in enumerate(CAUSES)}
 
 @dataclass(frozen=True)
 class LedgerEntry:
-    """A frame that was sent, or should have been sent."""
+    """A frame that was or should have been sent."""
 
     due_ns: int  # time on this computer's monotonic clock
-    sent_ns: int  # likewise; 0: it was not sent
-    number: int  # number of the sample in its source, -1 for no frame
-    size: int  # bytes that went out
+    sent_ns: int  # the same for the actual time; 0: it was not sent
+    number: int  # number of the sample in its source; -1 if it is not a frame
+    size: int  # sent bytes
     cause: str
-    invisible: bool  # harmed, and still takes the protocol's own test for a frame
-    source: int  # number of the source: a device that is given another rate begins a new one
+    invisible: bool  # has a fault that the protocol's own checks do not detect
+    source: int  # number of the source; a change of the rate starts a new source
 
 
 class Ledger:
-    """The entries of one stream in the order of their sending, and what else happened to it."""
+    """The sent items and the events of one stream, in order."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.sources: list[Sampled] = []
-        self.events: list[tuple[int, str, str]] = []  # monotonic ns, what, and more about it
-        self.harmed: dict[int, bytes] = {}  # row of the entry to the bytes that went out instead of the frame
+        self.events: list[tuple[int, str, str]] = []  # time on the monotonic clock in ns, event, detail
+        self.harmed: dict[int, bytes] = {}  # bytes sent instead of the frame, by row of the entry
         self._due_ns, self._sent_ns, self._number = array("q"), array("q"), array("q")
         self._size, self._cause, self._invisible, self._source = array("q"), array("b"), array("b"), array("h")
 
     def __len__(self) -> int:
-        return len(self._source)  # the column that is written last: a ledger may be read while it grows
+        return len(self._source)  # the column that is written last, because a ledger may be read while it grows
 
     def add(self, item: SentItem, due_ns: int, sent_ns: int, size: int, cause: str) -> None:
-        """Enter an item with what became of it: ``size`` bytes went out at ``sent_ns``."""
+        """Add an item of which ``size`` bytes were sent at ``sent_ns``."""
         if cause not in UNHARMED and size:
             self.harmed[len(self)] = item.data[:size]
         self._due_ns.append(due_ns)
@@ -101,13 +105,13 @@ class Ledger:
         self._invisible.append(item.invisible)
         self._source.append(len(self.sources) - 1)
 
-    def enter(self, t_ns: int, event: str, detail: str = "") -> None:
-        """Enter something that happened: opened, closed, unplug, replug, heard, rate, clock."""
+    def add_event(self, t_ns: int, event: str, detail: str = "") -> None:
+        """Add an event: opened, closed, unplug, replug, heard, rate, clock."""
         self.events.append((t_ns, event, detail))
 
     @property
     def entries(self) -> list[LedgerEntry]:
-        """All entries, one by one."""
+        """All entries."""
         return [self.entry(row) for row in range(len(self))]
 
     def entry(self, row: int) -> LedgerEntry:
@@ -124,41 +128,41 @@ class Ledger:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many entries there are of each cause; of the sound ones under "sent"."""
+        """The number of entries by cause. Entries without a fault are counted as "sent"."""
         codes = self.column("cause")
         counts = {cause or "sent": int((codes == code).sum()) for code, cause in enumerate(CAUSES)}
         return {cause: count for cause, count in counts.items() if count}
 
     @property
-    def whole(self) -> Int64s:
-        """The rows of entries that went out as frames should (entry,)."""
+    def intact_rows(self) -> Int64s:
+        """The rows of entries that were sent unchanged (entry,)."""
         codes = np.array([CODES[cause] for cause in UNHARMED])
-        count = len(self)  # common length of all columns, which may grow meanwhile
+        count = len(self)  # common length of all columns, which may grow at the same time
         size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
         rows: Int64s = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
         return rows
 
     def samples(self, rows: Sequence[int] | Int64s | None = None) -> Samples:
-        """Return what a perfect link would give of entries, made once more from the source; by default of all `whole` ones.
+        """Return the samples that a perfect link returns for entries, by default for all `intact_rows`.
 
-        Values are those that were encoded, as far as the protocol can hold them; ``rows`` reports on which entry each is.
+        They are generated again from the source, encoded and decoded. ``rows`` has the index of the entry of each sample.
         """
-        rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
+        rows = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
         sensor = self.sources[-1].sensor
-        parts = [decoded(sensor, sensor.encode(part)) for part in self._parts(rows)]
-        return joined(parts)
+        parts = [decode_frames(sensor, sensor.encode(part)) for part in self._parts(rows)]
+        return concatenate(parts)
 
     def frames(self, rows: Sequence[int] | Int64s | None = None) -> list[bytes]:
-        """Return the frames of entries as they were meant to go out; by default of all that did `whole`."""
-        rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
+        """Return the frames of entries without faults, by default of all `intact_rows`."""
+        rows = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
         frames: list[bytes] = []
         for part in self._parts(rows):
             sensor = self.sources[-1].sensor
-            frames += one_by_one(sensor, sensor.encode(part))
+            frames += split_frames(sensor, sensor.encode(part))
         return frames
 
     def _parts(self, rows: Int64s) -> Iterator[Samples]:
-        """Yield the samples of entries, as far as neighbours are of one block."""
+        """Yield the samples of entries in runs from one block of a source."""
         numbers, sources = self.column("number")[rows], self.column("source")[rows]
         blocks = np.array(
             [number // self.sources[source].rows for number, source in zip(numbers, sources, strict=True)]
@@ -170,7 +174,7 @@ class Ledger:
                 yield take_rows(source.block(block), numbers[part] - block * source.rows)
 
     def table(self) -> pa.Table:
-        """Return the entries as a table, a row each."""
+        """Return the entries as a table."""
         import pyarrow as pa
 
         columns = {name: pa.array(self.column(name)) for name in ("due_ns", "sent_ns", "number", "size", "source")}
@@ -179,7 +183,7 @@ class Ledger:
         return pa.table(columns)
 
     def write(self, folder: Path) -> None:
-        """Write ``NAME.parquet`` with the entries and ``NAME.json`` with the events and the bytes that were harmed."""
+        """Write ``NAME.parquet`` with the entries and ``NAME.json`` with the events and the changed bytes."""
         import pyarrow.parquet as pq
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -194,8 +198,8 @@ class Ledger:
 
 
 def take_rows(samples: Samples, rows: Int64s) -> Samples:
-    """Return the samples of some frames, in their order."""
-    if samples.rows is not None:  # many samples a frame, as the points of a cloud
+    """Return the samples of the frames ``rows``, in this order."""
+    if samples.rows is not None:  # several samples per frame, such as the points of a cloud
         parts = [np.flatnonzero(samples.rows == row) for row in rows]
         positions = np.repeat(np.arange(len(rows), dtype=np.int64), [len(part) for part in parts])
         return Samples(tuple(values[np.concatenate(parts)] for values in samples.values), rows=positions)
@@ -214,7 +218,7 @@ class ClockTruth(TypedDict):
 
 
 def _clock(source: Sampled) -> ClockTruth:
-    """Return what is true of a source's clock, and when it was set."""
+    """Return the true offset and skew of a source's clock, and the times at which it was set."""
     timing = source.timing
     moments_ns = getattr(timing.steps, "moments_ns", [])
     return {"offset_ns": timing.clock.offset_ns, "skew": timing.clock.skew, "set_at_ns": moments_ns}

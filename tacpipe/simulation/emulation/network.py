@@ -1,7 +1,7 @@
-"""Emulate devices on the network: TCP servers and clients, websockets, and UDP ports.
+"""Emulate devices on the network: TCP servers, TCP clients for devices that connect, websockets, and UDP ports.
 
-A device with a UDP port sends datagrams to whoever wrote to it last or, if the host listens, to the port of the host.
-Websockets speak the protocol of the package websockets, without its sockets.
+A device with a UDP port sends datagrams to the last sender, or to the port of a host that listens.
+Websockets use the protocol implementation of the package websockets without its I/O.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from tacpipe.links.link import Address
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.endpoint import stretched
+from tacpipe.simulation.emulation.endpoint import sent_sizes
 
 HOST = "127.0.0.1"
 MAX_READ_BYTES = 65_536
 
 
 class Connection:
-    """A host that is connected."""
+    """A connected host."""
 
     def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
         connection.setblocking(False)
@@ -31,10 +31,10 @@ class Connection:
         self.socket, self.device = connection, sensor.device()
         self.pending_frames = 0
         self.fault = byte_faults.SOUND
-        self._unsent = b""  # rest of a piece that was sent in part
+        self._unsent = b""  # remaining bytes of a partly sent piece
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send over the connection what it has room for; a piece that was begun is ended before any other."""
+        """Send as many pieces as the connection accepts. A partly sent piece is completed before any other."""
         if self._unsent:
             self._unsent = self._unsent[self._send_some(self._unsent) :]
             if self._unsent:
@@ -42,7 +42,7 @@ class Connection:
         sizes = [len(piece) for piece in pieces]
         content = b"".join(pieces)
         sent = self._send_some(content)
-        parts = stretched(sizes, sent)
+        parts = sent_sizes(sizes, sent)
         for piece, part in zip(pieces, parts, strict=True):
             if 0 < part < len(piece):
                 self._unsent = piece[part:]
@@ -62,7 +62,7 @@ class Connection:
         self.socket.close()
 
     def read(self) -> bytes | None:
-        """Return what the host wrote; None when it is gone."""
+        """Return the bytes from the host, or None if it has disconnected."""
         try:
             return self.socket.recv(MAX_READ_BYTES) or None
         except BlockingIOError:
@@ -72,7 +72,7 @@ class Connection:
 
 
 class Registration(Connection):
-    """A host that is connected, and named a UDP port to the device to send frames to: replies go over the connection."""
+    """A connected host with a UDP port for frames. Replies use the connection."""
 
     def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
         super().__init__(connection, sensor)
@@ -81,12 +81,12 @@ class Registration(Connection):
         self.host = connection.getpeername()[0]
 
     def close(self) -> None:
-        """Close the connection and the port that frames go out by."""
+        """Close the connection and the port that sends frames."""
         super().close()
         self._port.close()
 
     def post(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send frames to the port that the host stated; those that the network refuses are lost."""
+        """Send frames to the host's port. Frames that the network refuses are lost."""
         sizes = []
         for piece in pieces:
             try:
@@ -97,7 +97,7 @@ class Registration(Connection):
 
 
 class Tcp:
-    """A TCP server that takes any number of hosts."""
+    """A TCP server for any number of hosts."""
 
     scheme = "tcp"
     kind: type[Connection] = Connection
@@ -111,14 +111,14 @@ class Tcp:
         self.address = Address(self.scheme, f"{HOST}:{self._port}")
 
     def replug(self) -> None:
-        """Serve, on the port of before."""
+        """Start the server, on the same port as before."""
         if self._server is None:
             self._server = socket.create_server((HOST, self._port))
             self._server.setblocking(False)
             self._port = self._server.getsockname()[1]
 
     def unplug(self) -> None:
-        """Close all connections and serve no more."""
+        """Close all connections and the server."""
         for peer in self.peers:
             self.leave(peer)
         self.peers = []
@@ -127,7 +127,7 @@ class Tcp:
             self._server = None
 
     def close(self) -> None:
-        """End."""
+        """Close the server."""
         self.unplug()
 
     def leave(self, peer: Connection) -> None:
@@ -140,45 +140,45 @@ class Tcp:
         return listening + [peer.socket.fileno() for peer in self.peers]
 
     def ready(self, descriptor: int) -> list[tuple[Connection, bytes]]:
-        """Take a connection, or return what a host wrote."""
+        """Accept a connection, or return the bytes from a host."""
         if self._server is not None and descriptor == self._server.fileno():
             try:
                 peer = self.kind(self._server.accept()[0], self.sensor)
-            except OSError:  # it went away before it was taken
+            except OSError:  # the host disconnected before the connection was accepted
                 return []
             self.peers = [*self.peers, peer]
             return [] if self.scheme == "ws" else [(peer, b"")]
         for peer in self.peers:
             if peer.socket.fileno() == descriptor:
-                return self._heard(peer)
+                return self._receive(peer)
         return []
 
-    def _heard(self, peer: Connection) -> list[tuple[Connection, bytes]]:
+    def _receive(self, peer: Connection) -> list[tuple[Connection, bytes]]:
         data = peer.read()
         if data is None:
             self.leave(peer)
             self.peers = [existing for existing in self.peers if existing is not peer]
             return []
-        return self.understood(peer, data)
+        return self.from_wire(peer, data)
 
-    def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
-        """Return what the host's bytes state the device."""
+    def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
+        """Return the device's messages in the bytes from the host."""
         return [(peer, data)] if data else []
 
     def look(self) -> list[tuple[Connection, bytes]]:
-        """Return nothing: descriptors state all."""
+        """Return nothing, because all events have descriptors."""
         return []
 
 
 class TcpUdp(Tcp):
-    """A TCP server for control, frames by UDP."""
+    """A TCP server for control, with frames by UDP."""
 
     scheme = "tcp+udp"
     kind = Registration
 
 
 class Client(Connection):
-    """A host that is connected, or about to be."""
+    """A host that is connected, or in the websocket handshake."""
 
     def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
         from websockets.server import ServerProtocol
@@ -188,11 +188,11 @@ class Client(Connection):
         self.open = False
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send each piece as a message of text; bytes that are not text (a fault's) go as a binary one."""
+        """Send each piece as a text message. Bytes that are not valid text because of a fault are sent as a binary one."""
         if not self.open:
             return [0] * len(pieces)
-        wires = [self._message(piece) for piece in pieces]
-        sent = super().send(wires)
+        messages = [self._message(piece) for piece in pieces]
+        sent = super().send(messages)
         return [len(piece) if part else 0 for piece, part in zip(pieces, sent, strict=True)]
 
     def _message(self, piece: bytes) -> bytes:
@@ -206,7 +206,7 @@ class Client(Connection):
 
 
 class Websocket(Tcp):
-    """A websocket server that takes any number of hosts."""
+    """A websocket server for any number of hosts."""
 
     scheme = "ws"
     kind = Client
@@ -215,8 +215,8 @@ class Websocket(Tcp):
         extras.require("An emulated websocket", "websockets")
         super().__init__(sensor)
 
-    def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
-        """Return the messages in the host's bytes, an empty one for a new connection; answer handshakes and pings."""
+    def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
+        """Return the messages from the host, and an empty one for a new connection. Answers handshakes and pings."""
         from websockets.frames import Opcode
         from websockets.http11 import Request
 
@@ -234,7 +234,7 @@ class Websocket(Tcp):
                 heard.append((peer, bytes(event.data)))
             elif event.opcode is Opcode.CLOSE:
                 peer.open = False
-        with contextlib.suppress(OSError):  # the peer is gone, which the next read reports
+        with contextlib.suppress(OSError):  # the host has disconnected, which the next read reports
             for piece in protocol.data_to_send():
                 if piece:
                     peer.socket.send(piece)
@@ -244,11 +244,11 @@ class Websocket(Tcp):
 
 
 MAX_DATAGRAM_BYTES = 65_536
-MAX_WAITING_BYTES = 65_536  # bytes, of the 200 KiB that a queue has by default
+MAX_QUEUED_BYTES = 65_536  # bytes, of the default queue size of 200 KiB
 
 
 class Correspondent:
-    """The host that datagrams go to."""
+    """The host that receives the datagrams."""
 
     fault = byte_faults.SOUND
 
@@ -258,11 +258,11 @@ class Correspondent:
         self.pending_frames = 0
 
     def full(self) -> bool:
-        """Return whether the host's queue is so full that the kernel may soon drop packets."""
-        return (waiting(self.target[1]) or 0) > MAX_WAITING_BYTES
+        """Return whether the host's queue is so full that the kernel may drop packets."""
+        return (queued_bytes(self.target[1]) or 0) > MAX_QUEUED_BYTES
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send each piece as a datagram; those that the network refuses are lost."""
+        """Send each piece as a datagram. Datagrams that the network refuses are lost."""
         return [self.endpoint.post(piece, self.target) for piece in pieces]
 
 
@@ -274,7 +274,7 @@ class Udp:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
         self._socket.setblocking(False)
-        self._away = False
+        self._unplugged = False
         self.peers: list[Correspondent] = []
         host, port = listener or self._socket.getsockname()
         self.address = Address("udp", f"{host}:{port}")
@@ -286,12 +286,12 @@ class Udp:
         return [self._socket.fileno()]
 
     def ready(self, descriptor: int) -> list[tuple[Correspondent, bytes]]:
-        """Return the datagram that came; its sender is who is written to from now on."""
+        """Return the received datagram. Its sender receives the datagrams from now on."""
         try:
             data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
-        except OSError:  # nothing came after all, or a refusal of what was sent
+        except OSError:  # no datagram, or a refusal of a sent one
             return []
-        if self._away:
+        if self._unplugged:
             return []
         if not self.peers:
             self.peers = [Correspondent(self, sender)]
@@ -299,32 +299,32 @@ class Udp:
         return [(self.peers[0], data)]
 
     def look(self) -> list[tuple[Correspondent, bytes]]:
-        """Return nothing: the port states all."""
+        """Return nothing, because all events have a descriptor."""
         return []
 
     def post(self, data: bytes, target: tuple[str, int]) -> int:
-        """Send one datagram; return how many bytes went out."""
+        """Send a datagram and return the number of sent bytes."""
         with contextlib.suppress(OSError):
             return self._socket.sendto(data, target)
         return 0
 
     def unplug(self) -> None:
-        """Hear and send nothing."""
-        self._away = True
+        """Stop receiving and sending."""
+        self._unplugged = True
 
     def replug(self) -> None:
-        """Begin anew, as a device does that was switched on."""
-        self._away = False
+        """Restart the device."""
+        self._unplugged = False
         for peer in self.peers:
             peer.device = self.sensor.device()
 
     def close(self) -> None:
-        """End."""
+        """Close the port."""
         self._socket.close()
 
 
-def waiting(port: int) -> int | None:
-    """Return how many bytes of memory hold what waits at a UDP port of this computer, None if nobody listens."""
+def queued_bytes(port: int) -> int | None:
+    """Return the memory in bytes of queued datagrams at a local UDP port, or None if nobody listens."""
     for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
         fields = line.split()
         if int(fields[1].rpartition(":")[2], 16) == port:

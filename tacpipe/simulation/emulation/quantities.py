@@ -1,7 +1,4 @@
-"""Compute each quantity that a field may have from the simulated world, in SI units.
-
-`tacpipe.simulation.emulation.quantities` turns it into what a device sends.
-"""
+"""Compute the values of fields from the simulated world by their quantity, and convert them to the device's units."""
 
 from __future__ import annotations
 
@@ -25,10 +22,10 @@ WIDTH_M = 0.03  # width of a pad along both axes
 SIGMA_M = 0.005  # standard deviation of the Gaussian that distributes the pressure
 
 
-def places(taxels: int) -> Floats:
-    """Return where taxels lie on the pad (taxel, 2), m from its centre: row by row of a grid as square as can be.
+def taxel_positions(taxels: int) -> Floats:
+    """Return the positions of taxels on the pad (taxel, 2) in m from its centre, on a grid that is as square as possible.
 
-    >>> places(2).tolist()
+    >>> taxel_positions(2).tolist()
     [[0.0, -0.0075], [0.0, 0.0075]]
     """
     rows = next(count for count in range(math.isqrt(taxels), 0, -1) if taxels % count == 0)
@@ -37,13 +34,13 @@ def places(taxels: int) -> Floats:
     return WIDTH_M * np.column_stack([(row + 0.5) / rows - 0.5, (column + 0.5) / columns - 0.5])
 
 
-def pressed(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
-    """Return the force on each taxel (time, taxel, axis), N: shear along x and y, pressure along z."""
+def taxel_forces(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
+    """Return the force on each taxel (time, taxel, axis) in N: shear along x and y, pressure along z."""
     normal_n = world.contact(t_ns, lambda scene: scene.contact.normal_n[:, finger])
     moved_m = world.contact(t_ns, lambda scene: scene.contact.displacement_m)
     load_n = world.contact(t_ns, lambda scene: scene.contact.force_n[:, ::2]) / 2
     centre_m = world.skins[finger].centre_m + np.clip(moved_m, -WIDTH_M / 2, WIDTH_M / 2)
-    distance2 = ((places(taxels) - centre_m[:, None]) ** 2).sum(axis=2)  # (time, taxel)
+    distance2 = ((taxel_positions(taxels) - centre_m[:, None]) ** 2).sum(axis=2)  # (time, taxel)
     fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * SIGMA_M**2))
     fraction /= fraction.sum(axis=1, keepdims=True)
     force: Floats = fraction[:, :, None] * np.column_stack([load_n, normal_n])[:, None]
@@ -51,30 +48,30 @@ def pressed(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
 
 
 def peak_fraction(taxels: int) -> float:
-    """Return the fraction of the force that the taxel under its centre bears, of so many."""
-    distance2 = (places(taxels) ** 2).sum(axis=1)
+    """Return the fraction of the force on the taxel at its centre, for a pad with ``taxels`` taxels."""
+    distance2 = (taxel_positions(taxels) ** 2).sum(axis=1)
     weight = np.exp((distance2.min() - distance2) / (2 * SIGMA_M**2))
     return float(weight.max() / weight.sum())
 
 
 CLEARANCE_M = 0.12  # distance from the wrist's proximity sensor to the object without slip
-WARMING_C, WARM_C, WARMING_NS = 4.0, 31.0, 600_000_000_000  # a device warms up by so much, towards so much, that slowly
-STEP_NS = 1_000_000  # over which differences are taken
+WARMING_C, WARM_C, WARMING_NS = 4.0, 31.0, 600_000_000_000  # warm-up: increase, final temperature, time constant
+STEP_NS = 1_000_000  # step of numerical derivatives
 STRENGTH = 1200.0  # signal strength of a range finder
-FRICTION = 0.5  # friction that a slip sensor states
+FRICTION = 0.5  # friction coefficient that a slip sensor reports
 
 
 @dataclass(frozen=True)
 class SensorView:
-    """A sensor's view of the world: when it looks, and on which finger it sits."""
+    """A sensor's view of the world: the times of its samples, and its finger."""
 
     world: World
     t_ns: Times
     finger: int = 0
 
 
-def look(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return what fields of one quantity show (time, field), SI; zeros for one that the world does not know."""
+def compute(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
+    """Return the values of fields of one quantity (time, field) in SI units; zeros if the quantity is not simulated."""
     function = (
         QUANTITIES.get(quantity)
         if not metadata_of(fields[0], "taxel") or quantity not in ("force", "torque")
@@ -84,38 +81,38 @@ def look(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def metadata_of(field: pa.Field, key: str) -> str | None:
-    """Return what a field's metadata states under ``key``, or None if it is silent."""
+    """Return the value of ``key`` in a field's metadata, or None."""
     value = (field.metadata or {}).get(key.encode())
     return None if value is None else value.decode()
 
 
 def axis_of(field: pa.Field) -> str | None:
-    """Return the axis or component that a field's metadata names."""
+    """Return the axis or component in a field's metadata, or None."""
     return metadata_of(field, "axis") or metadata_of(field, "component")
 
 
 def _vector(values: Floats, fields: Sequence[pa.Field], names: Sequence[str], axis: int) -> Floats:
-    """Return the columns of ``values`` (time, component) that fields name, ``axis`` for those that name none."""
+    """Return the columns of ``values`` (time, component) for the axes of fields; ``axis`` for fields without an axis."""
     return values[:, [names.index(name) if (name := axis_of(field)) in names else axis for field in fields]]
 
 
 def _tactile(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return the force on taxels (time, field): fields that share all layout but the axis are one taxel."""
-    places = [_place(field) for field in fields]
-    pads = list(dict.fromkeys(pad for pad, _ in places))
+    """Return the force on taxels (time, field). Fields that differ only in their axis belong to one taxel."""
+    taxels_of_fields = [_pad_and_taxel(field) for field in fields]
+    pads = list(dict.fromkeys(pad for pad, _ in taxels_of_fields))
     values = np.zeros((len(view.t_ns), len(fields)))
     for number, pad_name in enumerate(pads):
-        rows = [row for row, (pad, _) in enumerate(places) if pad == pad_name]
-        taxels = list(dict.fromkeys(places[row][1] for row in rows))
-        force = pressed(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
-        columns = [taxels.index(places[row][1]) for row in rows]
+        rows = [row for row, (pad, _) in enumerate(taxels_of_fields) if pad == pad_name]
+        taxels = list(dict.fromkeys(taxels_of_fields[row][1] for row in rows))
+        force = taxel_forces(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
+        columns = [taxels.index(taxels_of_fields[row][1]) for row in rows]
         axes = [schema.AXES.index(axis_of(fields[row]) or "z") for row in rows]
         values[:, rows] = force[:, columns, axes]
     return values
 
 
-def _place(field: pa.Field) -> tuple[str, str]:
-    """Return which pad a field is of, and which taxel of it."""
+def _pad_and_taxel(field: pa.Field) -> tuple[str, str]:
+    """Return the pad of a field, and its taxel."""
     layout = {
         key: metadata_of(field, key) or "" for key in ("sensor", "finger", "module", "triangle", "taxel", "electrode")
     }
@@ -130,7 +127,7 @@ def _normal(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _force(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return what the hand's load cell measures: the contact's force with its sign turned; alone, the finger's pressure."""
+    """Return the hand's load cell values, the negative contact force; for fields without an axis, the finger's pressure."""
     load = -view.world.contact(view.t_ns, lambda scene: scene.contact.force_n)
     normal = view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])
     return _vector(np.column_stack([load, normal]), fields, schema.AXES, 3)
@@ -142,7 +139,7 @@ def _torque(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _vibration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return a ringing at slip's speed, m/s: fields of one quantity are readings one after another."""
+    """Return a vibration with the amplitude of the slip speed in m/s. Fields of one quantity are successive readings."""
     speed = np.linalg.norm(view.world.contact(view.t_ns, lambda scene: scene.contact.velocity_m_s), axis=1)
     phase = np.arange(len(fields)) * 2.4 + (view.t_ns % 1_000_000_007)[:, None] * 1e-7
     ringing: Floats = speed[:, None] * np.sin(phase)
@@ -163,19 +160,19 @@ def _width(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     return np.repeat(view.world.arm(view.t_ns)[:, :1], len(fields), axis=1)
 
 
-def _difference(look_at: Callable[[Times], Floats], t_ns: Times) -> Floats:
-    """Return the speed of what is looked at (time, component), a second."""
+def _derivative(value_at: Callable[[Times], Floats], t_ns: Times) -> Floats:
+    """Return the time derivative of values (time, component), per second."""
     before, after = np.maximum(t_ns - STEP_NS, 0), t_ns + STEP_NS
-    return (look_at(after) - look_at(before)) / ((after - before) / 1e9)[:, None]
+    return (value_at(after) - value_at(before)) / ((after - before) / 1e9)[:, None]
 
 
 def _velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    velocity = _difference(lambda t_ns: view.world.arm(t_ns)[:, 1:4], view.t_ns)
+    velocity = _derivative(lambda t_ns: view.world.arm(t_ns)[:, 1:4], view.t_ns)
     return _vector(velocity, fields, schema.AXES, 2)
 
 
 def _acceleration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return what an accelerometer on the hand shows: at rest, gravity upwards."""
+    """Return the values of an accelerometer on the hand, which measures upward gravity at rest."""
     at = view.world.contact(view.t_ns, lambda scene: scene.path.hand_acceleration_m_s2)
     return _vector(at + np.array([0.0, 0.0, GRAVITY_M_S2]), fields, schema.AXES, 2)
 
@@ -184,12 +181,12 @@ def _angular_velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     def yaw(t_ns: Times) -> Floats:
         return view.world.contact(t_ns, lambda scene: scene.path.yaw_rad)[:, None]
 
-    about_z = _difference(yaw, view.t_ns)
+    about_z = _derivative(yaw, view.t_ns)
     return _vector(np.hstack([0 * about_z, 0 * about_z, about_z]), fields, schema.AXES, 2)
 
 
 def _joints(values: Floats, fields: Sequence[pa.Field]) -> Floats:
-    """Return the joints in order (time, field), the first ones once more where more are asked for."""
+    """Return the joints in order (time, field), repeated if there are more fields."""
     return values[:, np.arange(len(fields)) % values.shape[1]]
 
 
@@ -254,7 +251,7 @@ UNITS = {  # size of each unit in SI units or °C
     "N mm": 1e3, "mN m": 1e3, "m/s": 1.0, "mm/s": 1e3, "rad/s": 1.0, "deg/s": 180 / np.pi, "m/s^2": 1.0, "m/s²": 1.0,
     "g": 1 / 9.81, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "kg": 1.0, "degC": 1.0, "°C": 1.0,
 }  # fmt: skip
-COUNTS = {
+COUNTS = {  # counts at full range, by type
     "uint8": 200.0,
     "int8": 100.0,
     "uint16": 3000.0,
@@ -262,17 +259,17 @@ COUNTS = {
     "uint32": 1e5,
     "int32": 1e6,
 }
-FLOAT_COUNTS = 100.0  # the same, of fields that are floats
-FULL = {  # full range of a device of counts, SI
+FLOAT_COUNTS = 100.0  # the same for float fields
+FULL = {  # full range in SI units of devices that send counts
     "tactile": 12.0, "magnetic_flux_density": 12.0, "displacement": 12.0, "static_pressure": 10.0, "vibration": 0.5,
     "force": 15.0, "torque": 1.0, "temperature": 60.0, "acceleration": 20.0, "angular_velocity": 5.0, "proximity": 0.5,
     "distance": 0.5, "velocity": 2.0, "joint_position": 3.2, "joint_velocity": 3.0, "joint_torque": 90.0, "position": 1.0,
     "signal_strength": 3000.0, "length": 0.5, "finger_width": 0.1,
     "deflection": 10.0, "external_torque": 90.0,
 }  # fmt: skip
-SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities of one taxel among others
-NOISE = 0.002  # standard deviation as a fraction of what a device is made for
-AIMED = ("target_position", "target_orientation")  # values that a controller computes exactly
+SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities that taxels share
+NOISE = 0.002  # standard deviation as a fraction of the full range
+TARGETS = ("target_position", "target_orientation")  # values that a controller computes exactly
 SILENT = (
     "time",
     "status",
@@ -282,14 +279,16 @@ SILENT = (
     "orientation",
     "mass",
     "friction",
-    *AIMED,
+    *TARGETS,
 )  # quantities without noise
 
 
-def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator) -> list[AnyArray]:
-    """Return the column (time,) of each field, in its own type, of what the world shows (time, field), SI."""
+def to_device_units(
+    quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator
+) -> list[AnyArray]:
+    """Convert values (time, field) in SI units to the columns (time,) of fields, in their units and types, with noise."""
     full = FULL.get(quantity, 1.0)
-    if quantity in SHARED:  # a device with many taxels is made for less on each
+    if quantity in SHARED:  # the range per taxel is smaller with more taxels
         full *= peak_fraction(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
     noise = 0.0 if quantity in SILENT else NOISE * full
     noisy = values + noise * rng.standard_normal(values.shape) if noise else values
@@ -301,10 +300,10 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
     scale = unit_scale(metadata_of(field, "unit") or "1")
     if scale is None and quantity in FULL:
         full_scale = COUNTS.get(kind.name, FLOAT_COUNTS)
-        middle = (
+        offset = (
             full_scale if kind.kind == "u" and axis_of(field) in ("x", "y") else 0.0
-        )  # offset for signed values in an unsigned type
-        values = middle + values * (full_scale / full)
+        )  # signed values in an unsigned type
+        values = offset + values * (full_scale / full)
     else:
         values = values * (scale or 1.0)
     if kind.kind in "iu":
@@ -315,7 +314,7 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
 
 
 def unit_scale(unit: str) -> float | None:
-    """Return how many of ``unit`` make one of SI, None for counts; a number before the unit is what one count is.
+    """Return the number of ``unit`` per SI unit, or None for counts. A number before the unit is the size of one count.
 
     >>> unit_scale("mN"), unit_scale("0.1 N"), unit_scale("count")
     (1000.0, 10.0, None)

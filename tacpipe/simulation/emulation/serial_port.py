@@ -1,8 +1,7 @@
-"""Serve a serial device on a pseudo-terminal, behind a symbolic link that stays while the device is unplugged.
+"""Emulate a serial device on a pseudo-terminal, at the path of a symbolic link.
 
-A pseudo-terminal takes bytes as fast as they come and keeps some thousands of them. What it has no room for is lost, as in
-the buffer of a UART that nobody reads. While no host has the port open, nothing is sent. A host that opens the port with
-another speed than the device's reads garbled bytes.
+A pseudo-terminal has no baud rate and buffers some thousand bytes. Further bytes are lost, as in the full buffer of a UART.
+Nothing is sent while no host has the port open. A host that sets another baud rate than the device reads garbled bytes.
 """
 
 from __future__ import annotations
@@ -22,15 +21,15 @@ from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.endpoint import stretched
+from tacpipe.simulation.emulation.endpoint import sent_sizes
 
-IDLE_BITS = 30  # number of idle bits after the last byte
+IDLE_BITS = 30  # after the last byte
 
 
 def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
-    """Return what is read at ``read_baud`` of bytes that were sent at ``sent_baud``, 8 bits, no parity, one stop bit.
+    """Return the bytes read at ``read_baud`` if ``data`` is sent at ``sent_baud`` (8 bits, no parity, one stop bit).
 
-    A byte begins where the line falls; where no stop bit is found, it is kept all the same, as Linux does by default.
+    A byte starts at a falling edge. Bytes without a stop bit are retained, as by default in Linux.
 
     >>> garbled(b"touch", 9600, 9600)
     b'touch'
@@ -43,23 +42,23 @@ def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
     width = sent_baud / read_baud  # length of a received bit in sent bits
     middles = (1.5 + np.arange(8)) * width
     low = np.flatnonzero(line == 0)
-    received, place = [], 0.0
-    while (row := int(np.searchsorted(low, np.floor(place)))) < len(low):
-        start = max(place, float(low[row]))
+    received, position = [], 0.0
+    while (row := int(np.searchsorted(low, np.floor(position)))) < len(low):
+        start = max(position, float(low[row]))
         received.append(np.packbits(line[np.floor(start + middles).astype(int)], bitorder="little")[0])
-        place = start + 9.5 * width
-        if place >= len(line) - 12 * width:
+        position = start + 9.5 * width
+        if position >= len(line) - 12 * width:
             break
     return bytes(received)
 
 
-TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
-TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
+TERMIOS2, SPEED_AT = 44, 40  # size of struct termios2 of <asm-generic/termbits.h>, and offset of its output speed
+TCGETS2 = 0x802C542A  # from the same header; also reports non-standard speeds
 MAX_READ_BYTES = 4096
 
 
 class HostPort:
-    """The one host that has the port open."""
+    """The host that has the port open."""
 
     def __init__(self, endpoint: Pty) -> None:
         self.endpoint = endpoint
@@ -68,16 +67,16 @@ class HostPort:
 
     @property
     def fault(self) -> str:
-        """True if the host used another speed at the last write."""
+        """The cause `byte_faults.BAUD` if the host had set another baud rate at the last write."""
         return byte_faults.BAUD if self.endpoint.garbling else byte_faults.SOUND
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Write; return how many bytes of each piece the terminal had room for."""
+        """Write pieces, and return the number of written bytes of each."""
         return self.endpoint.write(pieces)
 
 
 class Pty:
-    """A serial port's other end."""
+    """The device's end of a serial port."""
 
     def __init__(self, sensor: Sensor, link: Path) -> None:
         self.sensor, self.link = sensor, link
@@ -89,25 +88,25 @@ class Pty:
         self.replug()
 
     def replug(self) -> None:
-        """Make a new terminal and have the link point to it."""
+        """Create a new pseudo-terminal and point the link to it."""
         if self._master >= 0:
             return
         draft = self.link.with_name(f".{self.link.name}")
         for path in (self.link, draft):
-            if not path.is_symlink() and path.exists():  # an emulator makes links alone
-                raise UsageError(f"{path} already exists, and no emulator made it. Give -o another folder.")
+            if not path.is_symlink() and path.exists():  # an emulator creates only links
+                raise UsageError(f"{path} already exists and is not from an emulator. Give -o another folder.")
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         name = os.ttyname(slave)
-        os.close(slave)  # the master then reports whether a host has it open
+        os.close(slave)  # the master now reports whether a host has it open
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
         self._port = HostPort(self)
 
     def unplug(self) -> None:
-        """Close the terminal, which the host sees as an unplugged port."""
+        """Close the terminal. Hosts see an unplugged port."""
         if self._master >= 0:
             os.close(self._master)
             if self.link.is_symlink():
@@ -115,15 +114,15 @@ class Pty:
         self._master, self.peers = -1, []
 
     def close(self) -> None:
-        """End."""
+        """Close the terminal."""
         self.unplug()
 
     def descriptors(self) -> list[int]:
-        """Return the terminal while a host has it open; before, it would never rest."""
+        """Return the terminal while a host has it open; otherwise it would always be readable."""
         return [self._master] if self.peers else []
 
     def ready(self, descriptor: int) -> list[tuple[HostPort, bytes]]:
-        """Return what the host wrote."""
+        """Return the bytes from the host."""
         try:
             data = os.read(self._master, MAX_READ_BYTES)
         except BlockingIOError:
@@ -133,10 +132,10 @@ class Pty:
             return []
         if self.wrong_baud():
             data = garbled(data, self._baud, self.sensor.baud)
-        return [(self._port, heard) for heard in self.understood(data)]
+        return [(self._port, heard) for heard in self.from_wire(data)]
 
     def look(self) -> list[tuple[HostPort, bytes]]:
-        """Find out whether a host has the port open."""
+        """Check whether a host has opened the port."""
         if self._master < 0 or self.peers:
             return []
         poll = select.poll()
@@ -147,35 +146,35 @@ class Pty:
         return [(self._port, b"")]
 
     def wrong_baud(self) -> bool:
-        """Return whether the host has set another speed than the device's."""
+        """Return whether the host has set another baud rate than the device's."""
         self._baud = _speed(self._master) if self._master >= 0 else 0
         return bool(self._baud) and self._baud != getattr(self.sensor, "baud", self._baud)
 
     def write(self, pieces: Sequence[bytes]) -> list[int]:
-        """Write pieces, garbled at a wrong speed; return how many bytes of each were taken."""
-        on_the_line = [self.on_the_line(piece) for piece in pieces]
+        """Write pieces, garbled at a wrong baud rate, and return the number of written bytes of each."""
+        wire_bytes = [self.to_wire(piece) for piece in pieces]
         self.garbling = self.wrong_baud()
         if self.garbling:
-            on_the_line = [garbled(piece, self.sensor.baud, self._baud) for piece in on_the_line]
+            wire_bytes = [garbled(piece, self.sensor.baud, self._baud) for piece in wire_bytes]
         count = 0
         with contextlib.suppress(BlockingIOError):
-            count = os.write(self._master, b"".join(on_the_line))
-        sizes = stretched([len(piece) for piece in on_the_line], count)
+            count = os.write(self._master, b"".join(wire_bytes))
+        sizes = sent_sizes([len(piece) for piece in wire_bytes], count)
         return [
             len(piece) if size == len(sent) else min(size, len(piece) - 1)
-            for piece, sent, size in zip(pieces, on_the_line, sizes, strict=True)
+            for piece, sent, size in zip(pieces, wire_bytes, sizes, strict=True)
         ]
 
-    def on_the_line(self, piece: bytes) -> bytes:
-        """Return a frame as it goes over the line."""
+    def to_wire(self, piece: bytes) -> bytes:
+        """Return the bytes on the line for a frame."""
         return piece
 
-    def understood(self, data: bytes) -> list[bytes]:
-        """Return what the host's bytes state the device."""
+    def from_wire(self, data: bytes) -> list[bytes]:
+        """Return the device's messages in the bytes from the host."""
         return [data]
 
 
 def _speed(master: int) -> int:
-    """Return the speed in bits a second that the host has set."""
-    on_the_line = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
-    return int(struct.unpack_from("=I", on_the_line, SPEED_AT)[0])
+    """Return the baud rate that the host has set."""
+    settings = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
+    return int(struct.unpack_from("=I", settings, SPEED_AT)[0])

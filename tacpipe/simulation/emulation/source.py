@@ -1,11 +1,11 @@
-"""Sample emulated sensors: the fields, clouds and slides of one world that the rig shares, over time.
+"""Generate the samples of emulated sensors from a common simulated world: fields, clouds and slides.
 
-uSkin and proximity counts come from the models of the simulated rig, with their noise, drift and held frames; what other
-fields show follows from their quantity and unit. Samples are made a block at a time, so that hours need no memory, and
-any block can be made once more: the same seed gives the same values.
+uSkin and proximity counts come from the models of the simulated rig, with noise, drift and repeated frames. The values of
+other fields follow from their quantity and unit. Samples are generated in blocks, so that long streams need little memory,
+and any block can be generated again: the same seed gives the same values.
 
-Clouds show a table with an object and another next to it, each a new scene. A BioTac slides over one material after
-another, in the trials of `tacpipe simulate material`.
+Each cloud is a new scene with a table and two objects. A BioTac slides over one material after another, as in the trials of
+`tacpipe simulate material`.
 """
 
 from __future__ import annotations
@@ -33,53 +33,53 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from _typeshed import DataclassInstance
 
-Columns = dict[int, AnyArray]  # number of the field to its values (time,)
+Columns = dict[int, AnyArray]  # values (time,) by number of the field
 
 BLOCK_S = 0.5
-KEPT = 3  # blocks that are kept in case they are asked for once more
-PARTS = {"report": (1, 2)}  # values of fields that name the part of a state in a frame
-UNCOUNTED = 1 << 32  # modulus of a counter that nobody looks at
-USKIN = 48  # channels of a 4x4
+CACHED = 3  # blocks
+PARTS = {"report": (1, 2)}  # alternating values of fields that identify the part of a state in a frame
+UNUSED_MODULUS = 1 << 32  # modulus of a counter that the sensor does not send
+USKIN = 48  # channels of a 4x4 uSkin
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When an emulated sensor takes its samples, and what its clock and its counters state."""
+    """The sample times of an emulated sensor, and the values of its clock and counters."""
 
     rate_hz: float
     start_ns: int = 0  # time of the first sample in the world
-    clock: faults.DeviceClock = field(default_factory=faults.DeviceClock)  # its oscillator paces its samples too
-    steps: Callable[[Times], Times] = no_steps  # returns the total of clock steps so far, ns (time,)
-    wrap_s: float | None = None  # counters go round so long after the start; None: they begin anywhere
+    clock: faults.DeviceClock = field(default_factory=faults.DeviceClock)  # its skew also changes the sample rate
+    steps: Callable[[Times], Times] = no_steps  # returns the total of clock steps so far (time,) in ns
+    wrap_s: float | None = None  # time after the start at which counters wrap; None: random initial values
 
-    def taken_ns(self, number: Int64s) -> Times:
-        """Return when samples ``number`` (sample,) are taken, in the world's time."""
+    def sample_ns(self, number: Int64s) -> Times:
+        """Return the times in ns of samples ``number`` (sample,) in the world."""
         sample_ns: Times = self.start_ns + np.rint(number * (1e9 / self.rate_hz / (1 + self.clock.skew))).astype(
             np.int64
         )
         return sample_ns
 
     def first_after(self, t_ns: int) -> int:
-        """Return the number of the first sample that is taken after ``t_ns``."""
+        """Return the number of the first sample after ``t_ns``."""
         return max(0, int(np.floor((t_ns - self.start_ns) * (1 + self.clock.skew) * self.rate_hz / 1e9)) + 1)
 
 
 class Sampled(Protocol):
-    """Generates the frames of an emulated sensor, one block at a time."""
+    """A source of samples of an emulated sensor, in blocks."""
 
     sensor: Sensor
     timing: Timing
-    rows: int  # frames a block
+    rows: int  # frames per block
 
     def block(self, number: int) -> Samples:
         """Return the samples of block ``number``."""
 
     def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's frames, counted from 0 through the stream (frame,)."""
+        """Return the numbers of a block's frames (frame,), counted from 0 at the start of the stream."""
 
 
 class SampleSource:
-    """The samples of one sensor, from its start on."""
+    """The samples of a sensor in the simulated world."""
 
     def __init__(
         self, sensor: Sensor, world: World, timing: Timing, seed: Sequence[int] = (0,), finger: int = 0
@@ -88,42 +88,42 @@ class SampleSource:
         self.fields = sensor.fields()
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))
         self._seed = list(seed)
-        self._groups = _grouped(self.fields)
+        self._groups = _group_by_quantity(self.fields)
         self._widths = _widths(sensor, self.fields)
         self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # drift of a uSkin at the start of each block
-        self._samples = functools.lru_cache(KEPT)(self._generate)
+        self._samples = functools.lru_cache(CACHED)(self._generate)
         rng = np.random.default_rng([*seed, 0])
         self._first = [
-            _first_count(timing, sensor.step, modulus or UNCOUNTED, rng)
+            _first_count(timing, sensor.step, modulus or UNUSED_MODULUS, rng)
             for modulus in (sensor.counter, sensor.device_counter)
         ]
 
     def block(self, number: int) -> Samples:
-        """Return the samples of block ``number``, `rows` of them."""
+        """Return the samples of block ``number``."""
         return self._samples(number)
 
     def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
+        """Return the numbers of a block's samples (sample,), counted from 0 at the start of the stream."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
     def _generate(self, block: int) -> Samples:
         numbers = self.numbers(block)
-        taken_ns = self.timing.taken_ns(numbers)
+        sample_ns = self.timing.sample_ns(numbers)
         rng = np.random.default_rng([*self._seed, 1, block])
-        view = SensorView(self.world, taken_ns, self.finger)
+        view = SensorView(self.world, sample_ns, self.finger)
         columns: Columns = {}
         for group in self._groups:
-            columns |= self._filled(group, view, block, rng)
+            columns |= self._columns_of(group, view, block, rng)
         step = self.sensor.step
         counts = [
-            (first + step * numbers) % (modulus or UNCOUNTED)
+            (first + step * numbers) % (modulus or UNUSED_MODULUS)
             for first, modulus in zip(self._first, (self.sensor.counter, self.sensor.device_counter), strict=True)
         ]
-        device_ns = faults.device_stamps(taken_ns, self.timing.clock) + self.timing.steps(taken_ns)
+        device_ns = faults.device_stamps(sample_ns, self.timing.clock) + self.timing.steps(sample_ns)
         return Samples(_blocks(self._widths, columns), counts[0], device_ns, counts[1])
 
-    def _filled(self, group: Sequence[int], view: SensorView, block: int, rng: np.random.Generator) -> Columns:
-        """Return the columns of the fields of one quantity."""
+    def _columns_of(self, group: Sequence[int], view: SensorView, block: int, rng: np.random.Generator) -> Columns:
+        """Return the columns of a group of fields with one quantity."""
         fields = [self.fields[number] for number in group]
         quantity = quantities.metadata_of(fields[0], "quantity") or ""
         if fields[0].name in PARTS:
@@ -141,23 +141,23 @@ class SampleSource:
                 number: pick_and_move.proximity_readings(up_m, 1.0, rng).astype(kind)
                 for number, kind in zip(group, kinds, strict=True)
             }
-        values = quantities.look(quantity, view, fields)
-        return dict(zip(group, quantities.sent(quantity, values, fields, rng), strict=True))
+        values = quantities.compute(quantity, view, fields)
+        return dict(zip(group, quantities.to_device_units(quantity, values, fields, rng), strict=True))
 
     def _uskin(self, view: SensorView, block: int, rng: np.random.Generator) -> Counts:
-        """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""
+        """Return the counts of a uSkin (time, channel) like `pick_and_move`, with a drift that continues between blocks."""
         skin = view.world.skins[view.finger]
         noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
         counts = skin.base_count + taxels.signal(skin, view.world.touch(view.finger, view.t_ns)) + noise
-        digits = taxels.digitised(counts + self._drifted(block))
+        digits = taxels.digitise(counts + self._drift_of_block(block))
         return faults.hold(digits, pick_and_move.PickRig().hold_probability, rng)[0]
 
-    def _drifted(self, block: int) -> Floats:
-        """Return the drift of a uSkin in a block (time, taxel, axis), a random walk from where the last block left it."""
+    def _drift_of_block(self, block: int) -> Floats:
+        """Return the drift of a uSkin in a block (time, taxel, axis): a random walk from the end of the previous block."""
         while True:
             number = min(block, len(self._drift) - 1)
             rng = np.random.default_rng([*self._seed, 2, number])
-            at_s = self.timing.taken_ns(number * self.rows + np.arange(self.rows + 1)) / 1e9
+            at_s = self.timing.sample_ns(number * self.rows + np.arange(self.rows + 1)) / 1e9
             walk = self._drift[number] + taxels.errors(at_s, 0.0, 1.0, rng)
             if number == len(self._drift) - 1:
                 self._drift.append(walk[-1])
@@ -166,14 +166,14 @@ class SampleSource:
 
 
 def _first_count(timing: Timing, step: int, modulus: int, rng: np.random.Generator) -> int:
-    """Return what a counter begins with: anything, or what makes it go round ``wrap_s`` after the start."""
+    """Return the initial value of a counter: random, or such that it wraps ``wrap_s`` after the start."""
     if timing.wrap_s is None:
-        return int(rng.integers(max(1, min(modulus, UNCOUNTED) // 2) // step + 1)) * step
+        return int(rng.integers(max(1, min(modulus, UNUSED_MODULUS) // 2) // step + 1)) * step
     return (modulus - step * round(timing.wrap_s * timing.rate_hz)) % modulus
 
 
-def _grouped(fields: Sequence[pa.Field]) -> list[list[int]]:
-    """Return the numbers of the fields of each quantity; forces of taxels apart from those of whole sensors."""
+def _group_by_quantity(fields: Sequence[pa.Field]) -> list[list[int]]:
+    """Return the numbers of the fields of each quantity. Forces of taxels and of sensors are separate groups."""
     groups: dict[tuple[str | None, bool, str | None], list[int]] = {}
     for number, channel in enumerate(fields):
         quantity = channel.name if channel.name in PARTS else quantities.metadata_of(channel, "quantity")
@@ -189,7 +189,7 @@ def _is_uskin(fields: Sequence[pa.Field]) -> bool:
 
 
 def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:
-    """Return the widths of the blocks of `Samples.values`: neighbours of one type, or those of each output."""
+    """Return the widths of the blocks of `Samples.values`: one per run of fields of one type, or one per output."""
     outputs: Sequence[str] | None = getattr(sensor, "outputs", None)
     if outputs:
         options = cast("DataclassInstance", sensor)
@@ -200,31 +200,31 @@ def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:
 
 
 def _blocks(widths: Sequence[int], columns: Columns) -> tuple[AnyArray, ...]:
-    """Return the columns side by side in blocks (sample, channel) of these widths."""
+    """Return the columns in blocks (sample, channel) of these widths."""
     stops = np.cumsum(widths).tolist()
     runs = [range(stop - width, stop) for stop, width in zip(stops, widths, strict=True)]
     return tuple(np.column_stack([columns[number] for number in run]) for run in runs)
 
 
-CLOUD_EVERY = 16  # one of so many of the camera's 300,000 points is kept
+CLOUD_STEP = 16  # every n-th of the camera's 300,000 points is used
 
 
 class CloudSource:
-    """The clouds of one camera, from its start on; as `Source`, but with many rows a frame."""
+    """The clouds of a camera, like `SampleSource` but with many rows per frame."""
 
     def __init__(self, sensor: Sensor, timing: Timing, seed: Sequence[int]) -> None:
         self.sensor, self.timing = sensor, timing
-        self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # clouds a block
+        self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # clouds per block
         self._seed = seed[0]
         self._coloured = len(sensor.fields()) > 3
         self._samples = functools.lru_cache(2)(self._generate)
 
     def block(self, number: int) -> Samples:
-        """Return the points of the clouds of block ``number``; ``rows`` reports on which each is."""
+        """Return the points of the clouds of block ``number``. ``rows`` has the index of the cloud of each point."""
         return self._samples(number)
 
     def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's clouds, counted from 0 through the stream (cloud,)."""
+        """Return the numbers of a block's clouds (cloud,), counted from 0 at the start of the stream."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
     def _generate(self, block: int) -> Samples:
@@ -241,40 +241,40 @@ class CloudSource:
             scene.placed, neighbour.shape, scene.up, scene.camera_m, GraspRig().noise_scale, rng
         ).cloud
         assert cloud.colours is not None
-        return cloud.points_m[::CLOUD_EVERY].astype(np.float32), cloud.colours[::CLOUD_EVERY]
+        return cloud.points_m[::CLOUD_STEP].astype(np.float32), cloud.colours[::CLOUD_STEP]
 
 
-SLIDE_KEPT = 3  # trials that are kept in case they are asked for once more
+CACHED_TRIALS = 3
 
 
 class SlideSource:
-    """The samples of one BioTac, from its start on."""
+    """The samples of a BioTac that slides over materials."""
 
     def __init__(self, sensor: Sensor, timing: Timing, seed: int, rig: SlideRig | None = None) -> None:
-        """Take a BioTac; raises `UsageError` for any other sensor."""
+        """Create the source of a BioTac. Raises `UsageError` for any other sensor."""
         if not isinstance(sensor, BioTac):
-            raise UsageError("emulate: slides is for the sensor biotac; leave it out for others.")
+            raise UsageError("emulate: slides is only for the sensor biotac; remove it for others.")
         self.sensor: Sensor = sensor
         self.timing, self._fingers = timing, sensor.fingers
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))
         self._seed, self._rig = seed, rig or SlideRig(arm_every=0)
         self._fields = [field.name for field in BioTac().fields()]
         self._ends = [0]  # end of each trial in samples from the start
-        self._trial = functools.lru_cache(SLIDE_KEPT)(self._generate)
+        self._trial = functools.lru_cache(CACHED_TRIALS)(self._generate)
 
     def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
+        """Return the numbers of a block's samples (sample,), counted from 0 at the start of the stream."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
     def block(self, number: int) -> Samples:
-        """Return the samples of block ``number``, `rows` of them."""
+        """Return the samples of block ``number``."""
         numbers = self.numbers(number)
         while self._ends[-1] <= numbers[-1]:
             self._ends.append(self._ends[-1] + len(self._trial(len(self._ends) - 1)))
         trials = np.searchsorted(self._ends, numbers, side="right") - 1
         rows = [self._trial(int(trial))[row - self._ends[trial]] for trial, row in zip(trials, numbers, strict=True)]
         readings = np.tile(np.stack(rows), self._fingers)
-        device_ns = faults.device_stamps(self.timing.taken_ns(numbers), self.timing.clock)
+        device_ns = faults.device_stamps(self.timing.sample_ns(numbers), self.timing.clock)
         return Samples((readings,), numbers % (self.sensor.counter or 1), device_ns)
 
     def _generate(self, number: int) -> Ints:

@@ -1,6 +1,6 @@
-"""Send a stream of an emulated rig: samples are planned ahead, changed by the faults, and sent when they are due.
+"""Send a stream of an emulated rig: frames are planned ahead, changed by faults, and sent when they are due.
 
-Deadlines are absolute: a frame that is late takes nothing away from the next ones, so that a stream does not drift.
+Due times are absolute, so a late frame does not delay the next ones, and the stream does not drift.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tacpipe.arrays import Times
 from tacpipe.errors import UsageError
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, SentItem, one_by_one
+from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, SentItem, split_frames
 from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.source import Sampled
@@ -24,98 +24,96 @@ from tacpipe.simulation.emulation.source import Sampled
 
 @dataclass(frozen=True)
 class FramePace:
-    """How a stream's frames come; in a rig file the keys of ``emulate``, for the whole rig or one stream."""
+    """The timing of a stream's frames: the keys of ``emulate`` in a rig file, for the rig or a stream."""
 
-    jitter_ms: float = 0.2  # mean delay of a frame, exponentially distributed
-    burst_ms: float = 0.0  # frames are collected for so long and sent together, as USB bridges do; 0: each alone
-    skew_ppm: float | None = None  # excess rate of the device's clock; None: random within 50
-    offset_ms: float | None = None  # lead of the device's clock; None: random within 80
+    jitter_ms: float = 0.2  # mean of the exponentially distributed delay of a frame
+    burst_ms: float = 0.0  # interval in which frames are collected and sent together, as by USB bridges; 0: separately
+    skew_ppm: float | None = None  # rate error of the device's clock; None: random within ±50
+    offset_ms: float | None = None  # offset of the device's clock; None: random within ±80
     slides: bool = False  # a biotac sends the slides of `tacpipe simulate material` instead of the rig's grasps
     video: str = ""  # video file that a camera shows again and again; empty: the gel of its finger
-    finger: int | None = None  # finger of the gripper with the sensor, 1 or 2; None: the last digit of its name, or 1
+    finger: int | None = None  # finger with the sensor, 1 or 2; None: the last digit of the stream's name, or 1
 
     def __post_init__(self) -> None:
         if self.jitter_ms < 0 or self.burst_ms < 0:
             raise UsageError(
-                f"emulate: jitter_ms is {self.jitter_ms:g} and burst_ms {self.burst_ms:g}; neither can be below 0."
+                f"emulate: jitter_ms is {self.jitter_ms:g} and burst_ms {self.burst_ms:g}; both must be at least 0."
             )
         if self.finger not in (None, 1, 2):
-            raise UsageError(f"emulate: finger is {self.finger}; the gripper has finger 1 and finger 2.")
+            raise UsageError(f"emulate: finger is {self.finger}; it must be 1 or 2.")
 
 
-def next_due_ns(taken_ns: Times, pace: FramePace, after_ns: int, rng: np.random.Generator) -> Times:
-    """Return when frames of samples taken at ``taken_ns`` (frame,) go out: none before ``after_ns``, and in order."""
-    late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(taken_ns))).astype(np.int64)
-    due = np.maximum(np.maximum.accumulate(taken_ns + late_ns), after_ns)
+def next_due_ns(sample_ns: Times, pace: FramePace, after_ns: int, rng: np.random.Generator) -> Times:
+    """Return the ascending due times (frame,) in ns of frames with samples at ``sample_ns``, not before ``after_ns``."""
+    late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(sample_ns))).astype(np.int64)
+    due = np.maximum(np.maximum.accumulate(sample_ns + late_ns), after_ns)
     burst_ns = round(pace.burst_ms * 1e6)
     burst_due_ns: Times = -(-due // burst_ns) * burst_ns if burst_ns else due
     return burst_due_ns
 
 
-AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
-IDLE_NS = 20_000_000  # period of checks of a stream without a receiver
-MAX_MESSAGES = 1000  # messages of the host that the ledger keeps
-PAUSE_NS = 2_000_000  # pause between two tries of a patient device
+AHEAD_NS = 1_500_000_000  # time by which frames are planned ahead
+IDLE_NS = 20_000_000  # additional delay of a stream without a receiver
+MAX_MESSAGES = 1000  # messages of hosts in the ledger
+RETRY_NS = 2_000_000  # pause between two attempts of a patient device
 
 
 class TransmissionPlan:
-    """The items of a stream, in order, a block of its source at a time: what goes out, when, and what was harmed."""
+    """The items of a stream in order, with due times and faults, in blocks of its source."""
 
     def __init__(self, source: Sampled, pace: FramePace, faults: Faults, seed: Sequence[int], *, packets: bool) -> None:
         self.source, self.pace = source, pace
         self._harm = Harm(faults, source.sensor, seed, packets=packets)
         self._rng = np.random.default_rng([*seed, 7])
         self._block = 0
-        self.until_ns = source.timing.start_ns  # time at which all earlier items are sent
+        self.planned_ns = source.timing.start_ns  # all planned items are due before this time
 
     def skip(self, t_ns: int) -> None:
-        """Begin with the block that holds the first sample after ``t_ns``."""
+        """Continue with the block that contains the first sample after ``t_ns``, if it is later."""
         self._block = max(self._block, self.source.timing.first_after(t_ns) // self.source.rows)
 
     def next_items(self) -> list[SentItem]:
         """Return the items of the next block."""
         source = self.source
         numbers = source.numbers(self._block)
-        frames = one_by_one(source.sensor, source.sensor.encode(source.block(self._block)))
-        due_ns = next_due_ns(source.timing.taken_ns(numbers), self.pace, self.until_ns, self._rng)
+        frames = split_frames(source.sensor, source.sensor.encode(source.block(self._block)))
+        due_ns = next_due_ns(source.timing.sample_ns(numbers), self.pace, self.planned_ns, self._rng)
         self._block += 1
-        self.until_ns = int(due_ns[-1]) + 1
+        self.planned_ns = int(due_ns[-1]) + 1
         return self._harm.apply(frames, due_ns.tolist(), int(numbers[0]))
 
 
 class Transmission:
-    """A stream that is served: its plan, its end of the link, its ledger. `fill` may come from another thread."""
+    """An emulated stream: its plan, its end of the link, and its ledger. `fill` may be called by another thread."""
 
     def __init__(
         self,
         endpoint: Endpoint,
         sensor: Sensor,
         ledger: Ledger,
-        planned: Callable[
-            [float, int], TransmissionPlan
-        ],  # returns due times, ns from the rig's start, of a rate and a start
+        make_plan: Callable[[float, int], TransmissionPlan],  # arguments: rate in Hz, start in ns since the rig's start
         rate_hz: float,
         epoch_ns: int,
         *,
-        patient: bool = False,  # bytes wait, and are not lost, where a host has no room
+        patient: bool = False,  # wait, instead of losing bytes, while a host's buffer is full
     ) -> None:
         self._patient = patient
-        self._late: deque[tuple[SentItem | None, bytes]] = (
+        self._unsent: deque[tuple[SentItem | None, bytes]] = (
             deque()
-        )  # items, or replies, and what of them is still to be sent
-        self._awaited: Peer | None = None  # the host that they are for
-        self._again_ns = 0
+        )  # items, or None for replies, and their unsent bytes
+        self._unsent_peer: Peer | None = None  # the host of the unsent items
+        self._retry_ns = 0
         self.endpoint, self.sensor, self.ledger = endpoint, sensor, ledger
-        self._planned, self._epoch_ns = planned, epoch_ns
+        self._make_plan, self._epoch_ns = make_plan, epoch_ns
         self._rate_hz = rate_hz
         self._lock = threading.Lock()
         self._items: deque[SentItem] = deque()
-        self._latest: SentItem | None = None  # the last frame that was due, for hosts that ask
+        self._latest: SentItem | None = None  # the last due frame, for hosts that request one
         self._on_request = bool(sensor.request())
-        self._begin(rate_hz, 0)
+        self._start_plan(rate_hz, 0)
 
-    def _begin(self, rate_hz: float, start_ns: int) -> None:
-        plan = self._planned(rate_hz, start_ns)
+    def _start_plan(self, rate_hz: float, start_ns: int) -> None:
+        plan = self._make_plan(rate_hz, start_ns)
         with self._lock:
             self._rate_hz, self._plan, self._latest = rate_hz, plan, None
             self._items.clear()
@@ -123,31 +121,31 @@ class Transmission:
         self.fill(start_ns)
 
     def fill(self, now_ns: int) -> None:
-        """Plan ahead of ``now_ns``, the time since the rig's start."""
+        """Plan frames ahead of ``now_ns``, the time since the rig's start."""
         with self._lock:
             self._plan.skip(now_ns - AHEAD_NS)
-            while self._plan.until_ns < now_ns + AHEAD_NS:
+            while self._plan.planned_ns < now_ns + AHEAD_NS:
                 self._items.extend(self._plan.next_items())
 
     @property
     def next_ns(self) -> int:
-        """When something is due, on the monotonic clock; a stream that nobody receives can wait."""
-        if self._late:
-            return self._again_ns
+        """The time at which the next item is due, on the monotonic clock. Without a receiver it is delayed."""
+        if self._unsent:
+            return self._retry_ns
         if not self._items:
-            return self._epoch_ns + self._plan.until_ns
+            return self._epoch_ns + self._plan.planned_ns
         due_ns = self._epoch_ns + self._items[0].due_ns
         return due_ns if self._on_request or self._receivers() else due_ns + IDLE_NS
 
     def run(self, now_ns: int) -> bool:
-        """Send what is due at ``now_ns`` on the monotonic clock; return whether the device was unplugged or came back."""
-        since_ns, items, due = now_ns - self._epoch_ns, self._items, list[SentItem]()
+        """Send the items due at ``now_ns`` on the monotonic clock. Returns whether the device was unplugged or replugged."""
+        elapsed_ns, items, due = now_ns - self._epoch_ns, self._items, list[SentItem]()
         plugged = False
-        if self._late:
-            self._push(now_ns)
-        if not items:  # the planning thread came too late
-            self.fill(since_ns)
-        while items and items[0].due_ns <= since_ns:
+        if self._unsent:
+            self._flush_unsent(now_ns)
+        if not items:  # the planning thread is late
+            self.fill(elapsed_ns)
+        while items and items[0].due_ns <= elapsed_ns:
             item = items.popleft()
             if item.number < 0 and item.cause in (UNPLUG, REPLUG):
                 self._send(due, now_ns)
@@ -158,13 +156,13 @@ class Transmission:
         self._send(due, now_ns)
         return plugged
 
-    def plug(self, back: bool, now_ns: int) -> None:
-        """Unplug the device, or bring it back."""
-        if back:
+    def plug(self, is_replugged: bool, now_ns: int) -> None:
+        """Unplug or replug the device."""
+        if is_replugged:
             self.endpoint.replug()
         else:
             self.endpoint.unplug()
-        self.ledger.enter(now_ns, REPLUG if back else UNPLUG)
+        self.ledger.add_event(now_ns, REPLUG if is_replugged else UNPLUG)
 
     def _receivers(self) -> list[Peer]:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
@@ -175,11 +173,11 @@ class Transmission:
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
         streaming = next((peer for peer in self._receivers() if peer.device.streaming), None)
         if self._patient and streaming is not None:
-            if streaming is not self._awaited:
-                self._late.clear()
-            self._awaited = streaming
-            self._late.extend((item, item.data) for item in items)
-            self._push(now_ns)
+            if streaming is not self._unsent_peer:
+                self._unsent.clear()
+            self._unsent_peer = streaming
+            self._unsent.extend((item, item.data) for item in items)
+            self._flush_unsent(now_ns)
             return
         sizes: list[int] | None = None
         fault = byte_faults.SOUND
@@ -191,7 +189,7 @@ class Transmission:
             if sizes is None:
                 sizes, fault = sent, peer.fault
         if sizes is not None:
-            self._enter(items[: len(sizes)], sizes, fault, now_ns)
+            self._add_to_ledger(items[: len(sizes)], sizes, fault, now_ns)
 
     def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
         post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
@@ -199,23 +197,23 @@ class Transmission:
         sent = iter(post(full) if full else [])
         return [next(sent) if piece else 0 for piece in pieces]
 
-    def _push(self, now_ns: int) -> None:
-        """Send what waits, in order, as far as the host has room for it; what waited for a host that left is forgotten."""
+    def _flush_unsent(self, now_ns: int) -> None:
+        """Send unsent items in order while the host accepts them. They are dropped if their host has disconnected."""
         peer = next(iter(self._receivers()), None)
-        if peer is None or peer is not self._awaited:
-            self._late.clear()
-        while self._late and peer is not None and not getattr(peer, "full", bool)():
-            item, remaining = self._late[0]
+        if peer is None or peer is not self._unsent_peer:
+            self._unsent.clear()
+        while self._unsent and peer is not None and not getattr(peer, "full", bool)():
+            item, remaining = self._unsent[0]
             remaining = remaining[self._post(peer, [remaining])[0] :]
             if remaining:
-                self._late[0] = (item, remaining)
+                self._unsent[0] = (item, remaining)
                 break
-            self._late.popleft()
+            self._unsent.popleft()
             if item is not None:
-                self._enter([item], [len(item.data)], peer.fault, now_ns)
-        self._again_ns = now_ns + PAUSE_NS
+                self._add_to_ledger([item], [len(item.data)], peer.fault, now_ns)
+        self._retry_ns = now_ns + RETRY_NS
 
-    def _enter(self, items: Iterable[SentItem], sizes: Sequence[int], fault: str, now_ns: int) -> None:
+    def _add_to_ledger(self, items: Iterable[SentItem], sizes: Sequence[int], fault: str, now_ns: int) -> None:
         for item, size in zip(items, sizes, strict=True):
             cause = item.cause
             if size < len(item.data):
@@ -224,33 +222,33 @@ class Transmission:
                 cause = fault
             self.ledger.add(item, self._epoch_ns + item.due_ns, now_ns, size, cause)
 
-    def heard(self, peer: Peer, data: bytes, now_ns: int) -> None:
-        """Have the device take what a host wrote: replies go first, then the frames that were asked for."""
+    def receive(self, peer: Peer, data: bytes, now_ns: int) -> None:
+        """Pass bytes from a host to the device, and send its replies, followed by requested frames."""
         if not data:
-            self.ledger.enter(now_ns, "connected")
+            self.ledger.add_event(now_ns, "connected")
         elif len(self.ledger.events) < MAX_MESSAGES:
-            self.ledger.enter(now_ns, "heard", data.hex())
+            self.ledger.add_event(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
-        if replies and self._late and peer is self._awaited:  # after the frame that is half sent
+        if replies and self._unsent and peer is self._unsent_peer:  # after the partly sent frame
             for reply in reversed(replies):
-                self._late.insert(1, (None, reply))
+                self._unsent.insert(1, (None, reply))
         elif replies:
             peer.send(replies)
         rate_hz = peer.device.rate_hz
         if rate_hz and rate_hz != self._rate_hz:
-            self.ledger.enter(now_ns, "rate", f"{rate_hz:g}")
-            self._begin(rate_hz, now_ns - self._epoch_ns)
+            self.ledger.add_event(now_ns, "rate", f"{rate_hz:g}")
+            self._start_plan(rate_hz, now_ns - self._epoch_ns)
         requested = peer.device.polled()
         if requested:
             peer.pending_frames += requested
-            self._hand_over(peer, now_ns)
+            self._send_requested(peer, now_ns)
 
-    def _hand_over(self, peer: Peer, now_ns: int) -> None:
-        """Send the latest frame to a host that asked; more that it asked for follow as they become due."""
-        before, peer.pending_frames = peer.pending_frames, 0
-        self.run(now_ns)  # frames that are due are those of others
-        peer.pending_frames = before
-        if self._latest is not None and peer in self.endpoint.peers:  # it may have been unplugged just now
+    def _send_requested(self, peer: Peer, now_ns: int) -> None:
+        """Send the latest frame to a host that requested it. Further requested frames are sent when they are due."""
+        pending, peer.pending_frames = peer.pending_frames, 0
+        self.run(now_ns)  # due frames are for other hosts
+        peer.pending_frames = pending
+        if self._latest is not None and peer in self.endpoint.peers:  # the device may have been unplugged in `run`
             sizes = self._post(peer, [self._latest.data])
             peer.pending_frames -= 1
-            self._enter([self._latest], sizes, peer.fault, now_ns)
+            self._add_to_ledger([self._latest], sizes, peer.fault, now_ns)

@@ -1,10 +1,10 @@
-"""Simulate the world of the emulated rig without an end: pick-and-move trials, one after another.
+"""Simulate the endless world of the emulated rig: a sequence of pick-and-move trials.
 
-A cycle is a trial of `tacpipe.simulation.pick_and_move` and the way back: the fingers open, the hand returns to where it
-began. So nothing jumps, and the skins stay the same throughout. Cycles are made when they are asked for, and a few are kept.
+A cycle is a trial of `tacpipe.simulation.pick_and_move` followed by a return: the fingers open, and the hand moves back to
+its start. Nothing jumps, and the skins do not change. Cycles are generated on demand, and a few are cached.
 
 The joints follow the hand by damped least squares from the arm's ready position (Siciliano et al., Robotics, 2009, section
-3.7), all moments of a path side by side. Where the path leaves what the arm reaches, the hand comes as near as it can.
+3.7), for all times of a path at once. Outside of the arm's workspace, the hand gets as close to the path as possible.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.signals import kinematics
 from tacpipe.simulation import mechanics, pick_and_move, trajectory
 
-READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # start pose of the robot's own examples
+READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # start pose in the robot's examples
 MIN_JOINT_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # Franka Emika, Panda documentation
 MAX_JOINT_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
 HAND_M = 0.107 + 0.1034  # distance of the fingertips from the last joint's frame, along its axis
 HAND_RAD = -np.pi / 4  # angle between the hand and the flange
-WAYPOINT_ROWS = 10  # rows of 1 ms between solved angles; interpolation moves the hand by less than 0.1 mm
-ROUNDS, DAMPING = 40, 1e-3
+WAYPOINT_ROWS = 10  # rows of 1 ms between solutions; the interpolation error of the hand is below 0.1 mm
+ITERATIONS, DAMPING = 40, 1e-3
 
 
 @dataclass(frozen=True)
@@ -37,95 +37,95 @@ class JointCourse:
     angle_rad: Floats
 
     def angles(self, t_ns: Times) -> Floats:
-        """Return the angles at ``t_ns`` (time, joint), rad."""
-        return _interpolated(t_ns, self.t_ns, self.angle_rad)
+        """Return the angles at ``t_ns`` (time, joint) in rad."""
+        return _interpolate(t_ns, self.t_ns, self.angle_rad)
 
     def speeds(self, t_ns: Times) -> Floats:
-        """Return the speeds at ``t_ns`` (time, joint), rad/s."""
+        """Return the speeds at ``t_ns`` (time, joint) in rad/s."""
         speed: Floats = np.gradient(self.angle_rad, self.t_ns / 1e9, axis=0)
-        return _interpolated(t_ns, self.t_ns, speed)
+        return _interpolate(t_ns, self.t_ns, speed)
 
 
 def joint_course(t_ns: Times, position_m: Floats, yaw_rad: Floats) -> JointCourse:
-    """Return the course of the joints that has the hand at ``position_m`` (time, axis), pointing down, turned by the yaw."""
+    """Return the joint angles over time for a downward hand at ``position_m`` (time, axis) with ``yaw_rad`` (time,)."""
     rows = np.unique(np.append(np.arange(0, len(t_ns), WAYPOINT_ROWS), len(t_ns) - 1))
-    return JointCourse(t_ns[rows], solved(position_m[rows], yaw_rad[rows]))
+    return JointCourse(t_ns[rows], solve_angles(position_m[rows], yaw_rad[rows]))
 
 
-def solved(position_m: Floats, yaw_rad: Floats) -> Floats:
-    """Return the angles (time, joint) that bring the hand to ``position_m`` (time, axis) with ``yaw_rad`` (time,)."""
+def solve_angles(position_m: Floats, yaw_rad: Floats) -> Floats:
+    """Return the joint angles (time, joint) in rad for the hand at ``position_m`` (time, axis) with ``yaw_rad`` (time,)."""
     target = _downwards(yaw_rad)
     angle = np.tile(READY_RAD, (len(position_m), 1))
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         frames = kinematics.joint_frames(kinematics.PANDA, angle)
-        place, turn = hand_pose(frames)
-        off = np.concatenate([position_m - place, _rotation_between(turn, target)], axis=1)  # (time, 6)
-        axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]
-        linear = np.cross(axes, place[:, None] - places)
+        position, rotation = hand_pose(frames)
+        error = np.concatenate([position_m - position, _rotation_between(rotation, target)], axis=1)  # (time, 6)
+        axes, origins = frames[:, :, :3, 2], frames[:, :, :3, 3]
+        linear = np.cross(axes, position[:, None] - origins)
         jacobian = np.concatenate([linear, axes], axis=2).transpose(0, 2, 1)  # (time, 6, joint)
         square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING * np.eye(6)
-        step = np.einsum("tij,ti->tj", jacobian, np.linalg.solve(square, off[:, :, None])[:, :, 0])
+        step = np.einsum("tij,ti->tj", jacobian, np.linalg.solve(square, error[:, :, None])[:, :, 0])
         angle = np.clip(angle + np.clip(step, -0.2, 0.2), MIN_JOINT_RAD, MAX_JOINT_RAD)
     return angle
 
 
 def joint_torques(angle_rad: Floats, force_n: Floats) -> Floats:
-    """Return what the joints bear (time, joint), N m, for a force (time, axis) at the hand in the base's frame."""
+    """Return the joint torques (time, joint) in N m for a force (time, axis) at the hand in the base frame."""
     frames = kinematics.joint_frames(kinematics.PANDA, angle_rad)
     linear = np.cross(frames[:, :, :3, 2], hand_pose(frames)[0][:, None] - frames[:, :, :3, 3])
-    borne: Floats = -np.einsum("tja,ta->tj", linear, force_n)
-    return borne
+    torques: Floats = -np.einsum("tja,ta->tj", linear, force_n)
+    return torques
 
 
 def hand_pose(frames: AnyFloats) -> tuple[Floats, Floats]:
-    """Return place (time, axis) and rotation (time, 3, 3) of the hand, of what `kinematics.joint_frames` gives."""
+    """Return position (time, axis) and rotation (time, 3, 3) of the hand, from the result of `kinematics.joint_frames`."""
     last = frames[:, -1]
     cos, sin = np.cos(HAND_RAD), np.sin(HAND_RAD)
-    place: Floats = last[:, :3, 3] + HAND_M * last[:, :3, 2]
-    turn: Floats = last[:, :3, :3] @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return place, turn
+    position: Floats = last[:, :3, 3] + HAND_M * last[:, :3, 2]
+    rotation: Floats = last[:, :3, :3] @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return position, rotation
 
 
 def _downwards(yaw_rad: Floats) -> Floats:
-    """Return the rotations (time, 3, 3) of a hand that points down: half a turn about an axis of half the yaw."""
-    turn = np.zeros((len(yaw_rad), 3, 3))
+    """Return the rotations (time, 3, 3) of a downward hand: a half-turn around an axis at half the yaw angle."""
+    rotation = np.zeros((len(yaw_rad), 3, 3))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    turn[:, 0, 0], turn[:, 0, 1] = cos, sin
-    turn[:, 1, 0], turn[:, 1, 1] = sin, -cos
-    turn[:, 2, 2] = -1.0
-    return turn
+    rotation[:, 0, 0], rotation[:, 0, 1] = cos, sin
+    rotation[:, 1, 0], rotation[:, 1, 1] = sin, -cos
+    rotation[:, 2, 2] = -1.0
+    return rotation
 
 
-def _rotation_between(turn: Floats, target: Floats) -> Floats:
-    """Return for small angles the vector (time, 3) that turns ``turn`` into ``target``."""
-    vector: Floats = 0.5 * np.cross(turn, target, axis=1).sum(axis=2)
+def _rotation_between(rotation: Floats, target: Floats) -> Floats:
+    """Return the rotation vector (time, 3) from ``rotation`` to ``target``, for small angles."""
+    vector: Floats = 0.5 * np.cross(rotation, target, axis=1).sum(axis=2)
     return vector
 
 
-def _interpolated(t_ns: Times, known_ns: Times, values: Floats) -> Floats:
-    return np.column_stack([np.interp(t_ns, known_ns, column) for column in values.T])
+def _interpolate(t_ns: Times, waypoint_ns: Times, values: Floats) -> Floats:
+    return np.column_stack([np.interp(t_ns, waypoint_ns, column) for column in values.T])
 
 
 TRIAL_S, RETURN_S = 10.5, 1.5  # duration of a cycle
-RELEASE_S = 0.3  # time in which the fingers open, at the start of the way back
+RELEASE_S = 0.3  # duration of the opening of the fingers, at the start of the return
 CYCLE_NS = round((TRIAL_S + RETURN_S) * 1e9)
 BASE_M = (
     0.12,
     0.0,
     0.0,
-)  # the arm stands this much nearer than the published rig's, so that it reaches all positions of hands
-CYCLES = 4  # number of cycles that are kept: streams run ahead of each other by less
+)  # offset of the arm's base from that of the published rig, so that all hand positions are within reach
+CYCLES = 4  # number of cached cycles; streams are never further apart
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """A trial with its way back, and the angles of the arm's joints meanwhile."""
+    """A trial with its return, and the angles of the arm's joints."""
 
     scene: pick_and_move.PickScene
     joints: JointCourse
 
     def torques(self, t_ns: Times) -> Floats:
-        """Return what the load in the hand asks of the joints (time, joint), N m."""
+        """Return the joint torques (time, joint) in N m for the load in the hand."""
         load_n = -pick_and_move.interpolation(self.scene, t_ns)(self.scene.contact.force_n)
         yaw_rad = pick_and_move.interpolation(self.scene, t_ns)(self.scene.path.yaw_rad)
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -136,7 +136,7 @@ class Cycle:
 
 
 class World:
-    """One physical simulation, which all sensors of a rig look at; times are nanoseconds from its start."""
+    """One physical simulation for all sensors of a rig. Times are in ns since its start."""
 
     def __init__(self, seed: int = 0, rig: pick_and_move.PickRig | None = None) -> None:
         self._seed = seed
@@ -145,7 +145,7 @@ class World:
         self.skins = pick_and_move.perform(seed, 0, self._rig).skins
 
     def cycle(self, number: int) -> Cycle:
-        """Return cycle ``number``; the same seed gives the same one, whenever it is asked for."""
+        """Return cycle ``number``, which depends only on the seed."""
         return self._cycle(number)
 
     def _generate(self, number: int) -> Cycle:
@@ -155,49 +155,49 @@ class World:
             full_scene, joint_course(full_scene.path.t_ns, full_scene.path.position_m, full_scene.path.yaw_rad)
         )
 
-    def at(self, t_ns: Times, look: Callable[[Cycle, Times], Floats]) -> Floats:
-        """Return what ``look`` finds of each cycle at times within it, for ``t_ns`` (time,) in order: (time, …)."""
+    def at(self, t_ns: Times, value: Callable[[Cycle, Times], Floats]) -> Floats:
+        """Return values (time, …) at ascending ``t_ns`` (time,). ``value`` computes them from a cycle and its times."""
         numbers = t_ns // CYCLE_NS
         parts = [
-            look(self.cycle(int(number)), t_ns[numbers == number] - number * CYCLE_NS) for number in np.unique(numbers)
+            value(self.cycle(int(number)), t_ns[numbers == number] - number * CYCLE_NS) for number in np.unique(numbers)
         ]
         return np.concatenate(parts)
 
     def contact(self, t_ns: Times, value: Callable[[pick_and_move.PickScene], Any]) -> Floats:
-        """Return at ``t_ns`` (time,) a value of the scene that is given at 1 kHz: (time,) or (time, axis)."""
+        """Return a value of the scene, (time,) or (time, axis) at 1 kHz, interpolated at ``t_ns`` (time,)."""
         return self.at(
             t_ns, lambda cycle, local_ns: pick_and_move.interpolation(cycle.scene, local_ns)(value(cycle.scene))
         )
 
     def touch(self, finger: int, t_ns: Times) -> Floats:
-        """Return the force on each taxel of finger 0 or 1 (time, taxel, axis), N."""
+        """Return the force on each taxel of finger 0 or 1 (time, taxel, axis) in N."""
         return self.at(t_ns, lambda cycle, local_ns: pick_and_move.touch(cycle.scene, finger, local_ns))
 
     def arm(self, t_ns: Times) -> Floats:
-        """Return finger width, position and quaternion (time, 8), as the simulated rig's stream ``robot``."""
+        """Return finger width, position and quaternion (time, 8), like the simulated rig's stream ``robot``."""
         return self.at(t_ns, lambda cycle, local_ns: pick_and_move.arm(cycle.scene, local_ns))
 
     def joint_angles(self, t_ns: Times) -> Floats:
-        """Return the angles of the arm's seven joints (time, joint), rad."""
+        """Return the angles of the arm's seven joints (time, joint) in rad."""
         return self.at(t_ns, lambda cycle, local_ns: cycle.joints.angles(local_ns))
 
     def joint_speeds(self, t_ns: Times) -> Floats:
-        """Return the speeds of the arm's seven joints (time, joint), rad/s."""
+        """Return the speeds of the arm's seven joints (time, joint) in rad/s."""
         return self.at(t_ns, lambda cycle, local_ns: cycle.joints.speeds(local_ns))
 
     def joint_torques(self, t_ns: Times) -> Floats:
-        """Return what the load in the hand asks of the arm's seven joints (time, joint), N m."""
+        """Return the torques of the arm's seven joints (time, joint) in N m for the load in the hand."""
         return self.at(t_ns, lambda cycle, local_ns: cycle.torques(local_ns))
 
 
 def with_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
-    """Return a scene that is longer by the way back: its last row is as its first."""
+    """Return a scene with the return appended. Its last row equals its first."""
     rows = round(RETURN_S * trajectory.RATE_HZ)
-    since_s = np.arange(1, rows + 1) / trajectory.RATE_HZ
-    grip = 1 - trajectory.minimum_jerk(np.clip(since_s / RELEASE_S, 0.0, 1.0))  # (time,), of the grip
-    away = 1 - trajectory.minimum_jerk(np.clip((since_s - RELEASE_S) / (RETURN_S - RELEASE_S), 0.0, 1.0))
+    elapsed_s = np.arange(1, rows + 1) / trajectory.RATE_HZ
+    grip = 1 - trajectory.minimum_jerk(np.clip(elapsed_s / RELEASE_S, 0.0, 1.0))  # (time,), fraction of the grip
+    away = 1 - trajectory.minimum_jerk(np.clip((elapsed_s - RELEASE_S) / (RETURN_S - RELEASE_S), 0.0, 1.0))
 
-    def fading(values: Floats, fraction: Floats, resting: Any = 0.0) -> Floats:
+    def fade(values: Floats, fraction: Floats, resting: Any = 0.0) -> Floats:
         last = values[-1] - resting
         faded: Floats = np.concatenate([values, resting + np.multiply.outer(fraction, last)])
         return faded
@@ -209,19 +209,19 @@ def with_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
         scene,
         path=trajectory.Trajectory(
             np.concatenate([path.t_ns, path.t_ns[-1] + step_ns * np.arange(1, rows + 1)]),
-            fading(path.position_m, away, path.position_m[0]) - BASE_M,
-            fading(path.yaw_rad, away, path.yaw_rad[0]),
+            fade(path.position_m, away, path.position_m[0]) - BASE_M,
+            fade(path.yaw_rad, away, path.yaw_rad[0]),
         ),
-        finger_m=fading(scene.finger_m, grip, scene.finger_m[0]),
-        grasp=replace(grasp, grip_n=fading(grasp.grip_n, grip)),
+        finger_m=fade(scene.finger_m, grip, scene.finger_m[0]),
+        grasp=replace(grasp, grip_n=fade(grasp.grip_n, grip)),
         contact=mechanics.Contact(
-            fading(contact.force_n, grip),
-            fading(contact.normal_n, grip),
-            fading(contact.displacement_m, away),
-            fading(contact.velocity_m_s, np.zeros(rows)),
+            fade(contact.force_n, grip),
+            fade(contact.normal_n, grip),
+            fade(contact.displacement_m, away),
+            fade(contact.velocity_m_s, np.zeros(rows)),
             np.concatenate([contact.slip, no_slip]),
             np.concatenate([contact.dropped, no_slip]),
-            fading(contact.torque_nm, grip),
-            fading(contact.rotation_rad, away),
+            fade(contact.torque_nm, grip),
+            fade(contact.rotation_rad, away),
         ),
     )

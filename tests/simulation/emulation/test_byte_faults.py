@@ -17,7 +17,15 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
 from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, Happening, SentItem, of_run, one_by_one, parse
+from tacpipe.simulation.emulation.byte_faults import (
+    ClockSteps,
+    Faults,
+    RandomEvents,
+    SentItem,
+    frames_of_run,
+    parse,
+    split_frames,
+)
 from tacpipe.simulation.emulation.source import SampleSource, Timing
 from tacpipe.simulation.emulation.transmission import FramePace, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
@@ -36,7 +44,7 @@ def planned(
     frames: dict[int, bytes] = {}
     for block in range(round(SECONDS * sensor.rate_hz / source.rows)):
         items += plan.next_items()
-        sound_frames = one_by_one(sensor, sensor.encode(source.block(block)))
+        sound_frames = split_frames(sensor, sensor.encode(source.block(block)))
         frames |= dict(zip(source.numbers(block).tolist(), sound_frames, strict=True))
     return items, frames
 
@@ -45,8 +53,8 @@ def framed(sensor: Sensor, items: list[SentItem]) -> list[bytes]:
     """Return the frames that the sensor's framer finds in the sent bytes."""
     framer = sensor.framer()
     chunks = [(item.due_ns, item.data) for item in items if item.data]
-    runs, _ = framer.feed(Chunks.of(chunks))
-    return [frame for run in runs + framer.flush()[0] for frame in of_run(run)]
+    runs, _ = framer.feed(Chunks.from_pairs(chunks))
+    return [frame for run in runs + framer.flush()[0] for frame in frames_of_run(run)]
 
 
 def of_cause(items: list[SentItem], cause: str) -> list[SentItem]:
@@ -124,9 +132,9 @@ def test_two_bits_that_cancel_out_in_a_sum_are_invisible() -> None:
     rows = list(frames.values())[:40]
     changed = bytearray(rows[20])
     changed[2], changed[4] = (changed[2] + 1) % 256, (changed[4] - 1) % 256
-    assert byte_faults.passes(TfMini(), rows, 20, bytes(changed))
+    assert byte_faults.is_undetectable(TfMini(), rows, 20, bytes(changed))
     changed[4] = (changed[4] + 2) % 256
-    assert not byte_faults.passes(TfMini(), rows, 20, bytes(changed))
+    assert not byte_faults.is_undetectable(TfMini(), rows, 20, bytes(changed))
 
 
 def test_dropped_frames_leave_gaps_in_the_counter() -> None:
@@ -190,9 +198,9 @@ def test_a_clock_that_is_set_shows_it_from_then_on() -> None:
 
 @given(rate=st.floats(0.1, 50), cuts=st.lists(st.integers(0, 10_000_000_000), max_size=8))
 def test_moments_are_the_same_however_they_are_asked_for(rate: float, cuts: list[int]) -> None:
-    expected = Happening(rate, np.random.default_rng(1)).until(10_000_000_000)
-    parts = Happening(rate, np.random.default_rng(1))
-    moments = [moment for cut in [*sorted(cuts), 10_000_000_000] for moment in parts.until(cut)]
+    expected = RandomEvents(rate, np.random.default_rng(1)).pop_until(10_000_000_000)
+    parts = RandomEvents(rate, np.random.default_rng(1))
+    moments = [moment for cut in [*sorted(cuts), 10_000_000_000] for moment in parts.pop_until(cut)]
     assert moments == expected
 
 
@@ -217,8 +225,8 @@ def test_faults_are_read_from_a_command_line() -> None:
     [
         ("nois=1", "there is no fault nois"),
         ("noise", "'noise' is not a fault"),
-        ("drop=2", "0 to 1"),
-        ("flip=-1", "below 0"),
+        ("drop=2", "between 0 and 1"),
+        ("flip=-1", "at least 0"),
     ],
 )
 def test_what_is_no_fault_is_refused(text: str, message: str) -> None:

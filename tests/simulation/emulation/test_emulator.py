@@ -25,7 +25,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.ledger import Ledger, joined
+from tacpipe.simulation.emulation.ledger import Ledger, concatenate
 from tests.simulation.emulation.rigs import ALL_SENSORS, FIRST_PAPER, PATIENCE_S, awaited, in_order, one_stream_rig
 
 pytestmark = pytest.mark.rig
@@ -49,7 +49,7 @@ class Reader:
         for _, chunk in chunks:
             if answer := self.sensor.answer(chunk):
                 self.link.write(answer)
-        runs, losses = self.framer.feed(Chunks.of(chunks))
+        runs, losses = self.framer.feed(Chunks.from_pairs(chunks))
         self.runs, self.losses = self.runs + runs, self.losses + losses
 
     def read(self, frames: int = FRAMES) -> Samples:
@@ -60,7 +60,9 @@ class Reader:
             if self.sensor.request():
                 self.link.write(self.sensor.request())
             self.take(self.link.read(0.2))
-        return joined([self.sensor.decode(run.frames) for run in self.runs], [len(run.frames) for run in self.runs])
+        return concatenate(
+            [self.sensor.decode(run.frames) for run in self.runs], [len(run.frames) for run in self.runs]
+        )
 
 
 @contextmanager
@@ -225,7 +227,7 @@ def test_a_host_at_another_speed_reads_garbage() -> None:
 
     with (
         Emulator(one_stream_rig("optoforce")) as emulator,
-        serial.Serial(emulator.rig.streams["load"].address.place, 1_000_000) as port,
+        serial.Serial(emulator.rig.streams["load"].address.target, 1_000_000) as port,
     ):
         port.write(next(emulator.rig.streams["load"].sensor.opening({})).send)
         awaited(lambda: port.in_waiting > 220)
@@ -241,7 +243,7 @@ def test_what_a_host_does_not_fetch_is_lost_and_told() -> None:
 
     with Emulator(one_stream_rig("optoforce")) as emulator:
         ledger = emulator.ledger["load"]
-        with serial.Serial(emulator.rig.streams["load"].address.place, 1_000_000) as port:
+        with serial.Serial(emulator.rig.streams["load"].address.target, 1_000_000) as port:
             port.write(next(emulator.rig.streams["load"].sensor.opening({})).send)
             awaited(lambda: ledger.counts.get("overrun", 0) > 50)
             received = port.read(port.in_waiting)

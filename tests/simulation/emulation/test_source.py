@@ -46,7 +46,7 @@ def test_the_same_seed_gives_the_same_values_in_whatever_order_blocks_are_asked_
 def test_a_uskin_tells_the_force_of_the_contact() -> None:
     source = SampleSource(Xela(rate_hz=50), WORLD, Timing(50), finger=1)
     counts = values(source, 20)[0].astype(float)
-    t_ns = source.timing.taken_ns(np.arange(len(counts)))
+    t_ns = source.timing.sample_ns(np.arange(len(counts)))
     pressed_n = taxels.forces(WORLD.skins[1], counts)[:, :, 2].sum(axis=1)
     true_n = WORLD.contact(t_ns, lambda scene: scene.contact.normal_n[:, 1])
     touching = true_n > 1
@@ -57,7 +57,7 @@ def test_a_uskin_tells_the_force_of_the_contact() -> None:
 
 def test_the_drift_of_a_uskin_goes_on_from_block_to_block() -> None:
     source = SampleSource(Xela(rate_hz=50), WORLD, Timing(50))
-    ends = [source._drifted(n)[[0, -1]] for n in range(40)]
+    ends = [source._drift_of_block(n)[[0, -1]] for n in range(40)]
     steps = np.array([after[0] - before[1] for before, after in itertools.pairwise(ends)])
     block_drifts = np.array([end[1] - end[0] for end in ends])
     assert np.abs(steps).std() < np.abs(block_drifts).std()  # one step of 20 ms against those of half a second
@@ -76,7 +76,7 @@ def test_distance_grows_by_what_the_object_slips() -> None:
     world = World(0, pick_and_move.PickRig(effort=1.15))
     source = SampleSource(TfMini(unit="mm"), world, Timing(100))
     distance_mm = values(source, 20)[0][:, 0].astype(float)
-    t_ns = source.timing.taken_ns(np.arange(len(distance_mm)))
+    t_ns = source.timing.sample_ns(np.arange(len(distance_mm)))
     down_m = -world.contact(t_ns, lambda scene: scene.contact.displacement_m[:, 1])
     assert np.ptp(down_m) > 0.001
     assert np.abs(distance_mm - 120 - 1000 * down_m).max() < 6  # noise of 1 mm
@@ -131,8 +131,8 @@ def test_a_fast_clock_takes_samples_faster_and_shows_their_nominal_spacing() -> 
     stamps = source.block(1).t_device_ns
     assert stamps is not None
     assert set(np.diff(stamps).tolist()) <= {9_999_999, 10_000_000, 10_000_001}
-    assert np.diff(timing.taken_ns(np.arange(1001)))[:1000].sum() == pytest.approx(1e10 / 1.001, abs=2)
-    assert timing.first_after(int(timing.taken_ns(np.array([500]))[0]) + 1000) == 501
+    assert np.diff(timing.sample_ns(np.arange(1001)))[:1000].sum() == pytest.approx(1e10 / 1.001, abs=2)
+    assert timing.first_after(int(timing.sample_ns(np.array([500]))[0]) + 1000) == 501
 
 
 @pytest.mark.parametrize("name", sorted(ALL_SENSORS.streams))
@@ -147,7 +147,7 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
         samples = CameraSource(sensor, WORLD, Timing(sensor.rate_hz), (0,), 0, "").block(8)
     else:
         samples = SampleSource(sensor, WORLD, Timing(sensor.rate_hz), (0,)).block(8)
-    decoded_samples = ledger.decoded(sensor, sensor.encode(samples))
+    decoded_samples = ledger.decode_frames(sensor, sensor.encode(samples))
     assert len(decoded_samples) == len(samples)
     for sent, read in zip(samples.values, decoded_samples.values, strict=True):
         if sent.dtype.kind == "f":  # The wire carries float32 values, or four digits.

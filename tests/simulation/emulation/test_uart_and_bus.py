@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.simulation.emulation.can import EXTENDED, frame_of, joined, line, split
-from tacpipe.simulation.emulation.endpoint import stretched
+from tacpipe.simulation.emulation.can import EXTENDED, frame_of, line, pack, split
+from tacpipe.simulation.emulation.endpoint import sent_sizes
 from tacpipe.simulation.emulation.serial_port import garbled
 
 
@@ -34,7 +34,7 @@ def test_a_speed_that_is_off_by_three_percent_is_near_enough(off: float) -> None
 )
 def test_can_frames_go_through_13_bytes_and_text(short: list[tuple[int, bytes]], long: list[tuple[int, bytes]]) -> None:
     frames = [*short, *((identifier | EXTENDED, data) for identifier, data in long)]
-    piece = b"".join(joined(*frame) for frame in frames)
+    piece = b"".join(pack(*frame) for frame in frames)
     assert split(piece) == frames
     lines = b"".join(line(*frame) for frame in frames).split(b"\r")[:-1]
     assert b"".join(frame_of(text) for text in lines) == piece
@@ -66,7 +66,7 @@ def test_other_commands_send_nothing(text: bytes) -> None:
 
 @given(st.lists(st.integers(0, 50), max_size=8), st.integers(0, 400))
 def test_what_is_taken_is_shared_out_in_order(sizes: list[int], available: int) -> None:
-    parts = stretched(sizes, available)
+    parts = sent_sizes(sizes, available)
     assert sum(parts) == min(available, sum(sizes))
     incomplete = [part < size for part, size in zip(parts, sizes, strict=True) if size]
     assert incomplete == sorted(incomplete)

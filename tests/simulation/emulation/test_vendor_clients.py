@@ -29,7 +29,7 @@ FRAMES = 20
 def read(requested_rig: Rig, client: Callable[[str], list[Any]]) -> tuple[AnyArray, Samples]:
     """Return the readings of a client on the emulated port (frame, …), and the samples that were sent."""
     with Emulator(requested_rig) as emulator:
-        readings = client(emulator.rig.streams["load"].address.place)
+        readings = client(emulator.rig.streams["load"].address.target)
     return np.array(readings), emulator.ledger["load"].samples()
 
 

@@ -48,4 +48,4 @@ def test_a_client_that_is_gone_already_ends_no_emulation(pieces: list[bytes]) ->
         peer.socket, peer.protocol = connection, Protocol(pieces)
         served: Any = object.__new__(network.Websocket)
 
-        assert served.understood(peer, b"") == []
+        assert served.from_wire(peer, b"") == []

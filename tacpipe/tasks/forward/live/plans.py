@@ -72,7 +72,7 @@ def _guarded(place: str, sender: str) -> str:
     place, _, option = place.partition("?")
     if option and sender:
         raise UsageError(f"--plan-from {excerpt(sender)}: leave ?{plain(option)} of --plan out.")
-    host, port = network.format_place("udp", place)
+    host, port = network.parse_host_port("udp", place)
     host = host or LOCAL
     if sender:
         option = f"sender={sender}"

@@ -19,7 +19,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.engine import Engine
 from tacpipe.printable import excerpt
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.grasps import GraspRequests, parsed
+from tacpipe.sensors.grasps import GraspRequests, parse_request
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.touch.live.messages import TouchDescription, TouchMessage
 from tacpipe.tasks.touch.predictor import PredictedReading, Predictor
@@ -219,7 +219,7 @@ class TouchEngine(Engine):
         if not self._waiting or self._offset_ns is None:
             return []
         t_ns, stream, text = self._waiting.popleft()
-        return [self._answered(t_ns + self._offset_ns, stream, parsed(text))]
+        return [self._answered(t_ns + self._offset_ns, stream, parse_request(text))]
 
     def _answered(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
         began_s = time.perf_counter()
