@@ -109,7 +109,7 @@ def _measure(seconds: int, rounds: int) -> list[timing.Line]:
     def linear_with_masks() -> None:
         for stream in inputs.values():
             resampling.linear(stream.t_ns, stream.values, grid_ns)
-            resampling.nearest(stream.t_ns, repairs.held(stream.values), grid_ns)
+            resampling.nearest(stream.t_ns, repairs.repeated_rows(stream.values), grid_ns)
             resampling.in_gap(stream.t_ns, grid_ns, GAP_NS)
             resampling.nearest_distance_ns(stream.t_ns, grid_ns)
 

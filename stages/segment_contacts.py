@@ -87,11 +87,11 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.io.parquet import with_metadata
     from tacpipe.signals.contact import (
         Thresholds,
-        at_rest,
         contact_intervals,
         load_in_blocks,
+        measure_rest,
         noise_thresholds,
-        tared,
+        tare_level,
     )
 
     columns = recording.columns()
@@ -112,14 +112,14 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
                 yield np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
 
         axes = axes_of(schema, names)
-        level, rows = at_rest(params.rest, blocks, t_ns, params.rest_s)
+        level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
         load, repeated = load_in_blocks(blocks, level, axes)
         loads.append(load)
         if stream in fixed:
             limits.append(Thresholds(params.on_count, params.off_count))
         else:
             limits.append(_with_given_levels(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
-        zero = tared(params.tare, next(blocks()), level, axes)
+        zero = tare_level(params.tare, next(blocks()), level, axes)
         rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
     stacked = np.array(loads)  # (sensor, time)
     loads.clear()
@@ -161,10 +161,10 @@ def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Co
 
 def _with_given_levels(params: Params, thresholds: Thresholds) -> Thresholds:
     """Return the thresholds of a stream in another unit than counts: those of the params, else ``thresholds``."""
-    from tacpipe.signals.contact import ENDS
+    from tacpipe.signals.contact import OFF_FRACTION
 
     on = thresholds.on if params.on_level is None else params.on_level
-    return thresholds._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
+    return thresholds._replace(on=on, off=OFF_FRACTION * on if params.off_level is None else params.off_level)
 
 
 def _threshold_attributes(

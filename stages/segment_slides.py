@@ -135,15 +135,15 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
         if profile:
             least_m_s = params.moving_fraction * params.speed_m_s
             slide = slide_signals.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
-        first, stop = slide_signals.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
+        first, stop = slide_signals.crop_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     protocol = slide_signals.Protocol(
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    described = slide_signals.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
-    departures = slide_signals.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
+    described = slide_signals.slide_statistics(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    departures = slide_signals.protocol_deviations(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
     attributes = {**described, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
     attributes |= {"outside_protocol": bool(departures)} | (
         {"outside_protocol_why": "; ".join(departures)} if departures else {}
@@ -163,7 +163,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     from tacpipe.channels.streams import finger, without_spikes
     from tacpipe.io.columns import release
     from tacpipe.signals import slides as slide_signals
-    from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load_in_blocks, noise_thresholds
+    from tacpipe.signals.contact import OFF_FRACTION, Thresholds, load_in_blocks, measure_rest, noise_thresholds
 
     stream = finger(name, streams)
     t_ns, names = stream.column("t_ns").to_numpy(), of_quantity(stream, "tactile")
@@ -176,18 +176,18 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
             measured &= ~np.isnan(values).any(axis=0)
             yield values
 
-    level, rows = at_rest(params.rest, blocks, t_ns, params.rest_s)
+    level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
     loaded, repeated = load_in_blocks(blocks, level, axes_of(stream.schema, names))
     if params.load_trigger is None:
         limits = noise_thresholds(repeated, loaded, t_ns, params.rest_s, rows)
     else:
-        limits = Thresholds(params.load_trigger, ENDS * params.load_trigger)
+        limits = Thresholds(params.load_trigger, OFF_FRACTION * params.load_trigger)
     unit = unit_of(stream.schema, names)
     release()  # the memory of the channels
     profile = arm.profile(streams, t_ns, by_place=True)
     release()
     try:
-        touched = slide_signals.touched_rows(loaded, limits.on, limits.off, unit)
+        touched = slide_signals.loaded_rows(loaded, limits.on, limits.off, unit)
         slide = touched
         if profile:
             usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
@@ -195,7 +195,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
                 profile["speed_m_s"][: touched[1]], touched[0], params.moving_fraction * usual_m_s, params.steady_frames
             )
             slide = moving or touched
-        first, stop = slide_signals.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
+        first, stop = slide_signals.crop_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {name}: {error}") from error
     kept_rows = slice(first, stop)

@@ -100,7 +100,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
         noise_floor=params.noise_floor,
         level_count=params.level_count,
     )
-    values = slip.filled(readings)
+    values = slip.fill_missing(readings)
     labels = {name: np.zeros(len(t_ns), dtype=bool) for name in ("slip", "slip_online", "dropped")}
     grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
     for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise

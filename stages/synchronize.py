@@ -95,7 +95,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.channels import streams as masks
     from tacpipe.io.columns import release
     from tacpipe.io.spill import MappedArrays
-    from tacpipe.signals.repairs import fresh_rate_hz, mean_rate_hz
+    from tacpipe.signals.repairs import mean_rate_hz, new_frame_rate_hz
     from tacpipe.signals.resampling import default_gap_ns
     from tacpipe.synchronization import streams
     from tacpipe.synchronization import streams as grids
@@ -137,7 +137,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
                 ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
             attributes[f"{name}{masks.GAP_MS}"] = gap_ns / 1e6
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
-            attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.repeated), 3)
+            attributes[f"{name}_fresh_hz"] = round(new_frame_rate_hz(stream.t_ns, stream.repeated), 3)
             attributes |= stream.attributes
         stream.columns.forget()
         if not storage.in_memory:

@@ -239,7 +239,7 @@ def speed(streams: Mapping[str, pa.Table | Columns]) -> tuple[Times, Floats] | N
         joint_rad = linear(*angles, at_ns)
         iiwa = kinematics.IIWA14
         hand_m = kinematics.last_frames(iiwa, joint_rad)[:, :3, 3] if place is None else linear(*place, at_ns)
-        if kinematics.carries(iiwa, joint_rad, hand_m):
+        if kinematics.carries_hand(iiwa, joint_rad, hand_m):
             velocity = kinematics.hand_velocity(iiwa, joint_rad, joint_rad_s, hand_m)[:, :3]
             return at_ns, np.linalg.norm(velocity, axis=1)
     return None if moving is None else (moving[0], np.linalg.norm(moving[1][:, :3], axis=1))

@@ -17,7 +17,7 @@ from tacpipe.datasets import arrays
 from tacpipe.errors import UsageError
 from tacpipe.printable import listed, plain
 from tacpipe.signals.contact import rest_level
-from tacpipe.signals.runs import breaks, window_starts
+from tacpipe.signals.runs import run_starts, window_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -271,7 +271,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         else:
             values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
         usable: Bools = ~streams.gaps(table) & np.isfinite(values).all(axis=1)
-        groups = np.cumsum(breaks(t_ns, streams.apart(recording.attributes)))
+        groups = np.cumsum(run_starts(t_ns, streams.apart(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
         return _RecordingRows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 

@@ -95,7 +95,11 @@ def _in_order(joint_rad: Floats, quaternions: Floats) -> Floats:
     """Return quaternions x, y, z, w (time, 4), reordered if the joints (time, 7) show that the columns are w, x, y, z."""
     import numpy as np
 
-    from tacpipe.signals.kinematics import PANDA, turns
+    from tacpipe.signals.kinematics import PANDA, rotates_with_hand
 
     w_last = np.roll(quaternions, -1, axis=1)
-    return w_last if not turns(PANDA, joint_rad, quaternions) and turns(PANDA, joint_rad, w_last) else quaternions
+    return (
+        w_last
+        if not rotates_with_hand(PANDA, joint_rad, quaternions) and rotates_with_hand(PANDA, joint_rad, w_last)
+        else quaternions
+    )

@@ -92,7 +92,7 @@ def _poses(path: Path) -> Floats:
 
     from tacpipe.formats import xela
     from tacpipe.formats.csv_table import place
-    from tacpipe.signals.kinematics import continuous, quaternions_of
+    from tacpipe.signals.kinematics import make_continuous, matrices_to_quaternions
 
     entries = [f"ee_T_{row}{column}" for row in range(4) for column in range(4)]  # named by row and column
     transforms = xela.read_floats(path, entries).reshape(-1, 4, 4)
@@ -106,7 +106,7 @@ def _poses(path: Path) -> Floats:
             f"{path}, {place(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
             f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
         )
-    return np.column_stack([moved, continuous(quaternions_of(turned))])
+    return np.column_stack([moved, make_continuous(matrices_to_quaternions(turned))])
 
 
 def _stamps_ns(path: Path, time_s: Floats) -> Int64s:

@@ -226,13 +226,17 @@ def _matrices(states: NDArray[np.void], name: str) -> Float32s:
 def _poses(states: NDArray[np.void], name: str) -> Floats:
     """Return an end-effector pose as position and quaternion (frame, 7)."""
     pose = _matrices(states, name).astype(np.float64)
-    return np.hstack([pose[:, :3, 3], kinematics.quaternions_of(pose[:, :3, :3])])
+    return np.hstack([pose[:, :3, 3], kinematics.matrices_to_quaternions(pose[:, :3, :3])])
 
 
 def _flat(poses: Floats) -> Floats:
     """Return positions with quaternions (frame, 7) as column-major matrices (frame, 16)."""
     matrices = np.zeros((len(poses), 4, 4))
-    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = kinematics.matrices_of(poses[:, 3:]), poses[:, :3], 1
+    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = (
+        kinematics.quaternions_to_matrices(poses[:, 3:]),
+        poses[:, :3],
+        1,
+    )
     return matrices.transpose(0, 2, 1).reshape(-1, POSE)
 
 

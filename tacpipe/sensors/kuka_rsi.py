@@ -215,14 +215,14 @@ def _fields(name: str) -> list[pa.Field]:
 def _columns(name: str, numbers: Floats) -> Floats:
     """Convert an output's numbers (sample, number) to m, rad and quaternions."""
     if name in POSES:
-        return np.hstack([numbers[:, :3] / 1000, kinematics.quaternions_of_angles(np.radians(numbers[:, 3:]))])
+        return np.hstack([numbers[:, :3] / 1000, kinematics.angles_to_quaternions(np.radians(numbers[:, 3:]))])
     return np.radians(numbers) if name in ANGLES else numbers
 
 
 def _to_wire(name: str, columns: Floats) -> Floats:
     """Convert columns to the numbers (sample, number) that the controller sends, in mm and degrees."""
     if name in POSES:
-        return np.hstack([columns[:, :3] * 1000, np.degrees(kinematics.angles_of(columns[:, 3:]))])
+        return np.hstack([columns[:, :3] * 1000, np.degrees(kinematics.quaternions_to_angles(columns[:, 3:]))])
     return np.degrees(columns) if name in ANGLES else columns
 
 

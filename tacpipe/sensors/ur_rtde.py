@@ -208,7 +208,9 @@ class UrRtde(Sensor):
         packages["size"], packages["type"], packages["recipe"] = self.package.itemsize, DATA, 1
         packages[STAMP] = samples.t_device_ns / 1e9
         for name, block in zip(self.outputs, samples.values, strict=True):
-            wire = np.hstack([block[:, :3], kinematics.vectors_of(block[:, 3:])]) if name in POSES else block
+            wire = (
+                np.hstack([block[:, :3], kinematics.quaternions_to_vectors(block[:, 3:])]) if name in POSES else block
+            )
             packages[name] = wire[:, 0] if packages[name].ndim == 1 else wire
         return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
 
@@ -325,7 +327,7 @@ def _to_columns(values: AnyArray, name: str) -> AnyArray:
     """Convert an output's values to columns (sample, channel) in native byte order. Poses get a quaternion."""
     block = values[:, None] if values.ndim == 1 else values
     block = block.astype(bool if type_of(name) == "BOOL" else block.dtype.newbyteorder("="))
-    return np.hstack([block[:, :3], kinematics.quaternions_of_vectors(block[:, 3:])]) if name in POSES else block
+    return np.hstack([block[:, :3], kinematics.vectors_to_quaternions(block[:, 3:])]) if name in POSES else block
 
 
 def _are_numbers(packages: AnyArray) -> Bools:

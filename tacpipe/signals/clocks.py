@@ -1,14 +1,14 @@
-"""A device's own clock next to the times at which its samples reached the host.
+"""Fit a device's clock to the arrival times of its samples on the host.
 
-The model: ``arrival = offset + (1 + drift) * device + latency``. A latency is never negative, and the fastest samples of
-a link take nearly the same time, so the line is a lower envelope: what lies above it is delay, and states nothing about
-the clock. Of all lines below the samples it is the one with the least sum of vertical distances (Moon, Skelly, Towsley,
-"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999), taken after samples that come
-impossibly early are left out. On simulated links its drift was two to five times as precise as that of a Theil-Sen line
-through low quantiles of blocks. The least latency itself cannot be distinguished from an offset; it stays in the offset.
+The model is ``arrival = offset + (1 + drift) * device + latency``. Latency is never negative and nearly constant for
+the fastest samples of a link, so the line is a lower envelope: distances above it are delays. Among all lines below the
+samples, it has the smallest sum of vertical distances (Moon, Skelly, Towsley, "Estimation and removal of clock skew
+from network delay measurements", INFOCOM 1999). Samples that arrive impossibly early are excluded first. On simulated
+links, its drift was two to five times as precise as that of a Theil-Sen line through low quantiles of blocks. The
+smallest latency is indistinguishable from an offset and included in it.
 
-A device that restarts steps its clock. Steps are looked for first, and each segment between them has its own line.
-Stamps are int64 nanoseconds; first values are subtracted before anything becomes a float.
+The clock of a device that restarts has a step. Steps are detected first, and each segment between them has its own
+line. Timestamps are int64 nanoseconds; the first value is subtracted before conversion to float.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from tacpipe.errors import TacpipeError
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 STEP_NS = 20_000_000  # smaller steps are latency: no device restarts within 20 ms
-STEP_WINDOW_NS = 2_000_000_000  # time that the clock must stay on both sides of a step; stalls of a host are shorter
+STEP_WINDOW_NS = 2_000_000_000  # compared time on both sides of a step; stalls of a host are shorter
 STEP_WINDOW_ROWS = (16, 4096)
-STEPS_LOOKED_AT = 64  # the largest jumps; a link that stalls more often than that hides restarts no smaller than these
-LOW = 0.1  # quantile that represents the fastest samples of a stretch: a few wrong stamps do not move it
-ROUGH_LOW, ROUGH_BLOCKS, ROUGH_ROWS = 0.05, 64, 8  # quantile, number and least length of the blocks of the first line
-EARLY_NS = 100_000.0  # least distance below the first line beyond which a sample is left out
-LINE_ROWS, LINE_NS = 32, 2_000_000_000  # least rows and time of a line: a shorter one shows jitter, no drift
+MAX_STEPS = 64  # number of largest jumps that are examined as steps; more stalls may hide smaller restarts
+LOW = 0.1  # quantile that represents the fastest samples; robust against a few wrong timestamps
+ROUGH_LOW, ROUGH_BLOCKS, ROUGH_ROWS = 0.05, 64, 8  # quantile, number and smallest size of blocks for the first line
+EARLY_NS = 100_000.0  # smallest distance below the first line at which samples are excluded
+LINE_ROWS, LINE_NS = 32, 2_000_000_000  # smallest number of rows and duration from which a drift is estimated
 HULL_BLOCKS = 512
-ENOUGH_ROWS = 1 << 14  # rows for a median and for the first line; the envelope itself uses all rows
-MAX_DRIFT = 0.1  # an RC oscillator is off by a few percent; beyond, the stamps are not nanoseconds
+MAX_SUBSAMPLE = 1 << 14  # rows for medians and the first line; the envelope uses all rows
+MAX_DRIFT = 0.1  # RC oscillators deviate by a few percent; above, timestamps are not in nanoseconds
 
 
 @dataclass(frozen=True)
 class Segment:
-    """The rows from ``start`` to ``stop`` (exclusive) between two steps, and the line that maps their device time."""
+    """The rows from ``start`` to ``stop`` (exclusive) between two steps, and the line for their device times."""
 
     start: int
     stop: int
     device_ns: int  # device time of the segment's first row
-    host_ns: int  # the host's time at that reading
-    drift: float  # host seconds a device second, less 1
+    host_ns: int  # host time at ``device_ns``
+    drift: float  # host seconds per device second, minus 1
 
     def host_times(self, device_ns: Times) -> Times:
-        """Return the host's time (time,) at readings of the device."""
+        """Convert device times (time,) to host times."""
         since_ns = device_ns - np.int64(self.device_ns)
         mapped: Times = np.int64(self.host_ns) + since_ns + np.rint(since_ns * self.drift).astype(np.int64)
         return mapped
@@ -56,7 +56,8 @@ class Segment:
 class ClockFit:
     """The fitted clock of a device, and the delays of its samples.
 
-    ``residual_ns`` are the quantiles `QUANTILES` of arrival less mapped time: latency beyond that of the fastest samples.
+    ``residual_ns`` are the quantiles `QUANTILES` of arrival minus fitted time: the latency above that of the fastest
+    samples.
     """
 
     segments: tuple[Segment, ...]
@@ -65,27 +66,26 @@ class ClockFit:
 
     @property
     def longest(self) -> Segment:
-        """The segment with the most rows, which speaks for the clock."""
+        """The segment with the most rows."""
         return max(self.segments, key=lambda segment: segment.stop - segment.start)
 
     @property
     def offset_ns(self) -> int:
-        """Host less device time at the first row of the longest segment."""
+        """Host minus device time at the first row of the longest segment."""
         return self.longest.host_ns - self.longest.device_ns
 
     @property
     def drift_ppm(self) -> float:
-        """Parts per million by which the host's clock is faster than the device's, in the longest segment."""
+        """The drift of the longest segment: parts per million by which the host's clock is faster."""
         return self.longest.drift * 1e6
 
 
 def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None) -> ClockFit:
-    """Return the fit of a device's clock (time,) against the arrival of its samples (time,), in row order.
+    """Fit a device's clock (time,) to the arrival times of its samples (time,), in row order.
 
-    Where ``certain`` (time,) is given, the other rows have arrivals that state nothing, as of a host that was held up,
-    and are left out; where no row is certain, all are taken. A segment too short to show a drift takes that of the
-    longest one that does, or none. Raises `TacpipeError` for a clock that stands still, or whose rate differs from the
-    host's by more than 10 %.
+    Only rows marked in ``certain`` (time,) are used, unless none is marked: others arrived while the host was delayed. A
+    segment that is too short to estimate its drift uses that of the longest segment, or 0. Raises `TacpipeError` if the
+    clock is constant or its rate differs from the host's by more than 10 %.
 
     >>> device_ns = np.arange(0, 10_000_000_000, 1_000_000)
     >>> fit = fit_clock(device_ns, 500 + device_ns + device_ns // 20_000)
@@ -94,16 +94,16 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
     """
     if len(device_ns) != len(arrival_ns) or not len(device_ns):
         raise TacpipeError(
-            f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals do not define a clock; give equally many "
-            "of both, at least one."
+            f"A clock cannot be fitted to {len(device_ns)} device times and {len(arrival_ns)} arrival times; their numbers "
+            "must be equal and at least 1."
         )
     if certain is not None and certain.any() and not certain.all():
         rows = np.flatnonzero(certain)
-        return _spread(fit_clock(device_ns[rows], arrival_ns[rows]), rows, len(device_ns))
+        return _to_all_rows(fit_clock(device_ns[rows], arrival_ns[rows]), rows, len(device_ns))
     if len(device_ns) > 1 and not np.any(device_ns != device_ns[0]):
         raise TacpipeError(
-            f"The device's clock stays at {device_ns[0]} ns in all {len(device_ns)} rows. "
-            "Leave t_device_ns out, or use the time of arrival (`--clock arrival`)."
+            f"The device's clock is constant, {device_ns[0]} ns in all {len(device_ns)} rows. "
+            "Remove t_device_ns, or use arrival times (`--clock arrival`)."
         )
     edges = [0, *clock_steps(device_ns, arrival_ns), len(device_ns)]
     spans = list(pairwise(edges))
@@ -111,100 +111,100 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
     fitted = [(stop - start, drift) for (start, stop), drift in zip(spans, drifts, strict=True) if drift is not None]
     borrowed = max(fitted)[1] if fitted else 0.0
     segments = tuple(
-        _anchored(start, stop, device_ns, arrival_ns, borrowed if drift is None else drift)
+        _anchor(start, stop, device_ns, arrival_ns, borrowed if drift is None else drift)
         for (start, stop), drift in zip(spans, drifts, strict=True)
     )
-    late_ns = (arrival_ns - _mapped(segments, device_ns)).astype(np.float64)  # (time,)
+    late_ns = (arrival_ns - _map_times(segments, device_ns)).astype(np.float64)  # (time,)
     quantiles = tuple(float(value) for value in np.quantile(late_ns, QUANTILES))
     return ClockFit(segments, quantiles, float(np.median(np.abs(late_ns))))
 
 
-def _spread(fit: ClockFit, rows: Int64s, count: int) -> ClockFit:
-    """Return a fit of some ``rows`` as one of all ``count``: a row that was left out belongs to the segment before it."""
+def _to_all_rows(fit: ClockFit, rows: Int64s, count: int) -> ClockFit:
+    """Convert a fit of ``rows`` to a fit of all ``count`` rows. An excluded row belongs to the previous segment."""
     edges = [0, *(int(rows[segment.start]) for segment in fit.segments[1:]), count]
     spans = zip(fit.segments, edges[:-1], edges[1:], strict=True)
     return replace(fit, segments=tuple(replace(segment, start=start, stop=stop) for segment, start, stop in spans))
 
 
 def host_times(fit: ClockFit, device_ns: Times, arrival_ns: Times) -> Times:
-    """Return when samples were taken on the host's clock (time,): device time mapped by ``fit``, never decreasing.
+    """Return the sampling times on the host's clock (time,), never decreasing.
 
-    A stamp that maps to more than 20 ms after its own arrival is wrong, and the arrival stands in for it; otherwise one
-    such stamp would hold up all that follow.
+    A device time that maps to more than 20 ms after its arrival is wrong and replaced by the arrival; otherwise it would
+    delay all later samples.
     """
-    mapped = _mapped(fit.segments, device_ns)
+    mapped = _map_times(fit.segments, device_ns)
     ahead = mapped - arrival_ns > STEP_NS
     host_ns: Times = np.maximum.accumulate(np.where(ahead, arrival_ns, mapped))
     return host_ns
 
 
 def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
-    """Return, sorted, the rows at which the device's clock steps against the host's for good.
+    """Return the sorted rows at which the device's clock steps permanently relative to the host's.
 
-    A late sample jumps too, but the clock behind it is where it was: so the fastest samples of the two seconds before
-    and after must lie apart by at least half the jump. Raises nothing; a gap in both clocks is not a step.
+    A late sample also causes a jump, but only for itself. The fastest samples in the two seconds before and after a step
+    must therefore differ by at least half the jump. A gap in both clocks is not a step.
     """
     apart = arrival_ns - device_ns
     apart = (apart - apart[0]).astype(np.float64)  # (time,)
     jumps = np.abs(np.diff(apart))
     if not len(jumps) or jumps.max() <= STEP_NS:
         return []
-    usual = float(np.median(_some(jumps)))  # median difference of latencies; a step is far beyond
+    usual = float(np.median(_subsample(jumps)))  # median difference of latencies; steps are much larger
     rows = np.flatnonzero(jumps > max(STEP_NS, 8 * usual)) + 1
-    rows = rows[np.argsort(-jumps[rows - 1], kind="stable")][:STEPS_LOOKED_AT]
-    period_ns = max(float(np.median(_some(np.diff(arrival_ns)))), 1.0)
+    rows = rows[np.argsort(-jumps[rows - 1], kind="stable")][:MAX_STEPS]
+    period_ns = max(float(np.median(_subsample(np.diff(arrival_ns)))), 1.0)
     reach = int(np.clip(STEP_WINDOW_NS / period_ns, *STEP_WINDOW_ROWS))
     steps: list[int] = [0, len(apart)]
-    for row in rows.tolist():  # largest first, so that a step is derived from the stalls around it
+    for row in rows.tolist():  # largest first, so that a step separates the stalls around it
         first = max(max(step for step in steps if step <= row), row - reach)
         stop = min(min(step for step in steps if step >= row), row + reach)
         if first < row < stop:
-            moved = _low(apart[row:stop]) - _low(apart[first:row])
+            moved = _low_quantile(apart[row:stop]) - _low_quantile(apart[first:row])
             if abs(moved) > max(STEP_NS, jumps[row - 1] / 2):
                 steps.append(row)
     return sorted(steps[2:])
 
 
-def _some(values: AnyArray) -> AnyArray:
-    """Return evenly spaced ones of ``values``; the step is odd, so that it keeps time with no link's batches."""
-    return values[:: len(values) // ENOUGH_ROWS | 1]
+def _subsample(values: AnyArray) -> AnyArray:
+    """Return every n-th of ``values``. n is odd, so that it is not a multiple of a link's batch size."""
+    return values[:: len(values) // MAX_SUBSAMPLE | 1]
 
 
-def _earliest(late_ns: AnyArray) -> float:
-    """Return the lateness below which a sample came impossibly early: its stamp is wrong."""
-    low, middle = np.quantile(_some(late_ns), (ROUGH_LOW, 0.5))
+def _earliest_possible(late_ns: AnyArray) -> float:
+    """Return the delay below which a sample arrived impossibly early, so that its timestamp must be wrong."""
+    low, middle = np.quantile(_subsample(late_ns), (ROUGH_LOW, 0.5))
     return float(low - max(middle - low, EARLY_NS))
 
 
-def _low(values: Floats) -> float:
+def _low_quantile(values: Floats) -> float:
     rank = int(LOW * (len(values) - 1))
     return float(np.partition(values, rank)[rank])
 
 
 def _drift(device_ns: Times, arrival_ns: Times) -> float | None:
-    """Return the drift of one segment, or None if it is too short to show one."""
+    """Return the drift of a segment, or None if the segment is too short."""
     since_ns = (device_ns - device_ns[0]).astype(np.float64)  # (time,)
     span_ns = float(since_ns.max())
     if len(since_ns) < LINE_ROWS or max(span_ns, float(arrival_ns[-1] - arrival_ns[0])) < LINE_NS:
         return None
     apart = arrival_ns - device_ns
     apart_ns = (apart - apart[0]).astype(np.float64)
-    rough = _rough_drift(_some(since_ns), _some(apart_ns))
+    rough = _rough_drift(_subsample(since_ns), _subsample(apart_ns))
     if rough is None or abs(rough) > MAX_DRIFT:
         rate = "none" if rough is None else f"{1 / (1 + rough):.4g}" if rough > -1 else "negative"
         raise TacpipeError(
-            f"The device's clock runs at {rate} times the host's over {span_ns / 1e9:.4g} s; it must run within 10 % of "
-            "it, and t_device_ns be in nanoseconds. Fix the stamps, or use the time of arrival (`--clock arrival`)."
+            f"The rate of the device's clock is {rate} times the host's over {span_ns / 1e9:.4g} s; it must be within 10 % "
+            "of it, with t_device_ns in nanoseconds. Correct the timestamps, or use arrival times (`--clock arrival`)."
         )
     level_ns = apart_ns - rough * since_ns
-    possible = level_ns >= _earliest(level_ns)
+    possible = level_ns >= _earliest_possible(level_ns)
     return rough + _envelope_slope(since_ns[possible], level_ns[possible])
 
 
 def _rough_drift(since_ns: Floats, apart_ns: Floats) -> float | None:
-    """Return the slope of a Theil-Sen line through a low quantile of each block of rows; None without two times.
+    """Return the slope of a Theil-Sen line through a low quantile of each block of rows, or None without two times.
 
-    Twice, because within a block a slope spreads the values.
+    It is computed twice, because a slope within a block affects the quantile.
     """
     rows = max(ROUGH_ROWS, -(-len(since_ns) // ROUGH_BLOCKS))
     whole = len(since_ns) // rows * rows
@@ -223,9 +223,9 @@ def _rough_drift(since_ns: Floats, apart_ns: Floats) -> float | None:
 
 
 def _envelope_slope(since_ns: Floats, level_ns: Floats) -> float:
-    """Return the slope of the edge of the lower convex hull that lies over the mean time.
+    """Return the slope of the edge of the lower convex hull at the mean time.
 
-    Only the lowest row of each of `HULL_BLOCKS` blocks is looked at: of nearly level values the hull has no others.
+    Only the lowest row of each of `HULL_BLOCKS` blocks is used: for nearly constant values, the hull has no others.
     """
     rows = max(1, len(since_ns) // HULL_BLOCKS)
     full_rows = len(since_ns) // rows * rows
@@ -235,7 +235,7 @@ def _envelope_slope(since_ns: Floats, level_ns: Floats) -> float:
     hull: list[tuple[float, float]] = []
     for time, level in zip(since_ns[lowest].tolist(), level_ns[lowest].tolist(), strict=True):
         if hull and time == hull[-1][0]:
-            continue  # of two points at one time the first is the lower
+            continue  # the first of two points at the same time is the lower one
         while len(hull) > 1 and _turns_up(hull[-2], hull[-1], (time, level)):
             hull.pop()
         hull.append((time, level))
@@ -252,31 +252,31 @@ def _turns_up(first: tuple[float, float], middle: tuple[float, float], last: tup
     return (middle[1] - first[1]) * (last[0] - first[0]) >= (last[1] - first[1]) * (middle[0] - first[0])
 
 
-def _anchored(start: int, stop: int, device_ns: Times, arrival_ns: Times, drift: float) -> Segment:
-    """Return the segment with the line of this drift that touches its fastest samples."""
+def _anchor(start: int, stop: int, device_ns: Times, arrival_ns: Times, drift: float) -> Segment:
+    """Return the segment whose line has ``drift`` and touches the fastest samples."""
     flat = Segment(start, stop, int(device_ns[start]), int(arrival_ns[start]), drift)
     late_ns = arrival_ns[start:stop] - flat.host_times(device_ns[start:stop])
-    fastest_ns = int(late_ns[late_ns >= _earliest(late_ns)].min())
+    fastest_ns = int(late_ns[late_ns >= _earliest_possible(late_ns)].min())
     return Segment(start, stop, flat.device_ns, flat.host_ns + fastest_ns, drift)
 
 
-def _mapped(segments: tuple[Segment, ...], device_ns: Times) -> Times:
+def _map_times(segments: tuple[Segment, ...], device_ns: Times) -> Times:
     return np.concatenate([segment.host_times(device_ns[segment.start : segment.stop]) for segment in segments])
 
 
-NEIGHBOURS = 3  # measurements on either side of a jump that must lie apart for a reset
+NEIGHBOURS = 3  # measurements before and after a jump that are compared to detect a reset
 LINE_OFFSETS, LINE_OFFSETS_NS = (
     3,
     10_000_000_000,
-)  # least measurements and time of a line: a shorter one shows the errors of its measurements, no drift
-MAX_PAIRED = 512  # measurements whose pairs are looked at; of more, as many evenly spaced
+)  # smallest number of measurements and duration from which a drift is estimated
+MAX_PAIRED = 512  # largest number of measurements for pairwise slopes; longer series are subsampled
 
 
 def fit_offsets(device_ns: Times, offset_ns: Int64s) -> tuple[Segment, ...]:
-    """Return a clock's lines, one a stretch between two resets, in the order of the measurements.
+    """Return one line per segment between two resets, in the order of the measurements.
 
-    ``offset_ns`` (measurement,) is what was to be added to the clock's reading ``device_ns`` (measurement,) for the other
-    clock's time. ``start`` and ``stop`` of a segment count measurements; there is none without a measurement.
+    The other clock's time is ``device_ns + offset_ns``, both (measurement,). ``start`` and ``stop`` of a segment are
+    indices of measurements. Without measurements there is no segment.
 
     >>> device_ns = np.arange(0, 100_000_000_000, 5_000_000_000)
     >>> (line,) = fit_offsets(device_ns, 7_000_000 + device_ns // 20_000)
@@ -285,15 +285,17 @@ def fit_offsets(device_ns: Times, offset_ns: Int64s) -> tuple[Segment, ...]:
     """
     if not len(device_ns):
         return ()
-    edges = [0, *resets(device_ns, offset_ns), len(device_ns)]
-    return tuple(_line(start, stop, device_ns[start:stop], offset_ns[start:stop]) for start, stop in pairwise(edges))
+    edges = [0, *find_resets(device_ns, offset_ns), len(device_ns)]
+    return tuple(
+        _fit_line(start, stop, device_ns[start:stop], offset_ns[start:stop]) for start, stop in pairwise(edges)
+    )
 
 
-def resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
-    """Return the measurements that are the first after the clock was reset, or replaced by another one.
+def find_resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
+    """Return the index of the first measurement after each reset or replacement of the clock.
 
-    That is where it went back, and where the offset jumps by more than any drift and stays there: one measurement that
-    is wrong is not a reset, nor is the very last one alone.
+    There, time decreases, or the offset jumps by more than any drift and does not jump back. A single outlier is not a
+    reset, nor is the last measurement alone.
     """
     steps_ns = np.diff(device_ns)
     jumps_ns = np.diff(offset_ns)
@@ -310,9 +312,9 @@ def resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
 
 
 def times_by_offsets(segments: tuple[Segment, ...], starts: list[int], device_ns: Times) -> Times:
-    """Return readings of the clock (time,) as times of the other one; ``starts`` is the first row of each segment.
+    """Convert times of the clock (time,) to the other clock. ``starts`` are the first rows of the segments.
 
-    Where the first segment does not start at row 0, it is used for the rows before it too.
+    Rows before the first segment are converted with it.
     """
     edges = [0, *starts[1:], len(device_ns)]
     mapped = [
@@ -322,8 +324,8 @@ def times_by_offsets(segments: tuple[Segment, ...], starts: list[int], device_ns
     return np.concatenate(mapped)
 
 
-def _line(start: int, stop: int, device_ns: Times, offset_ns: Int64s) -> Segment:
-    """Return the line of one stretch: median slope of all pairs, and median offset."""
+def _fit_line(start: int, stop: int, device_ns: Times, offset_ns: Int64s) -> Segment:
+    """Return a segment with the median slope of all pairs and the median offset."""
     since_ns = (device_ns - device_ns[0]).astype(np.float64)  # (measurement,)
     apart_ns = (offset_ns - offset_ns[0]).astype(np.float64)
     drift = 0.0

@@ -1,4 +1,4 @@
-"""Find contacts: the level without load, the load on a sensor, and the intervals and first rows of contact."""
+"""Detect contacts: the rest level and the load of a sensor, and the intervals and first rows of contact."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.repairs import held
-from tacpipe.signals.runs import in_long_runs, latched, runs
+from tacpipe.signals.repairs import repeated_rows
+from tacpipe.signals.runs import in_long_runs, latch, runs
 
-NOISE_FEWEST, NOISE_USUAL = 10.0, 40.0  # times the noise at rest: least, and usual, load at which contact starts
-PEAK_LEAST, PEAK_MOST = 0.05, 0.25  # least and largest start threshold, as fractions of the largest load
-WITHOUT_ROWS = "The level at rest cannot be distinguished from a recording without rows."
+NOISE_MIN, NOISE_USUAL = 10.0, 40.0  # smallest and usual start threshold, as multiples of the noise at rest
+PEAK_MIN, PEAK_MAX = 0.05, 0.25  # smallest and largest start threshold, as fractions of the largest load
+NO_ROWS = "The recording has no rows, so its rest level cannot be determined."
 # Yields the channels of a recording (time, channel) in blocks of one row or more, from the first row on.
 Blocks = Callable[[], Iterable[AnyArray]]
-ENDS = 2 / 3  # load at which contact ends, as a fraction of the load at which it starts
-PEAK_QUANTILE = 0.99  # quantile of the load that is its largest: a single wrong frame is none
+OFF_FRACTION = 2 / 3  # end threshold as a fraction of the start threshold
+PEAK_QUANTILE = 0.99  # quantile that counts as the largest load; robust against single wrong frames
 
 
 class Thresholds(NamedTuple):
     """The loads at which a contact starts and ends, in the unit of the load."""
 
-    on: float  # contact starts where the load reaches this
-    off: float  # load below which a contact ends
+    on: float  # contact starts when the load reaches this value
+    off: float  # contact ends when the load is below this value
 
 
 def rest_level(values: AnyArray, t_ns: Times, rest_s: float) -> Floats:
     """Return the median of each channel of ``values`` (time, channel) over the first ``rest_s`` seconds (channel,).
 
-    A median, because one bad frame must not shift a whole recording. The first row always counts.
-    Raises `TacpipeError` if there are no rows.
+    The median is robust against single bad frames. The first row is always included. Raises `TacpipeError` without rows.
     """
     if not len(t_ns):
-        raise TacpipeError(WITHOUT_ROWS)
+        raise TacpipeError(NO_ROWS)
     rows = int(np.searchsorted(t_ns, t_ns[0] + round(rest_s * 1e9), side="right"))
     level: Floats = np.median(values[: max(rows, 1)], axis=0).astype(np.float64)
     return level
 
 
-def lowest_part(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:
-    """Return the rows (time,) of the ``rest_s`` seconds in which ``total`` (time,), of all channels, is lowest.
+def lowest_rows(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:
+    """Return a mask (time,) of the ``rest_s`` seconds with the lowest mean of ``total`` (time,), the sum of all channels.
 
-    For recordings that begin in contact, of sensors that rise under load. Rows whose total is infinite never count.
+    It is for recordings that start in contact, from sensors whose values increase under load. Rows with an infinite
+    total are never included.
 
-    >>> lowest_part(np.array([9, 9, 1, 2, 9]), np.arange(5) * 10**9, rest_s=1.0).tolist()
+    >>> lowest_rows(np.array([9, 9, 1, 2, 9]), np.arange(5) * 10**9, rest_s=1.0).tolist()
     [False, False, True, True, False]
     """
     stop = np.searchsorted(t_ns, t_ns + round(rest_s * 1e9), side="right")
@@ -62,14 +62,14 @@ def lowest_part(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:
     return rows
 
 
-def at_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
-    """Return each channel's level without load (channel,), and the rows (time,) it is of, None for those of the start.
+def measure_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
+    """Return the rest level of each channel (channel,) and the mask of its rows (time,), None for those at the start.
 
-    ``blocks`` yields the channels. ``rest_rows`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for those of
-    `lowest_part`. Raises `TacpipeError` if there are no rows.
+    ``rest_rows`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for `lowest_rows`. Raises `TacpipeError`
+    without rows.
     """
     if not len(t_ns):
-        raise TacpipeError(WITHOUT_ROWS)
+        raise TacpipeError(NO_ROWS)
     if rest_rows == "start":
         first_rows: list[AnyArray] = []
         for values in blocks():
@@ -80,7 +80,7 @@ def at_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple
         values = np.concatenate(first_rows)
         return rest_level(values, t_ns[: len(values)], rest_s), None
     totals = [np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf) for values in blocks()]
-    rows = lowest_part(np.concatenate(totals), t_ns, rest_s)
+    rows = lowest_rows(np.concatenate(totals), t_ns, rest_s)
     chosen, first = [], 0
     for values in blocks():
         chosen.append(values[rows[first : first + len(values)]])
@@ -89,11 +89,11 @@ def at_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple
     return level, rows
 
 
-def tared(method: Literal["median", "first", "axis_mean"], values: AnyArray, level: Floats, axes: int) -> Floats:
-    """Return what is taken off each channel (channel,) of ``values`` (time, channel).
+def tare_level(method: Literal["median", "first", "axis_mean"], values: AnyArray, level: Floats, axes: int) -> Floats:
+    """Return the level to subtract from each channel (channel,) of ``values`` (time, channel).
 
-    ``median`` is ``level``, that of the channels at rest; ``first`` the first row; ``axis_mean`` that of
-    `axis_mean_level`, whose ``axes`` are of a taxel.
+    With ``median`` it is ``level``, with ``first`` the first row, and with ``axis_mean`` the result of
+    `axis_mean_level` for taxels with ``axes`` channels.
     """
     if method == "median":
         return level
@@ -104,27 +104,27 @@ def tared(method: Literal["median", "first", "axis_mean"], values: AnyArray, lev
 
 
 def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:
-    """Return what to take off each channel of ``values`` (time, channel) so that all taxels of an axis begin alike.
+    """Return the level (channel,) to subtract from ``values`` (time, channel) for equal first values of all taxels.
 
-    In the first row they then have the whole part of that axis' mean over the taxels, not 0, as in the authors'
-    notebooks; (channel,). The channels go taxel by taxel, ``axes`` to a taxel.
+    The first value of each axis is then its mean over the taxels, truncated to an integer, as in the authors' notebooks.
+    Channels are ordered by taxel, with ``axes`` per taxel.
 
     >>> axis_mean_level(np.array([[10, 1, 13, 2]]), axes=2).tolist()
     [-1.0, 0.0, 2.0, 1.0]
     """
     _require_taxels(values, axes)
     if not len(values):
-        raise TacpipeError(WITHOUT_ROWS)
+        raise TacpipeError(NO_ROWS)
     first = values[0].astype(np.float64).reshape(-1, axes)  # (taxel, axis)
     level: Floats = (first - np.trunc(first.mean(axis=0))).ravel()
     return level
 
 
 def load(values: AnyArray, rest_level: Floats, axes: int = 3) -> Floats:
-    """Return how far the taxels are from ``rest`` on average (time,), in the unit of ``values``.
+    """Return the mean distance of the taxels from ``rest_level`` (time,), in the unit of ``values``.
 
-    The channels of ``values`` (time, channel) go taxel by taxel, ``axes`` to a taxel; a taxel's distance is the length
-    of the vector of its axes. Raises `TacpipeError` if the channels are not whole taxels.
+    The channels of ``values`` (time, channel) are ordered by taxel, with ``axes`` per taxel. The distance of a taxel is
+    the norm of its vector. Raises `TacpipeError` if the number of channels is not a multiple of ``axes``.
 
     >>> load(np.array([[3.0, 4.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros(6)).tolist()
     [3.0]
@@ -137,13 +137,13 @@ def load(values: AnyArray, rest_level: Floats, axes: int = 3) -> Floats:
 
 
 def load_in_blocks(blocks: Blocks, rest_level: Floats, axes: int) -> tuple[Floats, Bools]:
-    """Return the `load` of channels that come in blocks, and which rows repeat the one before; each (time,)."""
+    """Return the `load` of channels in blocks, and a mask of rows that repeat the previous row; both (time,)."""
     loads: list[Floats] = []
     repeated: list[Bools] = []
     last: AnyArray | None = None
     for values in blocks():
         loads.append(load(values, rest_level, axes))
-        repeated.append(held(values if last is None else np.concatenate([last, values]))[-len(values) :])
+        repeated.append(repeated_rows(values if last is None else np.concatenate([last, values]))[-len(values) :])
         last = values[-1:]
     return np.concatenate(loads), np.concatenate(repeated)
 
@@ -151,13 +151,13 @@ def load_in_blocks(blocks: Blocks, rest_level: Floats, axes: int) -> tuple[Float
 def noise_thresholds(
     repeated: Bools, load: Floats, t_ns: Times, rest_s: float, rest: Bools | None = None
 ) -> Thresholds:
-    """Return thresholds for a sensor of any unit, from its noise at rest.
+    """Return thresholds from the noise of a sensor at rest, in any unit.
 
-    The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds, or the rows ``rest`` (time,);
-    samples that repeat the one before in all channels, ``repeated`` (time,), are left out. Contact starts at 40
-    times the noise, but at no more than a quarter of the recording's largest load, at least at a twentieth of that, and
-    at least at 10 times the noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to
-    230 counts, next to the 120 that were set by hand. Without any load the thresholds are infinite.
+    The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds or the rows ``rest`` (time,),
+    without rows that repeat the previous one (``repeated``). The start threshold is 40 times the noise, but at most 25 %
+    and at least 5 % of the largest load, and at least 10 times the noise. The end threshold is two thirds of it. On 52
+    published trials of a XELA uSkin, the start threshold is 70 to 230 counts; the authors chose 120. Without load, the
+    thresholds are infinite.
     """
     finite = np.isfinite(load)
     largest = float(np.quantile(load[finite], PEAK_QUANTILE)) if finite.any() else 0.0
@@ -165,19 +165,21 @@ def noise_thresholds(
         return Thresholds(np.inf, np.inf)
     at_rest = finite & ~repeated & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)
     noise = float(np.quantile(load[at_rest], 0.75)) if at_rest.any() else 0.0
-    usual = min(NOISE_USUAL * noise, PEAK_MOST * largest)
-    on = max(NOISE_FEWEST * noise, PEAK_LEAST * largest, usual)
-    return Thresholds(on, ENDS * on)
+    usual = min(NOISE_USUAL * noise, PEAK_MAX * largest)
+    on = max(NOISE_MIN * noise, PEAK_MIN * largest, usual)
+    return Thresholds(on, OFF_FRACTION * on)
 
 
-def touching(load: Floats, on: float | Floats, off: float | Floats) -> Bools:
-    """Return the rows of touch (time,), as `contact_intervals` detects it before it merges, drops and pads contacts."""
+def contact_mask(load: Floats, on: float | Floats, off: float | Floats) -> Bools:
+    """Return a mask of contact (time,), before `contact_intervals` merges, removes and extends contacts."""
     loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
     if not ((offs >= 0) & (offs <= ons)).all():
-        raise TacpipeError(f"Contact that starts at {on} and ends below {off} flickers; off must lie between 0 and on.")
+        raise TacpipeError(
+            f"The start threshold of contact is {on} and the end threshold {off}, which must be 0 to {on}."
+        )
     starting: Bools = np.any(loads >= ons, axis=0) & ~np.isnan(loads).any(axis=0)  # (time,)
     ending: Bools = np.all(loads < offs, axis=0)  # (time,)
-    return latched(starting, ending)
+    return latch(starting, ending)
 
 
 def contact_intervals(
@@ -189,15 +191,15 @@ def contact_intervals(
     merge_s: float,
     pad_s: float,
 ) -> Int64s:
-    """Return the row ranges (contact, 2) in which there is contact, stop exclusive, sorted and without overlap.
+    """Return the row ranges of contacts (contact, 2), stop exclusive, sorted and without overlap.
 
-    Contact starts where ``load`` (time,) reaches ``on`` and ends where it falls below ``off``. Of several sensors
-    ``load`` is (sensor, time) and the thresholds may be (sensor,): it starts where any load reaches its own and ends
-    where all are below. Where a load is NaN it does neither. Contacts that are at most ``merge_s`` apart are one; then
-    those shorter than ``min_s`` go; the rest grow by ``pad_s`` on both sides, and where they would meet, the rows
-    between them are shared out at the middle. Raises `TacpipeError` unless 0 <= off <= on.
+    Contact starts when ``load`` (time,) reaches ``on`` and ends when it falls below ``off``. For several sensors,
+    ``load`` is (sensor, time) and the thresholds may be (sensor,): contact starts when any load reaches its threshold
+    and ends when all are below theirs. It neither starts nor ends at NaN. Contacts at most ``merge_s`` apart are merged,
+    contacts shorter than ``min_s`` removed, and the others extended by ``pad_s`` on both sides, at most to the middle
+    between two contacts. Raises `TacpipeError` unless 0 <= off <= on.
     """
-    starts, stops = runs(touching(load, on, off))
+    starts, stops = runs(contact_mask(load, on, off))
     if not len(starts):
         return np.zeros((0, 2), dtype=np.int64)
     separate = t_ns[starts[1:]] - t_ns[stops[:-1] - 1] > round(merge_s * 1e9)  # (contact - 1,)
@@ -216,30 +218,32 @@ def contact_intervals(
 def _require_taxels(values: AnyArray, axes: int) -> None:
     channels = values.shape[1]
     if not channels or channels % axes:
-        raise TacpipeError(f"{channels} tactile channels are not whole taxels of {axes} axes; check the columns.")
+        raise TacpipeError(
+            f"There are {channels} tactile channels; taxels of {axes} axes need a multiple. Check the columns."
+        )
 
 
-NOISES = 3.0  # standard deviations of a finger's pressure at rest, beyond which it is touched
+NOISES = 3.0  # contact threshold, as a multiple of the standard deviation of a finger's pressure at rest
 
 
 @dataclass(frozen=True)
 class ContactLimits:
-    """Limits of pressing and of rest."""
+    """Thresholds of contact and of steady pressure."""
 
-    rest_s: float  # seconds at the start, whose median is each finger's level without load
-    on_count: float  # device counts of pressure above that level, from which on a finger presses
-    settle_s: float  # seconds that all fingers must press, and that the reading is taken of
-    settled_count: float  # device counts by which the pressure may vary in so many seconds, and still rests
+    rest_s: float  # time at the start whose median is the rest level of each finger
+    on_count: float  # pressure above the rest level, in counts, at which a finger presses
+    settle_s: float  # time for which all fingers must press, and duration of the averaged reading
+    settled_count: float  # largest range of a steady pressure within ``settle_s``, in counts
 
 
 def contact_row(pressure: Floats, t_ns: Times, limits: ContactLimits) -> int:
-    """Return the first row in which all fingers touch; ``pressure`` is (time, finger).
+    """Return the first row in which all fingers are in contact; ``pressure`` is (time, finger).
 
-    They do where all then press for ``settle_s`` or longer. Each has touched since its pressure left rest for the last
-    time before that: since it is above a count, or `NOISES` times its noise at rest if that is more. Raises `TacpipeError`
-    where the stream is too short, or some finger never presses while the others do.
+    It is before the first ``settle_s`` in which all fingers press. A finger is in contact from the last row before that in
+    which its pressure rises above 1 count or `NOISES` times its noise at rest. Raises `TacpipeError` if the stream is too
+    short, or the fingers never press together.
     """
-    rows = _rows(t_ns, limits.settle_s)
+    rows = _count_rows(t_ns, limits.settle_s)
     level = rest_level(pressure, t_ns, limits.rest_s)
     rise = pressure - level  # (time, finger)
     pressing = np.logical_and.reduce(rise >= limits.on_count, axis=1)  # (time,)
@@ -247,43 +251,41 @@ def contact_row(pressure: Floats, t_ns: Times, limits: ContactLimits) -> int:
     if not pressed.any():
         largest = ", ".join(f"{value:g}" for value in rise.max(axis=0))
         raise TacpipeError(
-            f"There is no contact: the fingers' pressures rise by {largest} counts at most, and must all be "
-            f"{limits.on_count:g} or more above rest for {limits.settle_s:g} s. Leave the grasp out, or lower --on-count."
+            f"There is no contact: the fingers' pressures rise by at most {largest} counts, but all must rise by "
+            f"{limits.on_count:g} for {limits.settle_s:g} s. Exclude the grasp, or lower --on-count."
         )
     noise = rise[t_ns - t_ns[0] <= limits.rest_s * 1e9].std(axis=0)  # (finger,)
-    touching = rise > np.clip(
-        NOISES * noise, 1.0, 0.99 * limits.on_count
-    )  # whatever moved at rest, pressing is touching
+    touching = rise > np.clip(NOISES * noise, 1.0, 0.99 * limits.on_count)  # a pressing finger is always in contact
     since = [int(runs(finger[: pressed.argmax() + 1])[0][-1]) for finger in touching.T]
     return max(since)
 
 
 def settled_rows(pressure: Floats, t_ns: Times, contact: int, limits: ContactLimits) -> slice:
-    """Return the first ``settle_s`` of rows, from the row ``contact`` on, in which the pressure of each finger rests.
+    """Return the first ``settle_s`` from row ``contact`` in which the pressure of all fingers (time, finger) is steady.
 
-    ``pressure`` is (time, finger). Raises `TacpipeError` if it never does.
+    Raises `TacpipeError` if there are none.
     """
-    rows = _rows(t_ns, limits.settle_s)
+    rows = _count_rows(t_ns, limits.settle_s)
     windows = sliding_window_view(pressure[contact:], rows, axis=0)  # (start, finger, row)
     ranges = np.ptp(windows, axis=-1).max(axis=1)  # (start,)
     if not (ranges <= limits.settled_count).any():
         raise TacpipeError(
-            f"The fingers' pressures never rest after contact: within {limits.settle_s:g} s they vary by "
-            f"{ranges.min():g} counts or more, and may by {limits.settled_count:g}. Hold the grasp still for longer, or "
-            f"allow more with --settled-count."
+            f"The fingers' pressures are never steady after contact: within {limits.settle_s:g} s they vary by at least "
+            f"{ranges.min():g} counts; at most {limits.settled_count:g} are allowed. Hold the grasp longer, or raise "
+            f"--settled-count."
         )
     first = contact + int((ranges <= limits.settled_count).argmax())
     return slice(first, first + rows)
 
 
-def _rows(t_ns: Times, duration_s: float) -> int:
-    """Return how many rows last ``duration_s``, one or more. Raises `TacpipeError` if a stream has no more than these."""
+def _count_rows(t_ns: Times, duration_s: float) -> int:
+    """Return the number of rows in ``duration_s``, at least 1. Raises `TacpipeError` if the stream has no more rows."""
     rows = 1
     if len(t_ns) > 1:
         rows = max(1, round(duration_s * 1e9 / float(np.median(np.diff(t_ns)))))
     if len(t_ns) <= rows:
         raise TacpipeError(
-            f"The fingers' stream has {len(t_ns)} rows; at its rate {rows} must be held, and some before that. Record "
-            f"from before the hand closes until after."
+            f"The fingers' stream has {len(t_ns)} rows; at its rate, more than {rows} are needed. Record from before the "
+            f"hand closes until after it."
         )
     return rows

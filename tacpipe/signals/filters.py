@@ -1,4 +1,4 @@
-"""Smooth evenly spaced samples, with the full signal or causally, and reduce a signal to its envelope."""
+"""Smooth uniformly sampled signals, with zero phase or causally, and reduce a signal to its envelope."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.errors import TacpipeError
 
-PAD_ROWS = 9  # scipy.signal.filtfilt's default for a filter of second order: three times its three coefficients
+PAD_ROWS = 9  # default of scipy.signal.filtfilt for a second-order filter: three times its three coefficients
 
 
 @dataclass(frozen=True)
 class Biquad:
-    """A filter of second order: ``y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2]``."""
+    """A second-order filter: ``y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2]``."""
 
     b: tuple[float, float, float]
     a: tuple[float, float]  # a1 and a2; a0 is 1
 
     def causal(self, values: AnyArray) -> Floats:
-        """Return ``values`` (time,) filtered with what came so far, as if the first value had always been there.
+        """Filter ``values`` (time,) forwards, as if the first value had been constant before.
 
-        The recursion is the transposed direct form II, its state at first that of a constant input.
+        The filter is in transposed direct form II.
         """
         (b0, b1, b2), (a1, a2) = self.b, self.a
         first = float(values[0]) if len(values) else 0.0
@@ -30,7 +30,7 @@ class Biquad:
         second_state = (b2 - a2 * gain) * first
         first_state = (b1 - a1 * gain) * first + second_state
         filtered = []
-        for value in values.tolist():  # a recursion; plain numbers are faster than numpy's here
+        for value in values.tolist():  # in a recursion, Python floats are faster than those of numpy
             smooth = b0 * value + first_state
             first_state = b1 * value - a1 * smooth + second_state
             second_state = b2 * value - a2 * smooth
@@ -38,10 +38,7 @@ class Biquad:
         return np.array(filtered, dtype=np.float64)
 
     def both_ways(self, values: AnyArray) -> Floats:
-        """Return ``values`` (time,) filtered forwards and backwards, which shifts nothing in time.
-
-        Both ends are continued by the values before them, turned about the end (odd padding, as scipy.signal.filtfilt).
-        """
+        """Filter ``values`` (time,) forwards and backwards, with zero phase and odd padding as in scipy.signal.filtfilt."""
         pad = min(PAD_ROWS, len(values) - 1)
         if pad < 1:
             return values.astype(np.float64)
@@ -53,15 +50,15 @@ class Biquad:
 
 
 def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
-    """Return the Butterworth low-pass of second order: gain 1 at rest, 1/sqrt(2) at ``cutoff_hz``.
+    """Return a second-order Butterworth low-pass with gain 1 at 0 Hz and 1/sqrt(2) at ``cutoff_hz``.
 
-    By the bilinear transform with the cutoff prewarped (Oppenheim and Schafer, "Discrete-Time Signal Processing", 7.2).
-    Raises `TacpipeError` for a cutoff that is not between 0 and half the rate.
+    It is the bilinear transform with prewarped cutoff (Oppenheim and Schafer, "Discrete-Time Signal Processing", 7.2).
+    Raises `TacpipeError` unless the cutoff is between 0 and half the rate.
     """
     if not 0 < cutoff_hz < rate_hz / 2:
         raise TacpipeError(
-            f"A cutoff of {cutoff_hz:g} Hz is impossible at {rate_hz:g} samples a second; it must lie above 0 and below "
-            f"half the rate, {rate_hz / 2:g} Hz."
+            f"The cutoff is {cutoff_hz:g} Hz; at a sampling rate of {rate_hz:g} Hz it must be above 0 and below half the "
+            f"rate, {rate_hz / 2:g} Hz."
         )
     warped = float(np.tan(np.pi * cutoff_hz / rate_hz))
     scale = 1 / (1 + np.sqrt(2.0) * warped + warped**2)
@@ -71,7 +68,7 @@ def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
 
 
 def median(values: AnyArray, rows: int) -> Floats:
-    """Return the median of the ``rows`` (odd) around each row of ``values`` (time,); end values continue beyond the ends.
+    """Return the median of the ``rows`` (odd) around each row of ``values`` (time,), with constant padding at both ends.
 
     >>> median(np.array([1, 9, 1, 1, 2]), 3).tolist()
     [1.0, 1.0, 1.0, 1.0, 2.0]
@@ -79,10 +76,10 @@ def median(values: AnyArray, rows: int) -> Floats:
     return _medians(values, rows // 2, rows // 2)
 
 
-def median_so_far(values: AnyArray, rows: int) -> Floats:
-    """Return the median of each row of ``values`` (time,) and the ``rows - 1`` before it.
+def trailing_median(values: AnyArray, rows: int) -> Floats:
+    """Return the median of each row of ``values`` (time,) and the previous ``rows - 1``.
 
-    >>> median_so_far(np.array([1, 9, 1, 2, 2]), 3).tolist()
+    >>> trailing_median(np.array([1, 9, 1, 2, 2]), 3).tolist()
     [1.0, 1.0, 1.0, 2.0, 2.0]
     """
     return _medians(values, rows - 1, 0)
@@ -98,10 +95,10 @@ def _medians(values: AnyArray, before: int, after: int) -> Floats:
 
 
 def envelope(t_ns: Times, values: AnyArray, points: int) -> tuple[Times, Floats]:
-    """Return a signal (time, channel) with at most ``points`` rows that looks the same as a line: times, values.
+    """Return times and values of a signal (time, channel) reduced to at most ``points`` rows for a line plot.
 
-    A longer one is cut into ``points // 2`` stretches of equal time. Of each that has rows, two remain: the least values,
-    at its first row, and the largest, at its middle one. NaN is left out where a stretch has anything else. Times ascend.
+    A longer signal is divided into ``points // 2`` intervals of equal duration. Each interval with rows becomes two rows:
+    its minima at its first time and its maxima at its middle time. NaN is ignored unless an interval has only NaN.
 
     >>> t_ns, values = envelope(np.arange(6), np.array([[0], [9], [1], [5], [-7], [6]]), points=4)
     >>> t_ns.tolist(), values.ravel().tolist()

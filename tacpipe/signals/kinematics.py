@@ -1,10 +1,9 @@
-"""Convert rotations, as quaternions x, y, z, w, and compute the velocity of a serial arm's hand from its joints.
+"""Convert rotations and compute the velocity of a serial arm's hand from its joints. Quaternions are x, y, z, w.
 
-A chain is given by its modified Denavit-Hartenberg parameters (Craig, Introduction to Robotics, 1986, section 3.4). Each
-revolute joint adds ``axis × (hand - joint)`` times its speed to the hand's velocity and ``axis`` to its angular one: the
-columns of the geometric Jacobian (Siciliano et al., Robotics, 2009, section 3.1).
-
-The velocity is exact where differences of logged poses are rough.
+A chain is defined by its modified Denavit-Hartenberg parameters (Craig, Introduction to Robotics, 1986, section 3.4).
+The column of the geometric Jacobian for a revolute joint is ``axis × (hand - joint)`` for linear and ``axis`` for
+angular velocity (Siciliano et al., Robotics, 2009, section 3.1). This velocity is more accurate than differences of
+logged poses.
 """
 
 from __future__ import annotations
@@ -16,15 +15,16 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Times
 
-UPRIGHT = 1e-12  # largest distance of the sine of a right angle from 1
+UPRIGHT = 1e-12  # distance of a sine from 1 below which the angle counts as a right angle
 
 
-def continuous(quaternions: Floats) -> Floats:
-    """Return ``quaternions`` (time, 4) at unit length, each with the sign that lies nearer to the one before.
+def make_continuous(quaternions: Floats) -> Floats:
+    """Normalise ``quaternions`` (time, 4) and choose each sign for the smaller distance to the previous one.
 
-    q and -q are the same rotation; a recorded series may jump between them. The first keeps its sign. Rows of NaN stay.
+    q and -q are the same rotation, and a recorded series may jump between them. The sign of the first is unchanged, and
+    NaN is allowed.
 
-    >>> continuous(np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, -2.0]])).tolist()
+    >>> make_continuous(np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, -2.0]])).tolist()
     [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]
     """
     unit: Floats = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -34,20 +34,20 @@ def continuous(quaternions: Floats) -> Floats:
     return unit + 0.0  # -0.0 becomes 0.0, so that equal rotations have equal bytes
 
 
-def quaternions_of(matrices: Floats) -> Floats:
-    """Return the unit quaternions (time, 4) of rotation matrices (time, 3, 3), w not negative.
+def matrices_to_quaternions(matrices: Floats) -> Floats:
+    """Convert rotation matrices (time, 3, 3) to unit quaternions (time, 4) with non-negative w.
 
-    Of the four ways to take the square root that with the largest pivot is used, which never divides by a small number
-    (Shepperd, "Quaternion from rotation matrix", 1978).
+    The largest pivot is used, so that no division is by a small number (Shepperd, "Quaternion from rotation matrix",
+    1978).
     """
     m = matrices
     trace = np.trace(m, axis1=1, axis2=2)  # (time,)
     diagonal = np.diagonal(m, axis1=1, axis2=2)  # (time, axis)
-    pivots = np.column_stack([diagonal, trace])  # (time, 4): which of x, y, z, w is largest
+    pivots = np.column_stack([diagonal, trace])  # (time, 4): the largest belongs to the largest of x, y, z, w
     x, y, z = (2 * diagonal[:, axis] - trace + 1 for axis in range(3))
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
     xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    rows = np.stack(  # (time, pivot, 4): each row is the quaternion times four of its component at the pivot
+    rows = np.stack(  # (time, pivot, 4): the quaternion times four times its component at the pivot
         [
             np.stack([x, xy, xz, xw], axis=1),
             np.stack([xy, y, yz, yw], axis=1),
@@ -61,8 +61,8 @@ def quaternions_of(matrices: Floats) -> Floats:
     return np.where(unit[:, 3:] < 0, -unit, unit)
 
 
-def matrices_of(quaternions: Floats) -> Floats:
-    """Return the rotation matrices (time, 3, 3) of unit quaternions (time, 4)."""
+def quaternions_to_matrices(quaternions: Floats) -> Floats:
+    """Convert unit quaternions (time, 4) to rotation matrices (time, 3, 3)."""
     x, y, z, w = quaternions.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -72,15 +72,15 @@ def matrices_of(quaternions: Floats) -> Floats:
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
-def quaternions_of_vectors(vectors_rad: Floats) -> Floats:
-    """Return the unit quaternions (time, 4) of rotation vectors (time, 3): the axis, as long as the angle in rad."""
+def vectors_to_quaternions(vectors_rad: Floats) -> Floats:
+    """Convert rotation vectors (time, 3) in rad to unit quaternions (time, 4)."""
     half = np.linalg.norm(vectors_rad, axis=1, keepdims=True) / 2
-    shrink = np.sinc(half / np.pi) / 2  # sin(half) / angle, 1/2 where nothing is turned
+    shrink = np.sinc(half / np.pi) / 2  # sin(half) / angle, 1/2 at angle 0
     return np.hstack([vectors_rad * shrink, np.cos(half)])
 
 
-def vectors_of(quaternions: Floats) -> Floats:
-    """Return the rotation vectors (time, 3) of unit quaternions (time, 4), of half a turn at most."""
+def quaternions_to_vectors(quaternions: Floats) -> Floats:
+    """Convert unit quaternions (time, 4) to rotation vectors (time, 3) with angles of at most pi."""
     signed = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
     sine = np.linalg.norm(signed[:, :3], axis=1, keepdims=True)
     half = np.arctan2(sine, signed[:, 3:])
@@ -88,11 +88,8 @@ def vectors_of(quaternions: Floats) -> Floats:
     return vectors
 
 
-def quaternions_of_angles(angles_rad: Floats) -> Floats:
-    """Return the unit quaternions (time, 4) of turns (time, 3) about z, then the new y, then the new x; rad.
-
-    These are the angles A, B and C of KUKA.
-    """
+def angles_to_quaternions(angles_rad: Floats) -> Floats:
+    """Convert intrinsic z-y-x Euler angles (time, 3) in rad, KUKA's A, B and C, to unit quaternions (time, 4)."""
     (cz, cy, cx), (sz, sy, sx) = np.cos(angles_rad.T / 2), np.sin(angles_rad.T / 2)
     return np.column_stack(
         [
@@ -104,10 +101,10 @@ def quaternions_of_angles(angles_rad: Floats) -> Floats:
     )
 
 
-def angles_of(quaternions: Floats) -> Floats:
-    """Return the turns (time, 3) about z, the new y and the new x of unit quaternions (time, 4); rad.
+def quaternions_to_angles(quaternions: Floats) -> Floats:
+    """Convert unit quaternions (time, 4) to intrinsic z-y-x Euler angles (time, 3) in rad.
 
-    Where the new x points along z, the first and the last turn are about one axis; the last is 0 then.
+    In gimbal lock, the last angle is 0.
     """
     x, y, z, w = quaternions.T
     sine = np.clip(2 * (w * y - z * x), -1, 1)
@@ -118,14 +115,14 @@ def angles_of(quaternions: Floats) -> Floats:
     return np.column_stack([about_z, np.arcsin(sine), np.where(upright, 0.0, about_x)])
 
 
-BLOCK_ROWS = 1 << 14  # rows whose frames are computed at once
-TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
-TURN_SPREAD = 0.01  # the same of the entries of its rotation matrix
+BLOCK_ROWS = 1 << 14  # rows of frames in memory
+TOOL_SPREAD_M = 0.005  # largest standard deviation of the position of a hand in the frame of its arm's last link
+TURN_SPREAD = 0.01  # largest standard deviation of the entries of its rotation matrix
 
 
 @dataclass(frozen=True)
 class KinematicChain:
-    """Modified Denavit-Hartenberg parameters of revolute joints, each (joint,): lengths in metres, twists in radians."""
+    """Modified Denavit-Hartenberg parameters of revolute joints, each (joint,)."""
 
     length_m: tuple[float, ...]
     offset_m: tuple[float, ...]
@@ -141,14 +138,14 @@ PANDA = KinematicChain(  # Franka Emika, Panda documentation, "Denavit-Hartenber
 IIWA14 = (
     KinematicChain(  # KUKA LBR iiwa 14 R820, data sheet: 0.36, 0.42, 0.40 m between base, shoulder, elbow and wrist
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126),  # the last one to the flange, without the plate for tools
+        (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126),  # the last offset is to the flange, without the tool plate
         (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, -_QUARTER, _QUARTER),
     )
 )
 
 
 def joint_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
-    """Return the pose of each joint's frame in the base's, (time, joint, 4, 4), at angles ``joint_rad`` (time, joint)."""
+    """Return the poses of the joints' frames in the base frame (time, joint, 4, 4) at angles ``joint_rad`` (time, joint)."""
     frames = np.empty((*joint_rad.shape, 4, 4))
     reached = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
     for joint, (length, offset, twist) in enumerate(zip(chain.length_m, chain.offset_m, chain.twist_rad, strict=True)):
@@ -174,64 +171,68 @@ def joint_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
     return frames
 
 
-def carries(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
-    """Return whether a hand at ``hand_m`` (time, 3) hangs rigidly on the chain's last link: whether it is this arm.
+def carries_hand(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
+    """Return whether the positions ``hand_m`` (time, 3) are fixed in the frame of the chain's last link.
 
-    Rows that are not finite do not state.
+    If not, the hand belongs to another arm. Non-finite rows are ignored.
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
     joint_rad, hand_m = joint_rad[finite], hand_m[finite]
     last = last_frames(chain, joint_rad)
-    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])  # (time, 3), in the last link's frame
+    tool_m = np.einsum(
+        "tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3]
+    )  # (time, 3), in the frame of the last link
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 
-def turns(chain: KinematicChain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
-    """Return whether a hand with ``quaternions`` x, y, z, w (time, 4) turns with the chain's last link as one rigid body.
+def rotates_with_hand(chain: KinematicChain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
+    """Return whether the orientations ``quaternions`` (time, 4) are fixed in the frame of the chain's last link.
 
-    Rows that are not finite are left out.
+    Non-finite rows are ignored.
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(quaternions).all(axis=1)
     last = last_frames(chain, joint_rad[finite])[:, :3, :3]
-    tool = last.transpose(0, 2, 1) @ matrices_of(quaternions[finite])  # (time, 3, 3), in the last link's frame
+    tool = last.transpose(0, 2, 1) @ quaternions_to_matrices(
+        quaternions[finite]
+    )  # (time, 3, 3), in the frame of the last link
     return bool(len(tool)) and bool((tool.std(axis=0) < TURN_SPREAD).all())
 
 
 def last_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
-    """Return the pose of the last joint's frame in the base's (time, 4, 4)."""
-    lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
-    return np.concatenate([np.zeros((0, 4, 4)), *lasts])
+    """Return the pose of the last joint's frame in the base frame (time, 4, 4)."""
+    frames = [joint_frames(chain, joint_rad[block])[:, -1].copy() for block in _blocks(len(joint_rad))]
+    return np.concatenate([np.zeros((0, 4, 4)), *frames])
 
 
 def hand_velocity(chain: KinematicChain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
-    """Return linear (m/s) and angular (rad/s) velocity of the hand in the base's frame, (time, 6).
+    """Return linear (m/s) and angular (rad/s) velocity of the hand in the base frame (time, 6).
 
     ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).
     """
     velocity = np.empty((len(joint_rad), 6))
     for block in _blocks(len(joint_rad)):
-        velocity[block] = velocity_in(joint_frames(chain, joint_rad[block]), joint_rad_s[block], hand_m[block])
+        velocity[block] = velocity_from_frames(joint_frames(chain, joint_rad[block]), joint_rad_s[block], hand_m[block])
     return velocity
 
 
-def velocity_in(frames: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
-    """Return the velocity (time, 6) that `hand_velocity` does, with the poses of the joints from `joint_frames`."""
-    axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
-    levers = np.cross(axes, hand_m[:, None] - places)
+def velocity_from_frames(frames: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
+    """Return the result of `hand_velocity` (time, 6) from the result of `joint_frames`."""
+    axes, origins = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
+    levers = np.cross(axes, hand_m[:, None] - origins)
     parts = [np.einsum("tja,tj->ta", vectors, joint_rad_s) for vectors in (levers, axes)]
     return np.concatenate(parts, axis=1)
 
 
 def _blocks(rows: int) -> Iterator[slice]:
-    """Yield slices of `BLOCK_ROWS` rows: the frames of a row take 900 bytes, and those of an hour would not fit."""
+    """Yield slices of `BLOCK_ROWS` rows. The frames of a row need 900 bytes, so those of an hour do not fit in memory."""
     return (slice(first, first + BLOCK_ROWS) for first in range(0, rows, BLOCK_ROWS))
 
 
-def differences(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> AnyFloats:
-    """Return linear (m/s) and angular (rad/s) velocity from each row and the one before, (time, 6); 0 in the first.
+def difference_velocity(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> AnyFloats:
+    """Return linear (m/s) and angular (rad/s) velocity (time, 6) as backward differences; 0 in the first row.
 
-    ``quaternions`` (time, 4) are x, y, z, w, of unit length and continuous sign. Between neighbours the rotation is
-    small, so its vector is twice the vector part of their ratio. Only rows up to the own one are read.
+    ``quaternions`` (time, 4) are normalised and of continuous sign. Rotations between rows are small, so the rotation
+    vector is twice the vector part of their quotient.
     """
     velocity = np.zeros((len(t_ns), 6))
     step_s = np.diff(t_ns) / 1e9
@@ -246,9 +247,9 @@ def differences(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> A
 
 
 def path_speed(t_ns: Times, position_m: AnyFloats, span_s: float = 0.02) -> Floats:
-    """Return the speed along a path in m/s, (time,), of ``position_m`` (time, axis): over ``span_s`` around each row.
+    """Return the speed (time,) in m/s of ``position_m`` (time, axis), averaged over ``span_s`` around each row.
 
-    A span, because the difference of two readings in a row is mostly their noise.
+    Differences of neighbouring rows are mostly noise.
 
     >>> path_speed(np.arange(5) * 10_000_000, np.arange(5)[:, None] * 0.01).round(6).tolist()
     [1.0, 1.0, 1.0, 1.0, 1.0]
@@ -257,9 +258,9 @@ def path_speed(t_ns: Times, position_m: AnyFloats, span_s: float = 0.02) -> Floa
     rows = np.arange(len(t_ns))
     first = np.minimum(np.searchsorted(t_ns, t_ns - half_ns), np.maximum(rows - 1, 0))
     last = np.maximum(np.searchsorted(t_ns, t_ns + half_ns, side="right") - 1, np.minimum(rows + 1, len(rows) - 1))
-    moved = np.empty(len(t_ns))
+    distance_m = np.empty(len(t_ns))
     for block in _blocks(len(t_ns)):
-        moved[block] = np.linalg.norm(position_m[last[block]] - position_m[first[block]], axis=1)
-    took_s = (t_ns[last] - t_ns[first]) / 1e9
-    speed: Floats = np.divide(moved, took_s, out=np.zeros(len(t_ns)), where=took_s > 0)
+        distance_m[block] = np.linalg.norm(position_m[last[block]] - position_m[first[block]], axis=1)
+    duration_s = (t_ns[last] - t_ns[first]) / 1e9
+    speed: Floats = np.divide(distance_m, duration_s, out=np.zeros(len(t_ns)), where=duration_s > 0)
     return speed

@@ -1,8 +1,8 @@
-"""Repair recorded signals: impossible single readings, counters that wrapped, and repeated frames.
+"""Repair recorded signals: spikes, wrapped counters, and repeated frames.
 
-Hampel's identifier (Davies and Gather, "The identification of multiple outliers", JASA 1993): a reading is one that is
-further from the median of the window around it than a number of scaled median absolute deviations. On flat signals of whole
-counts those are 0 and every step of one count would be a spike, so there is a least distance.
+Spikes are found with Hampel's identifier (Davies and Gather, "The identification of multiple outliers", JASA 1993): the
+distance from the median of a window exceeds a number of scaled median absolute deviations. In constant integer signals
+these are 0 and each change by one count would be a spike, so there is also a smallest distance.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Bools, Times
 
 BLOCK_VALUES = 1 << 19  # values whose windows are in memory at once
-TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in its median absolute deviations
+TO_SIGMA = 1.4826  # standard deviation per median absolute deviation of a normal distribution
 
 
 def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tuple[Bools, AnyArray]:
-    """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these repaired.
+    """Return the mask of spikes in ``values`` (time, channel), and the values with spikes replaced.
 
-    A spike is further than ``deviations`` scaled median absolute deviations, and than ``floor``, from the median of the
-    ``rows`` (odd) around it, which takes its place; with one row there are none. Signals are
-    mirrored at their ends. Types stay as they are.
+    The distance of a spike from the median of the ``rows`` (odd) around it exceeds both ``deviations`` scaled median
+    absolute deviations and ``floor``. It is replaced by the median. Signals are mirrored at their ends. The dtype is
+    unchanged.
 
     >>> is_spike, repaired = hampel(np.array([[3], [4], [900], [4], [5]]), rows=5, deviations=5.0, floor=100.0)
     >>> is_spike.ravel().tolist(), repaired.ravel().tolist()
@@ -33,7 +33,9 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
     half = rows // 2
     if not 0 < half < len(values):
         return is_spike, repaired
-    wide = np.flatnonzero(values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor)  # others have no spike
+    wide = np.flatnonzero(
+        values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor
+    )  # other channels have no spikes
     if not len(wide):
         return is_spike, repaired
     block_rows = max(1, BLOCK_VALUES // len(wide))
@@ -50,51 +52,51 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
     return is_spike, repaired
 
 
-HALF, RANGE = 1 << 15, 1 << 16  # half range and range of counts of 16 bits
+HALF, RANGE = 1 << 15, 1 << 16  # half range and range of 16-bit counts
 
 
-def unwrapped(values: AnyArray) -> AnyArray:
-    """Return ``values`` (time,), integers of 16 bits, with wrap-around undone, as int32; as they are where there is none.
+def unwrap(values: AnyArray) -> AnyArray:
+    """Return 16-bit integers ``values`` (time,) unwrapped as int32, or unchanged if they do not wrap.
 
-    A jump of more than half the range between consecutive samples is one, the other way round the range: no signal that
-    is sampled well moves so far. Real uSkin frames jump by 5,000 counts at most.
+    A jump of more than half the range between consecutive samples is a wrap: no well-sampled signal changes that fast.
+    Recorded uSkin frames change by at most 5,000 counts.
 
-    >>> unwrapped(np.array([65_530, 65_535, 4, 65_534], dtype=np.uint16)).tolist()
+    >>> unwrap(np.array([65_530, 65_535, 4, 65_534], dtype=np.uint16)).tolist()
     [65530, 65535, 65540, 65534]
     """
     if len(values) < 2 or int(values.max()) - int(values.min()) <= HALF:
         return values
     wide = values.astype(np.int32)
-    turned = turns(wide)
+    turned = count_wraps(wide)
     if not turned.any():
         return values
     wide[1:] += RANGE * np.cumsum(turned, dtype=np.int32)
     return wide
 
 
-def turns(values: AnyArray) -> AnyArray:
-    """Return how often each row of ``values`` (time, …) wrapped around since the row before: 1, 0 or -1, (time - 1, …).
+def count_wraps(values: AnyArray) -> AnyArray:
+    """Return the number of wraps before each row of ``values`` (time, …): 1, 0 or -1, (time - 1, …).
 
-    The counts are of a type that holds their differences.
+    The dtype of ``values`` must represent their differences.
 
-    >>> turns(np.array([65_535, 4, 65_534])).tolist()
+    >>> count_wraps(np.array([65_535, 4, 65_534])).tolist()
     [1, -1]
     """
     jumps = np.diff(values, axis=0)
     return (jumps < -HALF).astype(np.int32) - (jumps > HALF)
 
 
-def held(values: AnyArray) -> Bools:
-    """Return where every channel of ``values`` (time, channel) equals the frame before (time,); the first never does.
+def repeated_rows(values: AnyArray) -> Bools:
+    """Return a mask of rows of ``values`` (time, channel) that equal the previous row (time,); False for the first row.
 
-    >>> held(np.array([[1, 2], [1, 2], [1, 3]])).tolist()
+    >>> repeated_rows(np.array([[1, 2], [1, 2], [1, 3]])).tolist()
     [False, True, False]
     """
-    return held_columns(list(values.T))
+    return repeated_in_columns(list(values.T))
 
 
-def held_columns(columns: Iterable[AnyArray]) -> Bools:
-    """Return the same as `held` for channels that lie apart, each (time,); stops at the first that leaves none held."""
+def repeated_in_columns(columns: Iterable[AnyArray]) -> Bools:
+    """Return the result of `repeated_rows` for separate channels (time,). Stops as soon as no row is repeated."""
     repeated = np.zeros(0, dtype=bool)
     for number, column in enumerate(columns):
         if not number:
@@ -107,14 +109,11 @@ def held_columns(columns: Iterable[AnyArray]) -> Bools:
 
 
 def mean_rate_hz(t_ns: Times) -> float:
-    """Return how many samples came a second; 0 for fewer than two samples or for stamps that are all equal."""
-    return fresh_rate_hz(t_ns, np.zeros(len(t_ns), dtype=bool))
+    """Return the mean sampling rate in Hz, or 0 for fewer than two samples or constant time."""
+    return new_frame_rate_hz(t_ns, np.zeros(len(t_ns), dtype=bool))
 
 
-def fresh_rate_hz(t_ns: Times, repeated: Bools) -> float:
-    """Return how many new frames came a second: those after the first that are not held, over the time they span.
-
-    0 for fewer than two samples or for stamps that are all equal.
-    """
+def new_frame_rate_hz(t_ns: Times, repeated: Bools) -> float:
+    """Return the mean rate in Hz of frames that do not repeat the previous one, or 0 as `mean_rate_hz`."""
     span_ns = int(t_ns[-1] - t_ns[0]) if len(t_ns) else 0
     return float(np.count_nonzero(~repeated[1:]) * 1e9 / span_ns) if span_ns > 0 else 0.0

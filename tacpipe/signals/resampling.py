@@ -1,8 +1,8 @@
 """Resample signals: grids, interpolation, distance to samples, and gaps.
 
-Time is int64 nanoseconds throughout. Only differences of stamps become floats, so that stamps near 1.6e18 (UTC today)
-lose nothing: as float64 they would be rounded to 256 ns. Stamps must not run backwards; equal ones are allowed, and the
-last of them counts. Beyond the first and the last sample a signal keeps its end value; `in_gap` states where that is.
+Time is int64 nanoseconds. Only time differences become floats: UTC times near 1.6e18 as float64 would be rounded to
+256 ns. Times must not decrease; of equal times, the last sample counts. Before the first and after the last sample, a
+signal is constant; `in_gap` marks these points.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.kinematics import continuous
+from tacpipe.signals.kinematics import make_continuous
 
-GAP_NS = 50_000_000  # longest time between two samples without a gap, of sensors of 20 Hz or more
-GAP_PERIODS = 2.5  # the same of slower sensors, in their periods
-PARALLEL = 1e-6  # rad; below this angle the sine weights of slerp divide by zero and linear ones are exact to 1e-13
+GAP_NS = 50_000_000  # longest time between two samples without a gap, for sensors of 20 Hz or more
+GAP_PERIODS = 2.5  # the same for slower sensors, in periods
+PARALLEL = 1e-6  # rad; below this angle, slerp divides by almost zero, and linear weights are exact to 1e-13
 
 
 def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
-    """Return ``first_ns + round(k * 1e9 / rate_hz)`` for k = 0, 1, … as far as ``last_ns``, int64 (time,).
+    """Return ``first_ns + round(k * 1e9 / rate_hz)`` for k = 0, 1, … up to ``last_ns``, int64 (time,).
 
-    Empty if ``last_ns`` lies before ``first_ns``. Raises `TacpipeError` for a rate that is not positive.
+    It is empty if ``last_ns`` is before ``first_ns``. Raises `TacpipeError` if the rate is not positive.
 
     >>> uniform_grid(0, 70_000_000, 30.0).tolist()
     [0, 33333333, 66666667]
@@ -32,23 +32,23 @@ def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
 
 
 def uniform_offsets(first: int, count: int, rate_hz: float) -> Times:
-    """Return ``round(k * 1e9 / rate_hz)`` for the ``count`` whole numbers k from ``first``, int64 (time,).
+    """Return ``round(k * 1e9 / rate_hz)`` for ``count`` integers k from ``first``, int64 (time,).
 
-    Raises `TacpipeError` for a rate that is not positive.
+    Raises `TacpipeError` if the rate is not positive.
 
     >>> uniform_offsets(1, 2, 30.0).tolist()
     [33333333, 66666667]
     """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e9):
-        raise TacpipeError(f"A rate of {rate_hz} Hz gives no grid; it must lie above 0 and at most at 1e9 Hz.")
+        raise TacpipeError(f"The rate of a grid is {rate_hz} Hz; it must be above 0 and at most 1e9 Hz.")
     offsets_ns: Times = np.rint(np.arange(first, first + count, dtype=np.float64) * 1e9 / rate_hz).astype(np.int64)
     return offsets_ns
 
 
 def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
-    """Return ``values`` (time, channel) at the times ``grid_ns``, interpolated linearly, as float64 (grid, channel).
+    """Interpolate ``values`` (time, channel) linearly at ``grid_ns``, as float64 (grid, channel).
 
-    A NaN spreads to the points between it and its neighbours and no further.
+    A NaN affects only the points between it and its neighbours.
     """
     lower, upper, weight = _neighbours(t_ns, grid_ns)
     start: Floats = np.take(values, lower, axis=0).astype(np.float64, copy=False)  # (grid, channel)
@@ -59,12 +59,12 @@ def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
 
 
 def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
-    """Return unit quaternions at ``grid_ns`` (grid, 4), turned at constant speed along the shorter arc between samples.
+    """Interpolate ``quaternions`` (time, 4) at ``grid_ns`` (grid, 4) with constant angular speed along the shorter arc.
 
-    ``quaternions`` (time, 4) are xyzw; they are normalised and their signs made continuous first, so neither scale nor
-    sign of a sample matters, and the result has no jump of sign either.
+    Quaternions are x, y, z, w. They are normalised with `kinematics.make_continuous` first, so that scale and sign do not
+    matter.
     """
-    ends = continuous(quaternions)
+    ends = make_continuous(quaternions)
     lower, upper, weight = _neighbours(t_ns, grid_ns)
     start, stop = ends[lower], ends[upper]  # (grid, 4)
     angle = np.arccos(np.clip((start * stop).sum(axis=1), -1.0, 1.0))  # (grid,)
@@ -72,20 +72,20 @@ def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
     sine = np.where(near, 1.0, np.sin(angle))
     first = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
     second = np.where(near, weight, np.sin(weight * angle) / sine)
-    turned: Floats = first[:, None] * start + second[:, None] * stop
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    return turned
+    interpolated: Floats = first[:, None] * start + second[:, None] * stop
+    interpolated /= np.linalg.norm(interpolated, axis=1, keepdims=True)
+    return interpolated
 
 
 def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -> Floats:
-    """Return the median of the samples at most ``half_ns`` from each grid point, float64 (grid, channel).
+    """Return the median of the samples within ``half_ns`` of each grid point, float64 (grid, channel).
 
-    ``values`` are (time, channel). Where no sample is that near, the value is that of `linear`.
+    ``values`` are (time, channel). Without a sample in the window, the result is that of `linear`.
     """
     medians = linear(t_ns, values, grid_ns)
     first = np.searchsorted(t_ns, grid_ns - half_ns, side="left")
     count = np.searchsorted(t_ns, grid_ns + half_ns, side="right") - first
-    for samples in np.unique(count[count > 0]).tolist():  # few different ones: about as many come in each window
+    for samples in np.unique(count[count > 0]).tolist():  # there are few different counts
         points = np.flatnonzero(count == samples)
         windows = values[first[points, None] + np.arange(samples)]  # (point, sample, channel)
         medians[points] = np.median(windows, axis=1)
@@ -93,10 +93,7 @@ def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -
 
 
 def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
-    """Return, sorted, the rows that `linear` and `slerp` look at: with those alone they give the same.
-
-    A stream of 1 kHz on a grid of 50 Hz is gathered from a tenth of its rows.
-    """
+    """Return the sorted rows that `linear` and `slerp` read. With 1 kHz samples on a 50 Hz grid, these are 10 %."""
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     bracketing = np.zeros(len(t_ns), dtype=bool)
     bracketing[lower] = bracketing[upper] = True
@@ -104,7 +101,7 @@ def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
 
 
 def nearest_rows(t_ns: Times, grid_ns: Times) -> Indices:
-    """Return for each grid point the row of the nearest sample (grid,); the earlier one where two are as near."""
+    """Return the row of the nearest sample for each grid point (grid,), of two equally near ones the earlier."""
     _require_samples(t_ns)
     after = np.clip(np.searchsorted(t_ns, grid_ns, side="right"), 1, max(len(t_ns) - 1, 1))
     before = after - 1
@@ -113,20 +110,18 @@ def nearest_rows(t_ns: Times, grid_ns: Times) -> Indices:
 
 
 def nearest(t_ns: Times, values: AnyArray, grid_ns: Times) -> AnyArray:
-    """Return the nearest sample of ``values`` (time, …) at each grid point (grid, …), its type kept."""
+    """Return the nearest sample of ``values`` (time, …) at each grid point (grid, …), with the same dtype."""
     return values[nearest_rows(t_ns, grid_ns)]
 
 
 def nearest_distance_ns(t_ns: Times, grid_ns: Times) -> Times:
-    """Return the distance from each grid point to the nearest sample, int64 nanoseconds (grid,), never negative."""
+    """Return the absolute distance from each grid point to the nearest sample in ns, int64 (grid,)."""
     distance_ns: Times = np.abs(t_ns[nearest_rows(t_ns, grid_ns)] - grid_ns)
     return distance_ns
 
 
 def newest_rows(t_ns: Times, grid_ns: Times) -> Indices:
-    """Return for each grid point the row of the newest sample that is not after it (grid,); of equal stamps the last.
-
-    -1 where there is none yet.
+    """Return the row of the last sample at or before each grid point (grid,), or -1 if there is none.
 
     >>> newest_rows(np.array([10, 20, 20]), np.array([5, 10, 30])).tolist()
     [-1, 0, 2]
@@ -135,19 +130,19 @@ def newest_rows(t_ns: Times, grid_ns: Times) -> Indices:
 
 
 def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
-    """Return where the newest sample, of ``newest_ns``, is older than ``gap_ns`` at a grid point (grid,).
+    """Return a mask of grid points (grid,) at which the newest sample, of ``newest_ns``, is older than ``gap_ns``.
 
-    That is what `in_gap` can state of a gap before the sample that ends it has come.
+    It is the online counterpart of `in_gap`, before the sample that ends a gap arrives.
     """
     overdue: Bools = grid_ns - newest_ns > gap_ns
     return overdue
 
 
 def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -> Floats:
-    """Return the median of the samples at most ``span_ns`` before each grid point, float64 (grid, channel).
+    """Return the median of the samples in the ``span_ns`` up to each grid point, float64 (grid, channel).
 
-    ``values`` are (time, channel). Where none is that near, the value is the newest sample's. Each grid point needs one
-    sample that is not after it.
+    ``values`` are (time, channel). Without a sample in the window, the result is the newest sample. Each grid point needs
+    a sample at or before it.
     """
     newest = newest_rows(t_ns, grid_ns)
     medians: Floats = values[newest].astype(np.float64)
@@ -158,9 +153,7 @@ def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -
 
 
 def default_gap_ns(t_ns: Times) -> int:
-    """Return the longest time between two samples of a stream without a gap: 50 ms, below 20 Hz 2.5 of its periods.
-
-    The period is the median step between its stamps.
+    """Return the longest time between two samples without a gap: 50 ms, or 2.5 median periods below 20 Hz.
 
     >>> default_gap_ns(np.arange(5) * 10_000_000), default_gap_ns(np.arange(5) * 73_000_000)
     (50000000, 182500000)
@@ -170,10 +163,7 @@ def default_gap_ns(t_ns: Times) -> int:
 
 
 def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
-    """Return where a grid point has no trustworthy value (grid,).
-
-    That is strictly between two samples further apart than ``gap_ns``, or outside the range of the samples.
-    """
+    """Return a mask of grid points (grid,) between samples more than ``gap_ns`` apart, or outside the samples' range."""
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
     inside: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
@@ -181,9 +171,9 @@ def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
 
 
 def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
-    """Return the sample rows before and after each grid point and the weight of the latter, each (grid,).
+    """Return the rows before and after each grid point and the weight of the latter, each (grid,).
 
-    At a sample both rows are that sample, so that what lies behind it has no state.
+    At a sample, both rows are that sample, so that the next sample has no effect.
     """
     _require_samples(t_ns)
     last = len(t_ns) - 1
@@ -196,4 +186,4 @@ def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
 
 def _require_samples(t_ns: Times) -> None:
     if not len(t_ns):
-        raise TacpipeError("A signal has no samples. Leave the stream out, or record it again.")
+        raise TacpipeError("The signal has no samples. Exclude the stream, or record it again.")

@@ -1,4 +1,4 @@
-"""Find runs of equal rows, gaps between rows, and the windows that a model may read."""
+"""Find runs of equal rows, gaps between rows, and windows for models."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tacpipe.errors import TacpipeError
 
 
 def runs(state: Bools) -> tuple[Indices, Indices]:
-    """Return the first rows and the stops, exclusive, of the runs of True, each (run,).
+    """Return start and exclusive stop rows of the runs of True, each (run,).
 
     >>> [edge.tolist() for edge in runs(np.array([True, False, True, True]))]
     [[0, 2], [1, 4]]
@@ -18,19 +18,19 @@ def runs(state: Bools) -> tuple[Indices, Indices]:
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
-def latched(on: Bools, off: Bools) -> Bools:
-    """Return a state (time,) that a row of ``on`` switches on and a row of ``off`` off; ``on`` wins, off at first.
+def latch(on: Bools, off: Bools) -> Bools:
+    """Return a state (time,) that ``on`` sets and ``off`` resets. ``on`` has precedence, and the initial state is off.
 
-    >>> latched(np.array([False, True, False, False]), np.array([False, False, False, True])).tolist()
+    >>> latch(np.array([False, True, False, False]), np.array([False, False, False, True])).tolist()
     [False, True, True, False]
     """
-    decided = np.maximum.accumulate(np.where(on | off, np.arange(len(on)), -1))
-    state: Bools = (decided >= 0) & on[decided]
+    last_change = np.maximum.accumulate(np.where(on | off, np.arange(len(on)), -1))
+    state: Bools = (last_change >= 0) & on[last_change]
     return state
 
 
 def in_long_runs(state: Bools, rows: int) -> Bools:
-    """Return which rows of ``state`` (time,) belong to a run of ``rows`` or more; known once the run has lasted."""
+    """Return a mask of the rows of ``state`` (time,) in runs of at least ``rows`` rows."""
     starts, stops = runs(state)
     long = stops - starts >= rows
     edges = np.zeros(len(state) + 1, dtype=np.int8)
@@ -39,21 +39,21 @@ def in_long_runs(state: Bools, rows: int) -> Bools:
     return np.cumsum(edges[:-1]).astype(bool)
 
 
-def lasting(state: Bools, rows: int) -> Bools:
-    """Return in which rows ``state`` (time,) has held for ``rows`` rows, this one included: the same, stated causally."""
+def in_long_runs_online(state: Bools, rows: int) -> Bools:
+    """Return a mask of rows up to which ``state`` (time,) was True for at least ``rows`` rows: `in_long_runs`, causally."""
     count = np.arange(1, len(state) + 1)
-    last_off = np.maximum.accumulate(np.where(state, 0, count))  # rows up to the last that was off
-    lasts: Bools = state & (count - last_off >= rows)
-    return lasts
+    last_off = np.maximum.accumulate(np.where(state, 0, count))  # rows up to the last False
+    in_run: Bools = state & (count - last_off >= rows)
+    return in_run
 
 
-GAP = 1.5  # times the median step of time, above which rows do not follow one another
+GAP = 1.5  # longest time between consecutive rows of a run, as a multiple of the median
 
 
-def breaks(t_ns: Times, gap: float = GAP) -> Bools:
-    """Return for each row (time,) whether an unbroken run begins there: after more than ``gap`` times the median step.
+def run_starts(t_ns: Times, gap: float = GAP) -> Bools:
+    """Return a mask of the first rows of runs (time,): the step before exceeds ``gap`` times the median.
 
-    >>> breaks(np.array([0, 20, 40, 100, 120])).tolist()
+    >>> run_starts(np.array([0, 20, 40, 100, 120])).tolist()
     [True, False, False, True, False]
     """
     begins = np.zeros(len(t_ns), dtype=bool)
@@ -67,16 +67,16 @@ def breaks(t_ns: Times, gap: float = GAP) -> Bools:
 def window_starts(groups: AnyArray, usable: Bools, context: int, horizon: int, stride: int = 1) -> Int64s:
     """Return the first rows (window,) of all windows of ``context + horizon`` rows.
 
-    A window lies within one group (``groups`` (time,) numbers recordings or contacts; equal neighbours belong together)
-    and on rows that are all ``usable`` (time,). ``stride`` counts rows from the start of each unbroken run, so that
-    what precedes a run does not move its windows. Raises `TacpipeError` for lengths below 1.
+    A window is within one group, such as a recording or a contact (``groups`` (time,) has its number), and all its rows
+    are ``usable`` (time,). ``stride`` is counted from the start of each contiguous run, so that windows do not depend on
+    earlier rows. Raises `TacpipeError` if a length is below 1.
 
     >>> window_starts(np.array([0, 0, 0, 1, 1, 1]), np.ones(6, dtype=bool), context=1, horizon=1).tolist()
     [0, 1, 3, 4]
     """
     if min(context, horizon, stride) < 1:
         raise TacpipeError(
-            f"A window of context {context}, horizon {horizon} and stride {stride} is none; each must be 1 or more."
+            f"A window has context {context}, horizon {horizon} and stride {stride}; each must be at least 1."
         )
     rows, length = len(groups), context + horizon
     if rows < length:
@@ -84,7 +84,7 @@ def window_starts(groups: AnyArray, usable: Bools, context: int, horizon: int, s
     broken = ~usable
     broken[1:] |= groups[1:] != groups[:-1]
     broken[1:] |= ~usable[:-1]
-    breaks = np.cumsum(broken)  # (time,): equal at both ends of a stretch if nothing breaks within it
+    breaks = np.cumsum(broken)  # (time,): equal at both ends of a contiguous window
     starts = np.arange(rows - length + 1)
     run_start = np.maximum.accumulate(np.where(broken, np.arange(rows), 0))[starts]
     complete = usable[starts] & (breaks[starts + length - 1] == breaks[starts]) & ((starts - run_start) % stride == 0)

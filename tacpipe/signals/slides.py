@@ -1,4 +1,4 @@
-"""Find the slide of a finger within a recording, choose its frames, and check it against the protocol."""
+"""Find the slide of a finger in a recording, crop it, and check it against the protocol."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tacpipe.arrays import AnyArray, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.runs import in_long_runs
 
-Rows = tuple[int, int]  # the first, and the one behind the last
+Rows = tuple[int, int]  # start and exclusive stop
 
 CROPS = ("middle", "offset", "none")
 
@@ -30,44 +30,43 @@ class Protocol:
 
 
 def trigger_row(pressure: AnyArray, threshold: float) -> int:
-    """Return the first row of ``pressure`` (time,) that reaches ``threshold``. Raises `TacpipeError` if none does.
+    """Return the first row in which ``pressure`` (time,) reaches ``threshold``. Raises `TacpipeError` if there is none.
 
     >>> trigger_row(np.array([12, 39, 40, 17, 80]), 40.0)
     2
     """
     reached = pressure >= threshold
     if not reached.any():
-        largest = f"its most is {np.nanmax(pressure):g}" if np.isfinite(pressure).any() else "it has no reading"
+        largest = f"its maximum is {np.nanmax(pressure):g}" if np.isfinite(pressure).any() else "it has no finite value"
         raise TacpipeError(
-            f"The pressure never reaches {threshold:g} counts, {largest}; no slide began. Exclude the recording, or lower "
+            f"The pressure never reaches {threshold:g} counts; {largest}. Exclude the recording, or lower "
             f"`--pressure-trigger`."
         )
     return int(reached.argmax())
 
 
-def touched_rows(load: Floats, on: float, off: float, unit: str = "") -> Rows:
-    """Return the rows from the first ``load`` (time,) of ``on`` or more to the last of ``off`` or more.
+def loaded_rows(load: Floats, on: float, off: float, unit: str = "") -> Rows:
+    """Return the rows from the first ``load`` (time,) of at least ``on`` to the last of at least ``off``.
 
     Raises `TacpipeError` if there is none.
 
-    >>> touched_rows(np.array([0.0, 1.0, 5.0, 3.0, 6.0, 2.0, 0.0]), on=4.0, off=2.0)
+    >>> loaded_rows(np.array([0.0, 1.0, 5.0, 3.0, 6.0, 2.0, 0.0]), on=4.0, off=2.0)
     (2, 6)
     """
     reached = load >= on
     if not reached.any():
-        largest = f"{np.nanmax(load):.3g}" if np.isfinite(load).any() else "no reading"
+        largest = f"its maximum is {np.nanmax(load):.3g}" if np.isfinite(load).any() else "it has no finite value"
         raise TacpipeError(
-            f"The load never reaches {on:.3g} {unit}, its most is {largest}; no slide began. Exclude the recording, or "
-            f"lower `--load-trigger`."
+            f"The load never reaches {on:.3g} {unit}; {largest}. Exclude the recording, or lower `--load-trigger`."
         )
     return int(reached.argmax()), int(np.flatnonzero(load >= off)[-1]) + 1
 
 
 def sliding_rows(speed_m_s: Floats, first: int, least_m_s: float, steady_rows: int) -> Rows | None:
-    """Return the rows from ``first`` on between which ``speed_m_s`` (time,) begins and ceases to be ``least_m_s``.
+    """Return the rows, from ``first``, between the first and last run in which ``speed_m_s`` (time,) reaches ``least_m_s``.
 
-    It counts once it lasts for ``steady_rows``, so that a single fast reading of an arm at rest begins nothing. What is
-    slower in between belongs to the slide. None if the arm never moves so fast.
+    A run has at least ``steady_rows`` rows, so that single fast readings of a resting arm do not count. Slower rows
+    between runs are included. Returns None without a run.
 
     >>> sliding_rows(np.array([0.0, 9.0, 0.0, 3.0, 3.0, 1.0, 3.0, 3.0, 0.0]), 0, least_m_s=2.0, steady_rows=2)
     (3, 8)
@@ -76,13 +75,13 @@ def sliding_rows(speed_m_s: Floats, first: int, least_m_s: float, steady_rows: i
     return (first + int(moving[0]), first + int(moving[-1]) + 1) if len(moving) else None
 
 
-def kept_rows(slide: Rows, frames: int, crop: str, offset_first: int) -> Rows:
-    """Return which rows of a slide are kept: all (crop ``none``), or ``frames`` of them.
+def crop_rows(slide: Rows, frames: int, crop: str, offset_first: int) -> Rows:
+    """Crop a slide to ``frames`` rows (crop ``middle`` or ``offset``), or return all its rows (``none``).
 
-    With the crop ``middle`` one row fewer lies before than behind them where they cannot be centred, with ``offset`` they
-    begin at the row ``offset_first``. Raises `TacpipeError` for another crop, and where there are not that many rows.
+    With ``middle``, if the rows cannot be centred, one row fewer is removed before than after them. With ``offset``, they
+    start at row ``offset_first``. Raises `TacpipeError` for another crop, or if there are too few rows.
 
-    >>> kept_rows((0, 800), 400, "middle", 0), kept_rows((0, 799), 400, "middle", 0), kept_rows((3, 800), 400, "offset", 101)
+    >>> kept_rows((0, 800), 400, "middle", 0), kept_rows((0, 799), 400, "middle", 0), crop_rows((3, 800), 400, "offset", 101)
     ((200, 600), (199, 599), (101, 501))
     """
     if crop not in CROPS:
@@ -93,29 +92,29 @@ def kept_rows(slide: Rows, frames: int, crop: str, offset_first: int) -> Rows:
     rows = slide[1] - begin
     if not 0 < frames <= rows:
         raise TacpipeError(
-            f"The slide has {max(rows, 0)} rows from row {begin} (counted from 0) on, and {frames} are to be kept. Exclude "
-            f"the recording, or give another number with `--frames`."
+            f"The slide has {max(rows, 0)} rows from row {begin} (counted from 0), but {frames} are needed. Exclude the "
+            f"recording, or change `--frames`."
         )
     first = begin + (rows - frames) // 2 if crop == "middle" else begin
     return first, first + frames
 
 
 def phases(rows: int, slide: Rows) -> NDArray[np.int8]:
-    """Return -1 for each row before the slide, 0 within it and 1 after it, (time,).
+    """Return the phase of each row (time,): -1 before the slide, 0 during it and 1 after it.
 
     >>> phases(5, (1, 3)).tolist()
     [-1, 0, 0, 1, 1]
     """
-    place = np.arange(rows)
-    return (place >= slide[1]).astype(np.int8) - (place < slide[0]).astype(np.int8)
+    row = np.arange(rows)
+    return (row >= slide[1]).astype(np.int8) - (row < slide[0]).astype(np.int8)
 
 
-def measured(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, float]:
-    """Return what the kept rows of a slide were like: the means of pressure and force, the median of the speed.
+def slide_statistics(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, float]:
+    """Return mean pressure, mean force and median speed of a cropped slide.
 
-    All are (time,). Speed and force are left out where they are not known in all rows.
+    All inputs are (time,). Speed and force are omitted unless they are finite in all rows.
 
-    >>> measured(np.array([10, 20]), {"speed_m_s": np.array([0.02, 0.03]), "force_n": np.array([np.nan, 1.0])})
+    >>> slide_statistics(np.array([10, 20]), {"speed_m_s": np.array([0.02, 0.03]), "force_n": np.array([np.nan, 1.0])})
     {'pressure_mean_count': 15.0, 'speed_m_s': 0.025}
     """
     figures = {"pressure_mean_count": round(float(pressure.mean()), 3)}
@@ -126,11 +125,11 @@ def measured(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, flo
     return figures
 
 
-def departures(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]) -> list[str]:
-    """Return in words each way in which a slide differs from its protocol, or None if it does not.
+def protocol_deviations(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]) -> list[str]:
+    """Return a description of each deviation of a slide from its protocol.
 
-    >>> wanted = Protocol(0.025, 0.1, 5.0, 2.0, 150.0)
-    >>> departures(wanted, 8.0, {"pressure_mean_count": 1.0, "speed_m_s": 0.03})
+    >>> protocol = Protocol(0.025, 0.1, 5.0, 2.0, 150.0)
+    >>> protocol_deviations(protocol, 8.0, {"pressure_mean_count": 1.0, "speed_m_s": 0.03})
     ['its speed is 30.0 mm/s and not 25.0', 'its mean pressure is 1.0 counts and not 2 to 150']
     """
     reasons = []

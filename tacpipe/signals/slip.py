@@ -1,20 +1,20 @@
-"""When a held object slips, derived from the distance between hand and object.
+"""Label slip of a grasped object from the distance between hand and object.
 
-The proximity sensor at the wrist looks at the object: while the object is held its reading stays, and where it moves the
-object slips. How the label is made, and why:
+The reading of a proximity sensor at the wrist is constant while the object is held and changes when it slips. Offline
+labels are computed in five steps:
 
-1. a median over 5 rows takes single bad readings out, and leaves the corners of a ramp where they are;
-2. a Butterworth low-pass of second order and 5 Hz, forwards and backwards, then a central difference give the *rate*;
-3. the rate's own noise is its root mean square in the half second after the grasp, when nothing has slipped yet;
-4. slip begins where the rate is beyond 5 times that noise for 3 rows, and ends where it is below 2 times for 5 rows;
-5. the filter spreads a slip of 0.1 s to twice that, and runs two that follow at once together: so a slip is cut where
-   the readings themselves rest, and each end is moved to where they leave the level before or reach the one after.
+1. A median over 5 rows removes outliers and preserves the corners of ramps.
+2. A second-order Butterworth low-pass of 5 Hz, forwards and backwards, and a central difference compute the *rate*.
+3. The noise of the rate is its root mean square in the half second after the grasp, before any slip.
+4. Slip starts when the rate exceeds 5 times the noise for 3 rows, and ends when it is below 2 times for 5 rows.
+5. The filter extends a slip of 0.1 s to twice its duration and merges consecutive slips. Slips are therefore split where
+   the readings rest, and their ends moved to where readings leave the level before and reach the level after.
 
-The label that is known at once has no step 5, a median over the last 5 rows, the low-pass forwards only and a backward
-difference; it comes on 3 rows late and goes 5 rows late besides.
+Online labels have no step 5, a median over the last 5 rows, a forward low-pass and a backward difference. They
+additionally start 3 rows and end 5 rows late.
 
-Published recordings leave the filter, thresholds and units open; the noise of their readings is 0.82 counts.
-Readings and rates are in counts and counts a second.
+The published recordings do not specify filter, thresholds and units; the noise of their readings is 0.82 counts.
+Readings are in counts, rates in counts per second.
 """
 
 from __future__ import annotations
@@ -25,44 +25,41 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.filters import butterworth, median, median_so_far
-from tacpipe.signals.runs import in_long_runs, lasting, latched, runs
+from tacpipe.signals.filters import butterworth, median, trailing_median
+from tacpipe.signals.runs import in_long_runs, in_long_runs_online, latch, runs
 
 MEDIAN_ROWS = 5
 LEVEL_ROWS = 10  # rows before and after a slip whose median is the level there
-CORNER_ROWS = 2  # how far back from the first row that has left its level the end of a slip may lie
-LEVEL_SIGMA = 3.0  # times the readings' own noise is at the level still
+CORNER_ROWS = 2  # largest distance of the end of a slip from the first row outside the level
+LEVEL_SIGMA = 3.0  # distance from the level within which readings rest, as a multiple of their noise
 
 
 @dataclass(frozen=True)
 class SlipLimits:
-    """Limits of slip: rates in multiples of their noise, and least numbers of rows."""
+    """Thresholds of slip: rates as multiples of their noise, and numbers of rows."""
 
     on_sigma: float = 5.0
     off_sigma: float = 2.0
     on_rows: int = 3
     off_rows: int = 5
-    noise_floor: float = 3.0  # counts a second
+    noise_floor: float = 3.0  # counts per second
     level_count: float = 0.75  # counts
 
     def __post_init__(self) -> None:
         if not 0 < self.off_sigma <= self.on_sigma:
             raise TacpipeError(
-                f"A slip that begins at {self.on_sigma:g} sigma and ends below {self.off_sigma:g} flickers; the latter "
-                "must lie above 0 and not above the former."
+                f"The end threshold of slip is {self.off_sigma:g} sigma; it must be above 0 and at most the start "
+                f"threshold, {self.on_sigma:g}."
             )
         if min(self.on_rows, self.off_rows) < 1 or not (self.noise_floor > 0 and self.level_count > 0):
             raise TacpipeError(
-                f"Slip after {self.on_rows} rows, its end after {self.off_rows}, a noise floor of {self.noise_floor:g} "
-                f"and a level of {self.level_count:g} counts cannot be; all must be positive, rows whole numbers."
+                f"Slip starts after {self.on_rows} rows and ends after {self.off_rows}, with a noise floor of "
+                f"{self.noise_floor:g} and a level of {self.level_count:g} counts; all must be positive."
             )
 
 
-def filled(readings: AnyArray) -> Floats:
-    """Return ``readings`` (time,) with NaN replaced by the last number before it, at the start by the first one.
-
-    So no row is filled from its future but those before the first reading, where nothing can be determined anyway.
-    """
+def fill_missing(readings: AnyArray) -> Floats:
+    """Replace each NaN in ``readings`` (time,) by the previous number, at the start by the first number."""
     values = readings.astype(np.float64)
     finite = np.isfinite(values)
     if not finite.any():
@@ -73,7 +70,7 @@ def filled(readings: AnyArray) -> Floats:
 
 
 def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
-    """Return how fast ``readings`` (time,) move, in counts a second (time,), without a shift in time."""
+    """Return the rate of change of ``readings`` (time,) in counts per second, with zero phase."""
     if len(readings) < 2:
         return np.zeros(len(readings))
     smooth = butterworth(cutoff_hz, rate_hz).both_ways(median(readings, MEDIAN_ROWS))
@@ -81,16 +78,16 @@ def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     return slope
 
 
-def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
-    """Return how fast ``readings`` (time,) move, in counts a second (time,), from each row and those before it."""
-    smooth = butterworth(cutoff_hz, rate_hz).causal(median_so_far(readings, MEDIAN_ROWS))
+def rate_online(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
+    """Return the rate of change of ``readings`` (time,) in counts per second, computed causally."""
+    smooth = butterworth(cutoff_hz, rate_hz).causal(trailing_median(readings, MEDIAN_ROWS))
     return np.diff(smooth, prepend=smooth[:1]) * rate_hz
 
 
 def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: SlipLimits) -> Bools:
-    """Return where the object slips (time,), stated with the whole of ``readings`` (time,) since the grasp at hand.
+    """Return the offline slip label (time,) from ``readings`` (time,) since the grasp.
 
-    In the first ``rest_rows`` rows it is taken to rest; their rate sets the threshold.
+    The thresholds are from the first ``rest_rows`` rows, in which the object rests.
     """
     speed = np.abs(rate(readings, rate_hz, cutoff_hz))
     noise = _noise(speed[:rest_rows], limits)
@@ -100,33 +97,33 @@ def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: 
         limits.level_count, LEVEL_SIGMA * float(np.std(readings[:rest_rows])) if len(readings[:rest_rows]) else 0.0
     )
     smooth = median(readings, MEDIAN_ROWS)
-    return _trimmed(latched(on, off) & ~_resting(smooth, limits.off_rows, level), smooth, level)
+    return _trim(latch(on, off) & ~_rows_at_rest(smooth, limits.off_rows, level), smooth, level)
 
 
 def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, rest_rows: int, limits: SlipLimits) -> Bools:
-    """Return where slip is known of (time,) from each row and those before it; never in the first ``rest_rows``."""
-    speed = np.abs(rate_so_far(readings, rate_hz, cutoff_hz))
+    """Return the online slip label (time,) from ``readings`` (time,); False in the first ``rest_rows`` rows."""
+    speed = np.abs(rate_online(readings, rate_hz, cutoff_hz))
     noise = _noise(speed[:rest_rows], limits)
-    on = lasting(speed > limits.on_sigma * noise, limits.on_rows)
+    on = in_long_runs_online(speed > limits.on_sigma * noise, limits.on_rows)
     on[:rest_rows] = False
-    return latched(on, lasting(speed < limits.off_sigma * noise, limits.off_rows))
+    return latch(on, in_long_runs_online(speed < limits.off_sigma * noise, limits.off_rows))
 
 
 def dropped(readings: Floats, rest_rows: int, patch_count: float, saturated_count: float) -> Bools:
-    """Return from where on (time,) the object is lost, stated with the whole of ``readings`` (time,) since the grasp.
+    """Return a mask of the rows from the loss of the object (time,), from ``readings`` (time,) since the grasp.
 
-    That is after the first ``rest_rows`` rows, once the readings, smoothed by a median, are more than ``patch_count`` from
-    the median of those rows, or at ``saturated_count`` or below, where the sensor sees no more.
+    It is lost, after the first ``rest_rows`` rows, when the median of readings differs by more than ``patch_count`` from
+    that of those rows or is at most ``saturated_count``, out of the sensor's range.
     """
-    return _lost(median(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
+    return _detect_loss(median(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
 
 
 def dropped_online(readings: Floats, rest_rows: int, patch_count: float, saturated_count: float) -> Bools:
-    """Return where the same is known of (time,) from each row and those before it."""
-    return _lost(median_so_far(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
+    """Return the result of `dropped`, computed causally (time,)."""
+    return _detect_loss(trailing_median(readings, MEDIAN_ROWS), readings[:rest_rows], patch_count, saturated_count)
 
 
-def _lost(smooth: Floats, rest_readings: Floats, patch_count: float, saturated_count: float) -> Bools:
+def _detect_loss(smooth: Floats, rest_readings: Floats, patch_count: float, saturated_count: float) -> Bools:
     if not len(rest_readings):
         return np.zeros(len(smooth), dtype=bool)
     lost = (np.abs(smooth - np.median(rest_readings)) > patch_count) | (smooth <= saturated_count)
@@ -138,10 +135,10 @@ def _noise(speed: Floats, limits: SlipLimits) -> float:
     return max(float(np.sqrt(np.mean(speed**2))) if len(speed) else 0.0, limits.noise_floor)
 
 
-def _resting(smooth: Floats, rows: int, level_count: float) -> Bools:
-    """Return which rows (time,) lie in ``rows`` or more in which ``smooth`` (time,) stays within ``level_count``.
+def _rows_at_rest(smooth: Floats, rows: int, level_count: float) -> Bools:
+    """Return a mask of rows (time,) in runs of at least ``rows`` in which ``smooth`` (time,) varies by ``level_count``.
 
-    Between two slips that follow at once the filtered rate does not come down; the readings state that there are two.
+    Between two consecutive slips the filtered rate does not decrease, but the readings rest.
     """
     resting = np.zeros(len(smooth), dtype=bool)
     if len(smooth) < rows:
@@ -152,10 +149,10 @@ def _resting(smooth: Floats, rows: int, level_count: float) -> Bools:
     return resting
 
 
-def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
-    """Return ``slip`` (time,) with the ends of each run moved to where ``smooth`` (time,) leaves the levels around it.
+def _trim(slip: Bools, smooth: Floats, level_count: float) -> Bools:
+    """Move the ends of each run of ``slip`` (time,) to where ``smooth`` (time,) leaves the levels around it.
 
-    A run that leaves its level nowhere goes: what has not moved has not slipped.
+    Runs without a change of level are removed.
     """
     trimmed = np.zeros_like(slip)
     starts, stops = runs(slip)
@@ -166,22 +163,25 @@ def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
         after = float(np.median(smooth[stop - 1 : min(highest, stop + LEVEL_ROWS)]))
         sign = 1.0 if after >= before else -1.0
         run = sign * smooth[start:stop]
-        first, last = _leaves(run - sign * before, level_count), _leaves((sign * after - run)[::-1], level_count)
+        first, last = (
+            _departure_row(run - sign * before, level_count),
+            _departure_row((sign * after - run)[::-1], level_count),
+        )
         if first is not None and last is not None:
             trimmed[max(start + first, lowest) : min(stop - last, highest)] = True
     return trimmed
 
 
-def _leaves(moved: Floats, level_count: float) -> int | None:
-    """Return the row in which ``moved`` (time,) begins to grow beyond ``level_count``, or None if it never does.
+def _departure_row(moved: Floats, level_count: float) -> int | None:
+    """Return the row in which ``moved`` (time,) starts to grow above ``level_count``, or None if it never does.
 
-    An object sets out from rest, so way grows as time squared: of the first row beyond and the next, ``s`` and ``s'``,
-    the former comes ``1 / (sqrt(s' / s) - 1)`` rows after the start. That may lie before the first row of ``moved``.
+    The distance of an object that starts from rest grows with the square of time. With distances ``s`` and ``s'`` in the
+    first row above and the next, the start is ``1 / (sqrt(s' / s) - 1)`` rows earlier, possibly before the first row.
     """
     beyond = moved > level_count
     if not beyond.any():
         return None
     first = int(beyond.argmax())
     following = float(moved[min(first + 1, len(moved) - 1)])
-    grown = (following / float(moved[first])) ** 0.5 - 1 if following > moved[first] else 0.0
-    return first - (min(int(1 / grown), CORNER_ROWS) if grown > 0 else 0)
+    growth = (following / float(moved[first])) ** 0.5 - 1 if following > moved[first] else 0.0
+    return first - (min(int(1 / growth), CORNER_ROWS) if growth > 0 else 0)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
-from tacpipe.signals.repairs import RANGE, turns
+from tacpipe.signals.repairs import RANGE, count_wraps
 from tacpipe.signals.resampling import is_overdue, median_before, newest_rows, uniform_offsets
 from tacpipe.synchronization.columns import PAST_NS
 
@@ -172,7 +172,7 @@ class _Source:
             distance = (self.levels - values[0])[self._wraps]
             self._turned = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
         if len(self._wraps):
-            turned = self._turned + np.cumsum(turns(extended[:, self._wraps]), axis=0)
+            turned = self._turned + np.cumsum(count_wraps(extended[:, self._wraps]), axis=0)
             self._values[added, self._wraps] += RANGE * turned
             self._turned = turned[-1]
         if len(self._compared):

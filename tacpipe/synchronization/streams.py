@@ -104,7 +104,7 @@ class TimedStream:
     repeated: Bools  # (time,), or True if a sample repeats the one before
     arrival_ns: Times  # (time,), when the samples arrived, whatever the clock of `t_ns`
     attributes: dict[str, Attribute] = field(default_factory=dict)  # attributes of the fit of its clock
-    unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
+    unwrap: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
 
     @property
     def channels(self) -> list[str]:
@@ -237,14 +237,14 @@ def without_wraps(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[Time
     """
     import pyarrow as pa
 
-    from tacpipe.signals.repairs import unwrapped
+    from tacpipe.signals.repairs import unwrap
 
     changed: dict[str, Int32s] = {}
     for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
         if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
             values = stream.columns.column(kind.name).to_numpy()
-            unwrapped_values = unwrapped(values)
+            unwrapped_values = unwrap(values)
             if unwrapped_values is not values:
                 changed[kind.name] = keep(unwrapped_values)
     return replace(stream, unwrapped=changed), len(changed)
@@ -254,12 +254,12 @@ def _repeated_rows(columns: Columns) -> Bools:
     """Return which rows repeat the one before in all channels but labels, which are meant to stay."""
     import numpy as np
 
-    from tacpipe.signals.repairs import held_columns
+    from tacpipe.signals.repairs import repeated_in_columns
 
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
     if not names:
         return np.zeros(columns.num_rows, dtype=bool)
-    return held_columns(columns.column(name).to_numpy() for name in names)
+    return repeated_in_columns(columns.column(name).to_numpy() for name in names)
 
 
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:

@@ -216,7 +216,7 @@ def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnCont
             limits.append((_level(fixed.get("on_count")), _level(fixed.get("off_count"))))
         else:
             limits.append((float(on), float(off)))
-    touching = contact.touching(np.array(loads), *np.array(limits).T)
+    touching = contact.contact_mask(np.array(loads), *np.array(limits).T)
     return replace(contents, spans=spans.split_padding(contents.spans, contents.taxels[0].t_ns, touching))
 
 

@@ -15,7 +15,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params
 from tacpipe.formats.xela_flat import discover, xela_flat
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.signals.kinematics import PANDA, turns
+from tacpipe.signals.kinematics import PANDA, rotates_with_hand
 from tests.formats import xela_files
 from tests.signals.test_kinematics import elementary
 
@@ -216,7 +216,7 @@ def test_the_published_trials_are_read_as_they_were_counted() -> None:
             np.column_stack([robot[name].to_numpy() for name in robot.column_names if name.endswith(ending)])
             for ending in (tuple(f"joint{n}_rad" for n in range(1, 8)), tuple(f"orientation_{part}" for part in "xyzw"))
         )
-        assert turns(PANDA, angles, quaternions)
+        assert rotates_with_hand(PANDA, angles, quaternions)
 
 
 def test_selected_streams_are_those_of_the_whole_recording(flat_trial: Trial) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tacpipe.arrays import Int64s
-from tacpipe.signals.clocks import fit_offsets, resets, times_by_offsets
+from tacpipe.signals.clocks import find_resets, fit_offsets, times_by_offsets
 
 RNG = np.random.default_rng(3)
 EVERY_NS = 5_000_000_000
@@ -39,7 +39,7 @@ def test_a_reset_begins_a_line_of_its_own(set_by_s: float) -> None:
     device_ns[30:] += set_by_ns
     offset_ns[30:] -= set_by_ns
 
-    assert resets(device_ns, offset_ns) == [30]
+    assert find_resets(device_ns, offset_ns) == [30]
     first, second = fit_offsets(device_ns, offset_ns)
     assert (first.start, first.stop, second.start, second.stop) == (0, 30, 30, 60)
     assert first.drift == pytest.approx(20e-6, abs=3e-6) and second.drift == pytest.approx(20e-6, abs=3e-6)

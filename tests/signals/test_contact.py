@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.contact import axis_mean_level, contact_intervals, load, noise_thresholds, rest_level
-from tacpipe.signals.repairs import held
+from tacpipe.signals.repairs import repeated_rows
 
 MS = 1_000_000
 loads = hnp.arrays(np.float64, st.integers(1, 80), elements=st.floats(0, 10))
@@ -71,7 +71,7 @@ def test_padding_stops_at_the_ends_and_midway_to_the_next_contact() -> None:
 
 
 def test_thresholds_the_wrong_way_round_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="off must lie between 0 and on"):
+    with pytest.raises(TacpipeError, match="which must be 0 to"):
         intervals([0], on=1.0, off=2.0)
 
 
@@ -99,7 +99,7 @@ def touched(rows: int, peak: float, noise: float, seed: int = 0) -> tuple[np.nda
 
 
 def thresholds(values: np.ndarray, t_ns: np.ndarray) -> tuple[float, float]:
-    return noise_thresholds(held(values), load(values, rest_level(values, t_ns, 0.2)), t_ns, 0.2)
+    return noise_thresholds(repeated_rows(values), load(values, rest_level(values, t_ns, 0.2)), t_ns, 0.2)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 0.004, 1.0, 5000.0])

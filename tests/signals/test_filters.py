@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import ndimage, signal
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.filters import butterworth, median, median_so_far
+from tacpipe.signals.filters import butterworth, median, trailing_median
 
 signals = hnp.arrays(np.float64, st.integers(10, 120), elements=st.floats(-1e4, 1e4))
 
@@ -47,7 +47,7 @@ def test_few_rows_that_are_alike_stay_as_they_are(rows: int) -> None:
 def test_the_median_is_that_of_ndimage(values: np.ndarray, rows: int) -> None:
     np.testing.assert_array_equal(median(values, rows), ndimage.median_filter(values, rows, mode="nearest"))
     so_far = [np.median(np.r_[np.full(rows, values[0]), values[: i + 1]][-rows:]) for i in range(len(values))]
-    np.testing.assert_array_equal(median_so_far(values, rows), so_far)
+    np.testing.assert_array_equal(trailing_median(values, rows), so_far)
     assert median(values[:0], rows).tolist() == []
 
 

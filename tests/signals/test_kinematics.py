@@ -78,28 +78,28 @@ def test_velocity_is_what_differences_of_the_hand_s_path_tell() -> None:
 def test_a_rigid_tool_is_carried_and_another_arm_is_told_apart() -> None:
     angles, _ = joints()
     place = hand(angles)
-    assert kinematics.carries(PANDA, angles, place)
-    assert kinematics.carries(PANDA, angles, place + np.random.default_rng(0).normal(0, 1e-3, place.shape))
-    assert not kinematics.carries(PANDA, angles + np.linspace(0, 0.4, 200)[:, None], place)
-    assert not kinematics.carries(PANDA, angles, place + np.linspace(0, 0.1, 200)[:, None])
-    assert not kinematics.carries(PANDA, angles[:0], place[:0])
+    assert kinematics.carries_hand(PANDA, angles, place)
+    assert kinematics.carries_hand(PANDA, angles, place + np.random.default_rng(0).normal(0, 1e-3, place.shape))
+    assert not kinematics.carries_hand(PANDA, angles + np.linspace(0, 0.4, 200)[:, None], place)
+    assert not kinematics.carries_hand(PANDA, angles, place + np.linspace(0, 0.1, 200)[:, None])
+    assert not kinematics.carries_hand(PANDA, angles[:0], place[:0])
 
 
 def test_rows_that_are_not_finite_do_not_make_it_another_arm() -> None:
     angles, _ = joints()
     place = hand(angles)
     place[7], angles[9, 2] = np.nan, np.nan
-    assert kinematics.carries(PANDA, angles, place)
-    assert not kinematics.carries(PANDA, angles, np.full_like(place, np.nan))
+    assert kinematics.carries_hand(PANDA, angles, place)
+    assert not kinematics.carries_hand(PANDA, angles, np.full_like(place, np.nan))
 
 
 def test_a_hand_turns_with_its_arm_in_the_right_order_of_its_quaternions_alone() -> None:
     angles, _ = joints()
     turned = Rotation.from_matrix([elementary(row)[-1][:3, :3] for row in angles]) * Rotation.from_rotvec([0.1, 2, 0.3])
     quaternions = turned.as_quat()
-    assert kinematics.turns(PANDA, angles, quaternions)
-    assert not kinematics.turns(PANDA, angles, np.roll(quaternions, 1, axis=1))
-    assert not kinematics.turns(PANDA, angles[:0], quaternions[:0])
+    assert kinematics.rotates_with_hand(PANDA, angles, quaternions)
+    assert not kinematics.rotates_with_hand(PANDA, angles, np.roll(quaternions, 1, axis=1))
+    assert not kinematics.rotates_with_hand(PANDA, angles[:0], quaternions[:0])
 
 
 @pytest.mark.parametrize("steps_ms", [np.full(49, 20), np.tile([10, 20, 30, 15, 25, 20, 20], 7)])
@@ -109,7 +109,7 @@ def test_differences_of_steady_motion_are_its_velocity(steps_ms: AnyArray) -> No
     velocity, turning = np.array([0.1, -0.2, 0.05]), np.array([0.3, 0.6, -0.9])
     start = Rotation.from_rotvec([0.2, -0.4, 1.0])
     quaternions = (Rotation.from_rotvec(time_s * turning) * start).as_quat()
-    velocities = kinematics.differences(t_ns, 1.0 + time_s * velocity, quaternions)
+    velocities = kinematics.difference_velocity(t_ns, 1.0 + time_s * velocity, quaternions)
     assert not velocities[0].any()
     assert np.allclose(velocities[1:, :3], velocity)
     assert np.allclose(velocities[1:, 3:], turning, rtol=1e-4)  # the sine of a small half angle for the angle
@@ -119,14 +119,14 @@ def test_differences_read_no_later_row() -> None:
     rng = np.random.default_rng(1)
     t_ns, place = np.arange(30) * 20_000_000, rng.normal(size=(30, 3))
     quaternions = Rotation.random(30, rng=rng).as_quat()
-    before = kinematics.differences(t_ns, place, quaternions)
+    before = kinematics.difference_velocity(t_ns, place, quaternions)
     place[18:], quaternions[18:] = 5.0, [0.0, 0.0, 0.0, 1.0]
-    after = kinematics.differences(t_ns, place, quaternions)
+    after = kinematics.difference_velocity(t_ns, place, quaternions)
     assert np.array_equal(after[:18], before[:18])
     assert not np.allclose(after[18], before[18])
 
 
 def test_rows_of_the_same_time_have_no_velocity_instead_of_an_infinite_one() -> None:
-    velocities = kinematics.differences(np.array([0, 0, 10]), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
+    velocities = kinematics.difference_velocity(np.array([0, 0, 10]), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
     assert np.isfinite(velocities).all()
     assert not velocities[1].any()

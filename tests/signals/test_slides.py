@@ -24,7 +24,7 @@ def test_the_trigger_is_the_first_row_at_or_above_the_threshold(pressure: list[i
 
 
 def test_a_pressure_without_readings_begins_nothing() -> None:
-    with pytest.raises(TacpipeError, match="it has no reading"):
+    with pytest.raises(TacpipeError, match="it has no finite value"):
         slides.trigger_row(np.full(4, np.nan), 40.0)
 
 
@@ -42,28 +42,28 @@ def test_the_middle_of_a_slide_is_as_far_from_both_ends(first: int, length: int,
     slide = (first, first + length)
     if frames > length:
         with pytest.raises(TacpipeError, match=rf"{length} rows.*row {first} .*{frames}"):
-            slides.kept_rows(slide, frames, "middle", 0)
+            slides.crop_rows(slide, frames, "middle", 0)
         return
-    start, stop = slides.kept_rows(slide, frames, "middle", 0)
+    start, stop = slides.crop_rows(slide, frames, "middle", 0)
     assert stop - start == frames
     assert 0 <= (slide[1] - stop) - (start - slide[0]) <= 1
-    assert slides.kept_rows(slide, frames, "none", 0) == slide
+    assert slides.crop_rows(slide, frames, "none", 0) == slide
 
 
 def test_the_published_crop_begins_101_rows_behind_the_trigger() -> None:
-    assert slides.kept_rows((0, 600), 400, "offset", 101) == (101, 501)
-    assert slides.kept_rows((8, 800), 400, "offset", 101) == (101, 501)
+    assert slides.crop_rows((0, 600), 400, "offset", 101) == (101, 501)
+    assert slides.crop_rows((8, 800), 400, "offset", 101) == (101, 501)
     with pytest.raises(TacpipeError, match=r"399 rows.*row 101"):
-        slides.kept_rows((0, 500), 400, "offset", 101)
+        slides.crop_rows((0, 500), 400, "offset", 101)
     with pytest.raises(TacpipeError, match=r"0 rows.*row 101"):
-        slides.kept_rows((0, 50), 400, "offset", 101)
+        slides.crop_rows((0, 50), 400, "offset", 101)
 
 
 def test_no_frames_and_unknown_crops_are_refused() -> None:
     with pytest.raises(TacpipeError, match="and 0 are to be kept"):
-        slides.kept_rows((0, 800), 0, "middle", 0)
+        slides.crop_rows((0, 800), 0, "middle", 0)
     with pytest.raises(TacpipeError, match="'end'"):
-        slides.kept_rows((0, 800), 400, "end", 0)
+        slides.crop_rows((0, 800), 400, "end", 0)
 
 
 def test_phases_are_minus_one_before_zero_within_and_one_behind() -> None:
@@ -75,14 +75,14 @@ def test_phases_are_minus_one_before_zero_within_and_one_behind() -> None:
 
 def test_a_slide_is_told_by_its_mean_pressure_and_force_and_its_median_speed() -> None:
     profile = {"speed_m_s": np.array([0.02, 0.025, 0.1]), "force_n": np.array([1.0, 2.0, 6.0])}
-    assert slides.measured(np.array([1, 2, 4]), profile) == {
+    assert slides.slide_statistics(np.array([1, 2, 4]), profile) == {
         "pressure_mean_count": 2.333,
         "speed_m_s": 0.025,
         "force_n": 3.0,
     }
-    assert slides.measured(np.array([1, 2, 3]), {}) == {"pressure_mean_count": 2.0}
+    assert slides.slide_statistics(np.array([1, 2, 3]), {}) == {"pressure_mean_count": 2.0}
     profile["force_n"][1] = np.nan
-    assert "force_n" not in slides.measured(np.array([1, 2, 4]), profile)
+    assert "force_n" not in slides.slide_statistics(np.array([1, 2, 4]), profile)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +101,6 @@ def test_each_way_to_leave_the_protocol_is_told(
     lasts_s: float, pressure: float, speed_m_s: float | None, expected: list[str]
 ) -> None:
     measures = {"pressure_mean_count": pressure, **({} if speed_m_s is None else {"speed_m_s": speed_m_s})}
-    departures = slides.departures(PROTOCOL, lasts_s, measures)
+    departures = slides.protocol_deviations(PROTOCOL, lasts_s, measures)
     assert len(departures) == len(expected)
     assert all(departure.startswith(beginning) for departure, beginning in zip(departures, expected, strict=True))

@@ -112,7 +112,7 @@ def test_the_online_label_comes_within_a_tenth_of_a_second() -> None:
 @pytest.mark.parametrize("rate_count_s", [-40.0, 300.0])
 def test_a_ramp_has_its_slope_for_a_rate(rate_count_s: float) -> None:
     ramp = 600.0 + rate_count_s / RATE_HZ * np.arange(300, dtype=np.float64)
-    for slope in (slip.rate(ramp, RATE_HZ, CUTOFF_HZ), slip.rate_so_far(ramp, RATE_HZ, CUTOFF_HZ)):
+    for slope in (slip.rate(ramp, RATE_HZ, CUTOFF_HZ), slip.rate_online(ramp, RATE_HZ, CUTOFF_HZ)):
         np.testing.assert_allclose(slope[40:-10], rate_count_s, rtol=1e-3)
 
 
@@ -129,8 +129,8 @@ def test_an_object_is_lost_beyond_the_patch_or_where_the_sensor_sees_no_more() -
 
 def test_a_reading_that_is_missing_is_the_last_one() -> None:
     nan = float("nan")
-    assert slip.filled(np.array([nan, 3.0, nan, nan, 5.0])).tolist() == [3.0, 3.0, 3.0, 3.0, 5.0]
-    assert slip.filled(np.array([nan, nan])).tolist() == [0.0, 0.0]
+    assert slip.fill_missing(np.array([nan, 3.0, nan, nan, 5.0])).tolist() == [3.0, 3.0, 3.0, 3.0, 5.0]
+    assert slip.fill_missing(np.array([nan, nan])).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2, 5])

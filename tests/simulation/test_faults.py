@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tacpipe.signals.repairs import held
+from tacpipe.signals.repairs import repeated_rows
 from tacpipe.simulation.faults import DeviceClock, arrivals, device_stamps, hold, samples
 
 
@@ -54,6 +54,6 @@ def test_held_frames_are_those_that_the_detector_finds() -> None:
     values = rng().permutation(3000).reshape(1000, 3)
     for probability in (0.0, 0.07, 0.75):
         logged, repeated = hold(values, probability, rng())
-        assert held(logged).tolist() == repeated.tolist()
+        assert repeated_rows(logged).tolist() == repeated.tolist()
         assert abs(repeated.mean() - probability) < 0.04
         assert (logged[~repeated] == values[~repeated]).all()

@@ -12,7 +12,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
 from tacpipe.signals.contact import rest_level
-from tacpipe.signals.repairs import held
+from tacpipe.signals.repairs import repeated_rows
 from tacpipe.simulation import taxels
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
 from tacpipe.simulation.pick_and_move import MASSES_KG, PickRig, PickScene, perform, simulate_trial, touch
@@ -240,7 +240,7 @@ def test_the_clock_of_the_device_leaves_the_stamps_of_the_host_alone() -> None:
 def test_held_frames_repeat_values_and_have_stamps_of_their_own(probability: float) -> None:
     streams = simulate_trial(0, 0, PickRig(duration_s=40.0, hold_probability=probability)).streams
     for name in ("xela1", "xela2"):
-        assert held(tactile(streams[name])).mean() == pytest.approx(probability, abs=0.03)
+        assert repeated_rows(tactile(streams[name])).mean() == pytest.approx(probability, abs=0.03)
         assert (np.diff(column(streams[name], "t_device_ns")) > 0).all()
         assert (np.diff(column(streams[name], "seq")) > 0).all()
 

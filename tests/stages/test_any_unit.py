@@ -110,7 +110,7 @@ def test_a_sensor_without_static_pressure_stays_whole_and_a_note_names_the_optio
 
 
 def test_a_load_that_is_never_reached_is_refused_with_the_largest_one(shard: Recording) -> None:
-    with pytest.raises(TacpipeError, match=r"never reaches 900 N, its most is 5\d"):
+    with pytest.raises(TacpipeError, match=r"never reaches 900 N; its maximum is 5\d"):
         slides(slides.params(trigger="load", load_trigger=900.0), shard({"skin": skin(1.0, "N")}))
     with pytest.raises(UsageError, match="--trigger load"):
         slides.params(load_trigger=3.0).check()

@@ -33,7 +33,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Indices, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.signals import repairs
-from tacpipe.signals.runs import latched, runs
+from tacpipe.signals.runs import latch, runs
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.params import AlarmLevels
 from tacpipe.tasks.forward.tracks import Track
@@ -225,7 +225,7 @@ def _changes_of(truth: AnyFloats, moved: AnyFloats, spaced: Indices, horizon: in
     """Return onset and end of the changes (change, 2) of one feature; ``truth`` and ``moved`` are (time,)."""
     size = np.abs(moved)
     on = (size > ON_SD * sd) & (sd > 0)
-    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # a change ends at a missing value
+    starts, stops = runs(latch(on, ~(size >= OFF_SD * sd)))  # a change ends at a missing value
     if not len(starts):
         return np.zeros((0, 2), dtype=np.intp)
     separate = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
@@ -374,7 +374,7 @@ class Loads:
                 sd=sd,
                 theta=theta,
                 rate_hz=self.rate_hz,
-                repeated=repairs.held(truth),
+                repeated=repairs.repeated_rows(truth),
             )
             scores[name] = AlarmScore(
                 events=result.events,

@@ -15,7 +15,7 @@ from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Times
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.signals import kinematics
-from tacpipe.signals.kinematics import quaternions_of_vectors
+from tacpipe.signals.kinematics import vectors_to_quaternions
 from tacpipe.signals.resampling import linear, slerp
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -77,7 +77,7 @@ class Arm:
             return np.zeros(6)
         before_ns, before = self._before
         rows = np.stack([before, placed])
-        velocity: Floats = kinematics.differences(np.array([before_ns, t_ns]), rows[:, :3], rows[:, 3:])[1]
+        velocity: Floats = kinematics.difference_velocity(np.array([before_ns, t_ns]), rows[:, :3], rows[:, 3:])[1]
         return velocity
 
     def _by_joints(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
@@ -91,7 +91,7 @@ class Arm:
             self._carried = bool((np.abs(tool_m - self._tool_m) < JOINED).all())
             if not self._carried:
                 return None
-        velocity: Floats = kinematics.velocity_in(frames, speeds[None], hand_m[None])[0]
+        velocity: Floats = kinematics.velocity_from_frames(frames, speeds[None], hand_m[None])[0]
         return velocity
 
 
@@ -208,7 +208,7 @@ def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s
     if quaternions[0] @ now[3:POSE] < 0:
         quaternions = -quaternions
     placed = np.hstack([linear(points_ns, poses[:, :3], grid_ns), quaternions])
-    moved = kinematics.differences(grid_ns, placed[:, :3], placed[:, 3:])
+    moved = kinematics.difference_velocity(grid_ns, placed[:, :3], placed[:, 3:])
     return np.hstack([placed, moved])[1:].astype(np.float32)
 
 
@@ -220,7 +220,7 @@ def without(t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
     after_s = ((ahead_ns - t_ns) / 1e9)[:, None]  # (step, 1)
     arm: Floats = now.astype(np.float64)
     position = arm[:3] + after_s * arm[POSE : POSE + 3]
-    turned = _product(quaternions_of_vectors(after_s * arm[POSE + 3 :]), arm[3:POSE])
+    turned = _product(vectors_to_quaternions(after_s * arm[POSE + 3 :]), arm[3:POSE])
     moved = np.broadcast_to(arm[POSE:], (len(ahead_ns), 6))
     return np.hstack([position, turned, moved]).astype(np.float32)
 

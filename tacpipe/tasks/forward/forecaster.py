@@ -23,7 +23,7 @@ from tacpipe.models.windows import ARM, POSE, ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
-from tacpipe.signals.kinematics import continuous
+from tacpipe.signals.kinematics import make_continuous
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.networks import acted
 from tacpipe.tasks.forward.params import ForwardConfig, Params
@@ -347,10 +347,10 @@ class Forecaster:
 
     def _arm(self, rows: AnyFloats, has_velocities: bool) -> AnyFloats:
         """Return the arm's rows (row, 13) with velocities, and quaternions with the sign used in training."""
-        rows = np.hstack([rows[:, :3], continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
+        rows = np.hstack([rows[:, :3], make_continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
         if not has_velocities:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
-            rows = np.hstack([rows, kinematics.differences(t_ns, rows[:, :3], rows[:, 3:])])
+            rows = np.hstack([rows, kinematics.difference_velocity(t_ns, rows[:, :3], rows[:, 3:])])
         return tracks.aligned(rows, self.orientation)
 
 

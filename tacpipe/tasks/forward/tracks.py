@@ -19,7 +19,7 @@ from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.signals import kinematics
-from tacpipe.signals.kinematics import continuous
+from tacpipe.signals.kinematics import make_continuous
 from tacpipe.signals.runs import window_starts
 
 if TYPE_CHECKING:
@@ -290,7 +290,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     by_joints = _velocity_of_joints(table, pose, placed)
-    by_poses = kinematics.differences(t_ns, placed[:, :3], placed[:, 3:])
+    by_poses = kinematics.difference_velocity(t_ns, placed[:, :3], placed[:, 3:])
     arm = np.hstack([placed, by_poses if by_joints is None else by_joints]).astype(np.float32)
     plan_velocity = None if by_joints is None else by_poses.astype(np.float32)
     del table, by_joints, by_poses
@@ -332,7 +332,7 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     if not pose.orientation:
         return np.tile([0.0, 0.0, 0.0, 1.0], (table.num_rows, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return continuous(inputs(table, pose.orientation).astype(np.float64))
+        return make_continuous(inputs(table, pose.orientation).astype(np.float64))
 
 
 def _opening(table: pa.Table | Columns) -> AnyFloats:
@@ -356,7 +356,7 @@ def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats
     names, speeds = joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
-        if kinematics.carries(kinematics.PANDA, angles, placed[:, :3]):
+        if kinematics.carries_hand(kinematics.PANDA, angles, placed[:, :3]):
             return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), placed[:, :3])
     return None
 

@@ -118,7 +118,7 @@ def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: Forwa
     window, plan = windows()
     arm = np.concatenate([window[..., len(CHANNELS) :], plan], axis=1)
     t_ns = np.arange(LENGTH) * 20_000_000
-    velocity = np.stack([kinematics.differences(t_ns, pose[:, :3], pose[:, 3:]) for pose in arm])
+    velocity = np.stack([kinematics.difference_velocity(t_ns, pose[:, :3], pose[:, 3:]) for pose in arm])
     finger = np.zeros((3, CONTEXT, 1))
     with_velocity = np.concatenate([window, velocity[:, :CONTEXT], finger], axis=-1)
     predicted = forecaster.predict(with_velocity, np.concatenate([plan, velocity[:, CONTEXT:]], axis=-1))

@@ -138,7 +138,7 @@ def test_velocities_are_differences_of_poses_on_any_other_arm(broken: str) -> No
         left_out = "velocity" if broken == "no speeds" else "joint"
         joints = {name: values for name, values in joints.items() if left_out not in name}
     recorded = track(table(JOINTED, pose, extra=joints))
-    expected = kinematics.differences(recorded.t_ns, pose[:, :3], recorded.arm[:, 3:7].astype(float))
+    expected = kinematics.difference_velocity(recorded.t_ns, pose[:, :3], recorded.arm[:, 3:7].astype(float))
     assert np.allclose(recorded.arm[:, 7:], expected, atol=1e-4)
 
 

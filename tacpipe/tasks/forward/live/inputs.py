@@ -17,7 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.live.decoding import BatchColumns
 from tacpipe.printable import listed
 from tacpipe.sensors import plan
-from tacpipe.signals.contact import rest_level, tared
+from tacpipe.signals.contact import rest_level, tare_level
 from tacpipe.synchronization import streams
 from tacpipe.synchronization.causal import Reading
 from tacpipe.synchronization.streams import holds_signal
@@ -222,7 +222,7 @@ class InputLayout:
         t_ns = np.zeros(len(rows), np.int64)  # all of them count
         for stream, (_, channels) in self.tactile_of.items():
             values = stacked[:, channels].astype(self.kinds[stream])
-            levels[channels] = tared(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
+            levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
         return levels
 
 

@@ -152,7 +152,7 @@ class Targets:
             self._kept.popleft()
         sign = 1.0 if newest[3:] @ before[3:] >= 0 else -1.0
         two_poses = np.stack([np.concatenate([before[:3], sign * before[3:]]), newest])
-        moved = kinematics.differences(np.array([before_ns, newest_ns]), two_poses[:, :3], two_poses[:, 3:])[1]
+        moved = kinematics.difference_velocity(np.array([before_ns, newest_ns]), two_poses[:, :3], two_poses[:, 3:])[1]
         state: Float32s = np.concatenate([newest, moved]).astype(np.float32)
         return state
 
