@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.streams import COUNT, absent, axes_of, unit_of
+from tacpipe.channels.streams import COUNT, common_unit, count_axes, missing_channel_error
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
 from tacpipe.plugins.params import added
@@ -102,7 +102,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     rest_metadata: dict[str, dict[str, str]] = {}
     schema = columns.schema
     sensors = _sensors(recording.name, schema)
-    units = {stream: unit_of(schema, names) for stream, names in sensors.items()}
+    units = {stream: common_unit(schema, names) for stream, names in sensors.items()}
     fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
     _check_levels(params, recording.name, units, fixed)
     for stream, names in sensors.items():
@@ -111,7 +111,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
             for table in columns.batches(names):
                 yield np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
 
-        axes = axes_of(schema, names)
+        axes = count_axes(schema, names)
         level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
         load, repeated = load_in_blocks(blocks, level, axes)
         loads.append(load)
@@ -215,5 +215,5 @@ def _sensors(name: str, schema: pa.Schema) -> dict[str, list[str]]:
         if metadata.get(b"quantity") == b"tactile":
             columns_by_stream.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
     if not columns_by_stream:
-        raise absent(name, "tactile", schema)
+        raise missing_channel_error(name, "tactile", schema)
     return columns_by_stream

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.streams import COUNT, axes_of, of_quantity, unit_of
+from tacpipe.channels.streams import COUNT, columns_with_quantity, common_unit, count_axes
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import (
     Fraction,
@@ -111,18 +111,18 @@ class Params(StreamSelection):
 def slides(params: Params, recording: Recording) -> RecordingOutput:
     """Return the slide of a recording, with its measures as attributes."""
     from tacpipe.channels import arm
-    from tacpipe.channels.streams import finger, without_spikes
+    from tacpipe.channels.streams import finger_stream, remove_spikes
     from tacpipe.datasets.overview import columns_of, streams_of
     from tacpipe.signals import slides as slide_signals
 
     if params.trigger == "load":
         return _slide_by_load(params, recording.name, columns_of(recording))
     streams = streams_of(recording)
-    table = finger(recording.name, streams)
+    table = finger_stream(recording.name, streams)
     t_ns = table.column("t_ns").to_numpy()  # (time,)
     attributes: dict[str, Attribute]
-    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, params.spike_count)
-    pressures = of_quantity(table, "static_pressure")
+    table, spikes = remove_spikes(table, params.spike_frames, params.spike_deviations, params.spike_count)
+    pressures = columns_with_quantity(table, "static_pressure")
     if not pressures:
         notes = [_KEPT_WHOLE.format(len(t_ns))] if len(t_ns) > params.frames else []
         attributes = {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
@@ -160,13 +160,13 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     import pyarrow as pa
 
     from tacpipe.channels import arm
-    from tacpipe.channels.streams import finger, without_spikes
+    from tacpipe.channels.streams import finger_stream, remove_spikes
     from tacpipe.io.columns import release
     from tacpipe.signals import slides as slide_signals
     from tacpipe.signals.contact import OFF_FRACTION, Thresholds, load_in_blocks, measure_rest, noise_thresholds
 
-    stream = finger(name, streams)
-    t_ns, names = stream.column("t_ns").to_numpy(), of_quantity(stream, "tactile")
+    stream = finger_stream(name, streams)
+    t_ns, names = stream.column("t_ns").to_numpy(), columns_with_quantity(stream, "tactile")
     measured = np.ones(len(names), bool)  # (channel,): it has a value in each row
 
     def blocks() -> Iterator[AnyArray]:
@@ -177,12 +177,12 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
             yield values
 
     level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
-    loaded, repeated = load_in_blocks(blocks, level, axes_of(stream.schema, names))
+    loaded, repeated = load_in_blocks(blocks, level, count_axes(stream.schema, names))
     if params.load_trigger is None:
         limits = noise_thresholds(repeated, loaded, t_ns, params.rest_s, rows)
     else:
         limits = Thresholds(params.load_trigger, OFF_FRACTION * params.load_trigger)
-    unit = unit_of(stream.schema, names)
+    unit = common_unit(stream.schema, names)
     release()  # the memory of the channels
     profile = arm.profile(streams, t_ns, by_place=True)
     release()
@@ -208,9 +208,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
         if count >= end:
             break
     whole = [channel for channel, is_measured in zip(names, measured, strict=True) if is_measured]
-    table, spikes = without_spikes(
-        pa.concat_tables(pieces), params.spike_frames, params.spike_deviations, height, whole
-    )
+    table, spikes = remove_spikes(pa.concat_tables(pieces), params.spike_frames, params.spike_deviations, height, whole)
     attributes: dict[str, Attribute] = {
         "load_mean": float(f"{loaded[kept_rows].mean():.4g}"),
         "load_trigger": float(f"{limits.on:.4g}"),

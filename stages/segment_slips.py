@@ -17,7 +17,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.channels.arm import METRES
-from tacpipe.channels.streams import COUNT, absent, entry, of_quantity, unit_of
+from tacpipe.channels.streams import COUNT, columns_with_quantity, common_unit, layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.stage import stage
@@ -83,7 +83,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
         raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
     channel = _proximity(recording.name, params.channel, table)
     readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
-    unit = unit_of(table.schema, [channel])
+    unit = common_unit(table.schema, [channel])
     if unit in METRES:
         readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
     elif unit not in (COUNT, ""):
@@ -126,7 +126,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
 
 def _proximity(name: str, channel: str, table: Columns) -> str:
     """Return the column with the distance of the object."""
-    proximity_columns = of_quantity(table, "proximity")
+    proximity_columns = columns_with_quantity(table, "proximity")
     if channel:
         if channel not in table.column_names:
             raise TacpipeError(
@@ -134,7 +134,7 @@ def _proximity(name: str, channel: str, table: Columns) -> str:
             )
         return channel
     if not proximity_columns:
-        raise absent(name, "proximity", table.schema, unit="mm")
+        raise missing_channel_error(name, "proximity", table.schema, unit="mm")
     if len(proximity_columns) != 1:
         raise TacpipeError(
             f"Recording {name} has {len(proximity_columns)} columns whose quantity is proximity, and slip is detected in "
@@ -148,7 +148,7 @@ def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeE
     stream = (table.schema.field(channel).metadata or {}).get(b"stream", b"").decode()
     return TacpipeError(
         f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
-        f"{entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."
+        f"{layout_entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."
     )
 
 

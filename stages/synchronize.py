@@ -100,7 +100,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.synchronization import streams
     from tacpipe.synchronization import streams as grids
     from tacpipe.synchronization.columns import look_ahead_ns
-    from tacpipe.synchronization.streams import listed
+    from tacpipe.synchronization.streams import join_names
 
     recorded_streams = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     signal_streams = {
@@ -110,7 +110,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     storage = MappedArrays(IN_MEMORY)
     placed: dict[str, TimedStream] = {}
     for name, stored in signal_streams.items():
-        placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
+        placed[name] = streams.to_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
         stored.forget()
     master_name = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in signal_streams.items()}
@@ -119,7 +119,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if omitted := [name for name in recorded_streams if name not in signal_streams]:
-        attributes["not_synchronized"] = listed(omitted)
+        attributes["not_synchronized"] = join_names(omitted)
     attributes["grid_rate_hz"] = round(mean_rate_hz(grid_ns), 3) if params.rate_hz is None else params.rate_hz
     if len(grid_ns) > 1:
         attributes["step_ms"] = round(float(np.median(np.diff(grid_ns))) / 1e6, 3)
@@ -128,7 +128,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         stream = placed.pop(name)
         exact = None if hold_values else grids.rows_at(stream.t_ns, grid_ns, rows)
         if params.unwrap:
-            stream, wrapped = streams.without_wraps(stream, storage.put_aside)
+            stream, wrapped = streams.unwrap_counts(stream, storage.put_aside)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
         gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
         columns += _on_grid(params, stream, grid_ns, exact, gap_ns, storage.put_aside)
@@ -166,8 +166,8 @@ def _on_grid(
     from tacpipe.synchronization import columns
 
     if params.values == "hold":
-        channels = columns.held_channels(stream, grid_ns, keep)
-        masks = [] if stream.truth else columns.held_masks(stream, grid_ns, gap_ns)
+        channels = columns.online_channels(stream, grid_ns, keep)
+        masks = [] if stream.truth else columns.online_masks(stream, grid_ns, gap_ns)
     else:
         channels = columns.channels(stream, grid_ns, exact, keep)
         masks = [] if stream.truth else columns.masks(stream, grid_ns, exact, gap_ns)

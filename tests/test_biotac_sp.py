@@ -22,7 +22,7 @@ def test_electrodes_lie_on_the_pad_and_mirror_each_other() -> None:
 
 
 def test_electrodes_are_unrolled_in_their_order_along_the_finger_and_mirrored_across_it() -> None:
-    flat = biotac_sp.unrolled_m()
+    flat = biotac_sp.unrolled_positions_m()
     np.testing.assert_array_equal(flat[:, 0], biotac_sp.electrode_positions_m()[:, 0])
     np.testing.assert_allclose(flat[:10, 1], -flat[10:20, 1])
     assert (flat[:10, 1] > biotac_sp.electrode_positions_m()[:10, 2]).all()  # an arc is longer than its shadow
@@ -61,7 +61,7 @@ def test_values_told_by_target_have_a_column_each_that_names_target_and_electrod
     [("pdc_th", 0.05496, 49), ("pdc_mf", 0.0617, 43), ("e_th", 0.06099, 213), ("e_mf", 0.05922, 195)],
 )
 def test_errors_of_the_letter_in_shares_are_its_errors_in_counts(target: str, share: float, counts: int) -> None:
-    zero, at = biotac_sp.counts(target, np.array([0.0, share]))
+    zero, at = biotac_sp.to_counts(target, np.array([0.0, share]))
     assert at - zero == pytest.approx(counts, abs=0.6)
-    np.testing.assert_allclose(biotac_sp.normalised(target, np.array([zero, at])), [0, share], atol=1e-12)
-    assert biotac_sp.normalised(target, np.array(biotac_sp.RANGES[target])).tolist() == [0, 1]
+    np.testing.assert_allclose(biotac_sp.normalise(target, np.array([zero, at])), [0, share], atol=1e-12)
+    assert biotac_sp.normalise(target, np.array(biotac_sp.RANGES[target])).tolist() == [0, 1]

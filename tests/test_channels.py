@@ -58,8 +58,8 @@ def test_an_arm_without_a_quaternion_has_none_and_no_position_is_no_arm() -> Non
 
 
 def test_columns_without_metadata_are_found_by_the_names_of_the_first_versions() -> None:
-    schema = pa.schema([pa.field(name, pa.float64()) for name in pose.NAMED.columns])
-    assert pose.pose(schema) == pose.NAMED
+    schema = pa.schema([pa.field(name, pa.float64()) for name in pose.DEFAULT_POSE.columns])
+    assert pose.pose(schema) == pose.DEFAULT_POSE
 
 
 def test_of_two_positions_the_stream_named_is_taken_and_else_the_robot() -> None:
@@ -92,21 +92,21 @@ def test_a_position_without_its_three_components_names_the_line_of_the_layout_fi
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001)])
 def test_a_length_is_read_in_its_unit(unit: str, factor: float) -> None:
-    assert pose.metres(field("x", "position", unit=unit)) == factor
+    assert pose.metres_per_unit(field("x", "position", unit=unit)) == factor
 
 
 def test_a_position_in_another_unit_names_the_line_of_the_layout_file() -> None:
     with pytest.raises(TacpipeError, match=r"'inch'.*\[streams\.ee\] columns"):
-        pose.metres(field("ee_x", "position", "ee", "inch"))
+        pose.metres_per_unit(field("ee_x", "position", "ee", "inch"))
 
 
 def test_what_is_absent_is_named_with_what_is_there_and_where_to_declare_it() -> None:
     bare = pa.field("skin_t1", pa.uint16(), metadata={"stream": "skin"})
-    message = str(absent.absent("trial-3", "tactile", [pa.field("t_ns", pa.int64()), bare, *arm("ee")]))
+    message = str(absent.missing_channel_error("trial-3", "tactile", [pa.field("t_ns", pa.int64()), bare, *arm("ee")]))
     for part in ("trial-3", "tactile", "3 of position", "skin_t1", "[streams.skin] columns", 'quantity = "tactile"'):
         assert part in message
 
 
 def test_columns_of_streams_name_the_stream_in_which_to_declare_them() -> None:
     streams = {"skin": [pa.field("t1", pa.uint16())], "ee": arm("ee")}
-    assert "[streams.skin] columns" in str(absent.absent("trial-3", "tactile", streams))
+    assert "[streams.skin] columns" in str(absent.missing_channel_error("trial-3", "tactile", streams))

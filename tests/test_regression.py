@@ -80,9 +80,9 @@ def test_the_global_error_is_at_least_the_mean_over_equal_batches(error: AnyArra
 @pytest.mark.parametrize("target", biotac_sp.TARGETS)
 def test_errors_in_shares_of_a_range_are_the_device_units_that_were_printed(target: str) -> None:
     for share, units in PRINTED[target]:
-        true = biotac_sp.counts(target, np.full((4, biotac_sp.width(target)), 0.25))
-        predicted = biotac_sp.counts(target, np.full((4, biotac_sp.width(target)), 0.25 + share))
-        normalised = (biotac_sp.normalised(target, values_in_counts) for values_in_counts in (true, predicted))
+        true = biotac_sp.to_counts(target, np.full((4, biotac_sp.width(target)), 0.25))
+        predicted = biotac_sp.to_counts(target, np.full((4, biotac_sp.width(target)), 0.25 + share))
+        normalised = (biotac_sp.normalise(target, values_in_counts) for values_in_counts in (true, predicted))
         assert regression.rmse(*normalised) == pytest.approx(share)
         assert int(regression.rmse(true, predicted)) == units  # the letter cuts decimals: it tells 74.6 as 74
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.channels.streams import of_quantity, signal
+from tacpipe.channels.streams import columns_with_quantity, signal
 from tacpipe.datasets.overview import streams_of
 
 
@@ -61,8 +61,8 @@ def test_a_synchronized_table_falls_apart_under_the_names_that_were_recorded() -
         "xela": {"t_ns": [10, 20], "x": [1, 2]},
         "robot": {"t_ns": [10, 20], "xela_x": [3, 4]},
     }
-    assert of_quantity(parts["xela"], "tactile") == ["x"]
-    assert of_quantity(parts["robot"], "tactile") == []
+    assert columns_with_quantity(parts["xela"], "tactile") == ["x"]
+    assert columns_with_quantity(parts["robot"], "tactile") == []
 
 
 def test_a_table_that_was_one_from_the_start_is_one_stream_without_name() -> None:

@@ -1,1 +1,1 @@
-"""The vocabulary of columns: streams, quantities, units, and the sensors' layouts."""
+"""The vocabulary of columns: streams, quantities, units, and sensor layouts."""

@@ -1,7 +1,7 @@
-"""The BioTac SP: where its electrodes lie, what a reading of two of them holds, and the ranges touch is scaled by.
+"""The BioTac SP: positions of its electrodes, columns of a reading of two fingers, and ranges for scaling.
 
-A grasp is measured by the thumb (``th``) and the middle finger (``mf``). Of each finger the pressure of the fluid (``pdc``)
-and 24 impedances (``e``) are predicted: four targets, 50 values.
+A grasp is measured with thumb (``th``) and middle finger (``mf``). The targets of prediction are the fluid pressure
+(``pdc``) and 24 impedances (``e``) of each finger: four targets with 50 values.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ELECTRODES = 24
 FINGERS = ("mf", "th")  # middle finger and thumb, in the order of the published files
 TARGETS = ("pdc_th", "pdc_mf", "e_th", "e_mf")
-RANGES = {  # device counts, the fixed ranges by which the letter scales (RA-L 2020, section on training)
+RANGES = {  # in counts; the fixed ranges of the publication (RA-L 2020, section on training)
     "pdc_th": (2500.0, 3400.0),
     "pdc_mf": (1600.0, 2300.0),
     "e_th": (100.0, 3600.0),
@@ -33,33 +33,33 @@ _MIDDLE = ((0.2588, -0.2523, 0.0), (0.1702, -0.2744, 0.0729), (0.1702, -0.2744, 
 
 
 def electrode_positions_m() -> Floats:
-    """Return where the electrodes lie on the core, metres (electrode, xyz).
+    """Return the positions of the electrodes on the core in metres (electrode, xyz).
 
-    x runs along the finger towards its tip, y away from the pad (electrodes lie at negative y), z sideways. Electrodes 1
-    to 10 lie at positive z, 11 to 20 mirror them, 21 to 24 lie on and about the midline. Source: the positions published
-    with tactile-gcn (Garcia-Garcia et al., TactileGCN, IJCNN 2019), in inches there.
+    x points to the fingertip, y away from the pad (electrodes have negative y), z sideways. Electrodes 1 to 10 have
+    positive z, 11 to 20 mirror them, and 21 to 24 are close to the midline. Source: the positions, in inches, published
+    with tactile-gcn (Garcia-Garcia et al., TactileGCN, IJCNN 2019).
     """
     right = np.column_stack([_X, _Y, _Z])
     return np.concatenate([right, right * (1, 1, -1), _MIDDLE]) * INCH_M
 
 
-def unrolled_m() -> Floats:
-    """Return where electrodes lie on the core rolled out flat, metres (electrode, axis): along the finger, and around it.
+def unrolled_positions_m() -> Floats:
+    """Return the positions of electrodes on the unrolled core in metres (electrode, axis): along and around the finger.
 
-    Along it is x of `electrode_positions_m`; around it is the arc about the finger's axis from the midline of the pad,
-    at the electrode's own distance from that axis, positive where z is.
+    The first is x of `electrode_positions_m`, the second the arc length from the midline of the pad at the electrode's
+    distance from the finger's axis, with the sign of z.
     """
     along, depth, across = electrode_positions_m().T
     return np.column_stack([along, np.hypot(depth, across) * np.arctan2(across, -depth)])
 
 
 def width(target: str) -> int:
-    """Return how many values a target has: 1 for a pressure, 24 for electrodes."""
+    """Return the number of values of a target: 1 for pressure, 24 for electrodes."""
     return ELECTRODES if target.startswith("e_") else 1
 
 
 def columns(target: str) -> list[str]:
-    """Return the columns that hold a target in a table of readings.
+    """Return the columns of a target in a table of readings.
 
     >>> columns("pdc_th"), columns("e_mf")[:2]
     (['th_pdc'], ['mf_electrode01', 'mf_electrode02'])
@@ -69,7 +69,7 @@ def columns(target: str) -> list[str]:
 
 
 def value_columns(target: str) -> list[str]:
-    """Return the columns that hold a target where values are listed by target: in predictions, and the truth beside them.
+    """Return the columns of a target in tables of predictions and ground truth.
 
     >>> value_columns("pdc_th"), value_columns("e_mf")[:2]
     (['pdc_th'], ['e_mf_01', 'e_mf_02'])
@@ -78,23 +78,23 @@ def value_columns(target: str) -> list[str]:
     return [target] if count == 1 else [f"{target}_{n:02d}" for n in range(1, count + 1)]
 
 
-def normalised(target: str, counts: Floats) -> Floats:
-    """Return counts of a target as fractions of its range (`RANGES`): 0 at its low end, 1 at its high one."""
+def normalise(target: str, counts: Floats) -> Floats:
+    """Scale counts of a target to fractions of its range in `RANGES`, 0 to 1."""
     low, high = RANGES[target]
     return (np.asarray(counts, np.float64) - low) / (high - low)
 
 
-def counts(target: str, shares: Floats) -> Floats:
-    """Return device counts of fractions of a target's range: what `normalised` undoes."""
+def to_counts(target: str, shares: Floats) -> Floats:
+    """Convert fractions of a target's range to counts, the inverse of `normalise`."""
     low, high = RANGES[target]
     return np.asarray(shares, np.float64) * (high - low) + low
 
 
 def fields() -> list[pa.Field]:
-    """Return the 58 fields of a reading, uint16 device counts, in the order of the published files.
+    """Return the 58 fields of a reading, uint16 counts, in the order of the published files.
 
-    Of each finger 24 electrodes, two quick readings of the fluid's pressure (``pac0``, ``pac1``), its pressure (``pdc``),
-    and temperature, its quick part before it (``tac``, ``tdc``).
+    For each finger there are 24 electrodes, two readings of dynamic pressure (``pac0``, ``pac1``), static pressure
+    (``pdc``), and dynamic and static temperature (``tac``, ``tdc``).
     """
     import pyarrow as pa
 

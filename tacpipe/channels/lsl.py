@@ -1,6 +1,6 @@
-"""The description of a stream of Lab Streaming Layer (LSL): its name, type, rate and channels, as its XML states them.
+"""Parse the XML description of a Lab Streaming Layer (LSL) stream: name, type, rate and channels.
 
-An LSL outlet sends it, and an XDF file holds it: https://github.com/sccn/xdf/wiki/Specifications.
+LSL outlets send it and XDF files contain it: https://github.com/sccn/xdf/wiki/Specifications.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, plain
 
-FORMATS = {  # numpy types by LSL's names; LSL has no unsigned types
+FORMATS = {  # numpy dtypes by LSL format; LSL has no unsigned types
     "float32": "float32",
     "double64": "float64",
     "int8": "int8",
@@ -25,13 +25,13 @@ FORMATS = {  # numpy types by LSL's names; LSL has no unsigned types
     "int64": "int64",
     "string": "text",
 }
-UNITS = {  # units by the names of LSL's recommendations
+UNITS = {  # units by the names that LSL recommends
     "microvolts": "uV", "millivolts": "mV", "volts": "V", "newtons": "N", "newton": "N", "meters": "m", "millimeters": "mm",
     "metres": "m", "degrees": "deg", "radians": "rad", "celsius": "degC", "seconds": "s", "milliseconds": "ms",
     "microtesla": "uT", "pascals": "Pa", "pascal": "Pa", "counts": "count", "normalized": "1", "none": "1",
     "meters/second": "m/s", "degrees/second": "deg/s", "radians/second": "rad/s", "meters/second^2": "m/s^2",
 }  # fmt: skip
-QUANTITIES = {  # quantities by the type of a channel, or of a stream whose channels have no type
+QUANTITIES = {  # quantities by the type of a channel, or of a stream if its channels have none
     "tactile": "tactile", "touch": "tactile", "taxel": "tactile", "pressure": "tactile", "skin": "tactile",
     "force": "force", "torque": "torque", "moment": "torque", "position": "position", "orientation": "orientation",
     "velocity": "velocity", "acceleration": "acceleration", "accelerometer": "acceleration", "acc": "acceleration",
@@ -41,7 +41,7 @@ QUANTITIES = {  # quantities by the type of a channel, or of a stream whose chan
     "eeg": "voltage", "emg": "voltage", "voltage": "voltage", "markers": "text", "current": "current",
 }  # fmt: skip
 COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
-MAX_TIME_S = 9e9  # latest time that nanoseconds in 64 bits hold
+MAX_TIME_S = 9e9  # latest time that fits in 64-bit nanoseconds
 TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
 MAX_CHANNELS = 1 << 16
 MAX_DESCRIPTION_BYTES = 1 << 24  # largest size of a description
@@ -67,10 +67,10 @@ class LslChannel:
 
 @dataclass(frozen=True)
 class LslDescription:
-    """The description that a stream states."""
+    """The description of a stream."""
 
     name: str
-    kind: str  # its type, as "EEG" or "Markers"
+    kind: str  # type, such as "EEG" or "Markers"
     format: str  # key of `FORMATS`
     rate_hz: float  # 0: irregular
     channels: tuple[LslChannel, ...]
@@ -80,19 +80,19 @@ class LslDescription:
 
     @property
     def is_text(self) -> bool:
-        """True for a stream of markers, whose samples are texts."""
+        """True for a stream of markers, whose samples are strings."""
         return self.format == "string"
 
     @property
     def dtype(self) -> str:
-        """The type of a number, as numpy names it."""
+        """The numpy dtype of values."""
         return FORMATS[self.format]
 
 
 def parse(text: str | bytes) -> LslDescription:
-    """Return the description in an ``<info>`` of LSL.
+    """Parse the ``<info>`` element of a stream.
 
-    Raises `TacpipeError` for what is not one: no XML, no such format, a count of channels or a rate that is none.
+    Raises `TacpipeError` if it is not XML, or its format, number of channels or rate is invalid.
     """
     if len(text) > MAX_DESCRIPTION_BYTES:
         raise TacpipeError(f"its description has {len(text):,} bytes, more than {MAX_DESCRIPTION_BYTES:,}")
@@ -121,7 +121,7 @@ def parse(text: str | bytes) -> LslDescription:
 
 
 def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[LslChannel, ...]:
-    """Return ``count`` channels: as described where there are as many descriptions, or else numbered."""
+    """Return ``count`` channels: the described ones if their number matches, else numbered ones."""
     labels = [element.findtext("label", "").strip() for element in described] if len(described) == count else []
     if not all(labels) or not labels:
         digits = max(2, len(str(count)))
@@ -129,15 +129,15 @@ def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: b
         labels = [plain_name] if count == 1 else [f"{plain_name}{number:0{digits}d}" for number in range(1, count + 1)]
     names = identifiers(labels)
     channels = []
-    for place, name in enumerate(names):
-        element = described[place] if len(described) == count else None
+    for index, name in enumerate(names):
+        element = described[index] if len(described) == count else None
         unit = "" if element is None else element.findtext("unit", "").strip()
-        quantity, component = _quantity("" if element is None else element.findtext("type", ""), kind, labels[place])
+        quantity, component = _quantity("" if element is None else element.findtext("type", ""), kind, labels[index])
         unit_name = UNITS.get(unit.lower(), unit)
         if text:
             channels.append(LslChannel(name, "1", "text"))
             continue
-        taxel = TAXEL.fullmatch(labels[place].lower()) if quantity == "tactile" and described else None
+        taxel = TAXEL.fullmatch(labels[index].lower()) if quantity == "tactile" and described else None
         channels.append(
             LslChannel(name, unit_name, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ()))
         )
@@ -145,22 +145,22 @@ def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: b
 
 
 def _quantity(type_text: str, kind: str, label: str) -> tuple[str, str]:
-    """Return quantity and component of a channel by its type (PositionX), else by that of its stream.
+    """Return quantity and component of a channel from its type, such as PositionX, or that of its stream.
 
     >>> _quantity("PositionX", "MoCap", "left.x"), _quantity("", "Force", "Fz"), _quantity("", "", "a")
     (('position', 'x'), ('force', 'z'), ('', ''))
     """
-    parted = COMPONENT.fullmatch(type_text.strip())
-    if parted and parted[1].lower() in QUANTITIES:
-        return QUANTITIES[parted[1].lower()], parted[2].lower()
+    match = COMPONENT.fullmatch(type_text.strip())
+    if match and match[1].lower() in QUANTITIES:
+        return QUANTITIES[match[1].lower()], match[2].lower()
     quantity = QUANTITIES.get(type_text.strip().lower()) or QUANTITIES.get(kind.strip().lower(), "")
-    parted = COMPONENT.fullmatch(label.strip())
+    match = COMPONENT.fullmatch(label.strip())
     vector = quantity in ("force", "torque", "position", "orientation", "velocity", "acceleration", "angular_velocity")
-    return quantity, parted[2].lower() if parted and vector else ""
+    return quantity, match[2].lower() if match and vector else ""
 
 
 def nanoseconds(seconds: Floats) -> Int64s:
-    """Return LSL's seconds as whole nanoseconds, their whole part apart: a product of all digits would be rounded.
+    """Convert LSL's seconds to integer nanoseconds. Integer and fractional parts are converted separately for precision.
 
     >>> nanoseconds(np.array([1.5, 41037.236252649])).tolist()
     [1500000000, 41037236252649]
@@ -171,7 +171,7 @@ def nanoseconds(seconds: Floats) -> Int64s:
 
 
 def identifiers(labels: Sequence[str]) -> list[str]:
-    """Return a name of small letters, digits and _ for each label, no two alike.
+    """Return a unique name of lower-case letters, digits and _ for each label.
 
     >>> identifiers(["Fx (N)", "fx_n", "3"])
     ['fx_n', 'fx_n_2', 'c3']

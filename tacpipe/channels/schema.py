@@ -1,7 +1,7 @@
-"""The channels that recordings have in common: their column names, types, units and layout, as arrow fields.
+"""Arrow fields of common channels: column names, types, units and layouts.
 
-The formats of published sets and the simulated rig build their tables here, so that what comes after them finds the
-same names. pyarrow is imported when a table is made: a rig PC names formats without it.
+Readers of published datasets and the simulated rigs use them, so that later stages find the same names. pyarrow is
+imported only to build tables, because recording does not need it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 TAXELS = 16  # taxels of a XELA uSkin 4x4, numbered row by row
 ELECTRODES = 19  # electrodes of a BioTac
-VIBRATIONS = 22  # readings of its pressure's quick part in one frame: 2200 Hz at 100 frames a second
+VIBRATIONS = 22  # readings of dynamic pressure per frame: 2200 Hz at 100 frames per second
 TRIANGLES, TRIANGLE_TAXELS = 6, 10  # triangular modules of a RoboSkin patch, and their taxels
 AXES = ("x", "y", "z")
 COMPONENTS = ("x", "y", "z", "w")
 
 
 def time_field(origin: str | None = None) -> pa.Field:
-    """Return the field ``t_ns``, int64 nanoseconds; ``origin`` states how stamps were computed that no clock gave."""
+    """Return the field ``t_ns``, int64 nanoseconds. ``origin`` describes how times without a clock were computed."""
     import pyarrow as pa
 
     metadata = {"unit": "ns", "quantity": "time", **({"made": origin} if origin else {})}
@@ -35,16 +35,16 @@ def time_field(origin: str | None = None) -> pa.Field:
 
 
 def device_fields(*, clock: bool, counters: Iterable[str]) -> list[pa.Field]:
-    """Return the int64 fields of a device's own clock, ``t_device_ns``, if it has one, and of its counters of samples."""
+    """Return the int64 fields of a device's clock, ``t_device_ns``, if it has one, and of its sample counters."""
     import pyarrow as pa
 
     time = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
-    counted = [pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"}) for name in counters]
-    return [time, *counted] if clock else counted
+    counter_fields = [pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"}) for name in counters]
+    return [time, *counter_fields] if clock else counter_fields
 
 
 def uskin_fields(taxels: int = TAXELS) -> list[pa.Field]:
-    """Return the fields ``taxel01_x`` to ``taxel16_z`` of a XELA uSkin, uint16 device counts, taxel by taxel."""
+    """Return the fields ``taxel01_x`` to ``taxel16_z`` of a XELA uSkin, uint16 counts, ordered by taxel."""
     import pyarrow as pa
 
     return [
@@ -59,9 +59,9 @@ def uskin_fields(taxels: int = TAXELS) -> list[pa.Field]:
 
 
 def biotac_fields() -> list[pa.Field]:
-    """Return the 44 fields of a BioTac, uint16 device counts: ``tdc``, ``tac``, ``pdc``, ``pac01`` …, ``electrode01`` ….
+    """Return the 44 fields of a BioTac, uint16 counts: ``tdc``, ``tac``, ``pdc``, ``pac01`` …, ``electrode01`` ….
 
-    Temperature and its quick part, pressure of the fluid, 22 readings of the pressure's quick part, 19 impedances.
+    They are static and dynamic temperature, static pressure, 22 readings of dynamic pressure, and 19 impedances.
     """
     import pyarrow as pa
 
@@ -82,7 +82,7 @@ def biotac_fields() -> list[pa.Field]:
 
 
 def roboskin_fields() -> list[pa.Field]:
-    """Return the fields ``triangle1_taxel01`` to ``triangle6_taxel10`` of a RoboSkin, float32 counts, by triangle."""
+    """Return the fields ``triangle1_taxel01`` to ``triangle6_taxel10`` of a RoboSkin, float32 counts."""
     import pyarrow as pa
 
     return [
@@ -109,19 +109,19 @@ def joint_torque_fields(joints: int = 7) -> list[pa.Field]:
 
 
 def twist_fields() -> list[pa.Field]:
-    """Return the six float64 fields of a motion: ``velocity_x_m_s``, … and ``angular_velocity_x_rad_s``, …."""
+    """Return the six float64 fields of a twist: ``velocity_x_m_s``, … and ``angular_velocity_x_rad_s``, …."""
     linear = [float_field(f"velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in AXES]
     return linear + [float_field(f"angular_velocity_{axis}_rad_s", "rad/s", "angular_velocity", axis) for axis in AXES]
 
 
 def wrench_fields() -> list[pa.Field]:
-    """Return the six float64 fields of a load: ``force_x_n``, … and ``torque_x_nm``, …."""
+    """Return the six float64 fields of a wrench: ``force_x_n``, … and ``torque_x_nm``, …."""
     force = [float_field(f"force_{axis}_n", "N", "force", axis) for axis in AXES]
     return force + [float_field(f"torque_{axis}_nm", "N m", "torque", axis) for axis in AXES]
 
 
 def profile_fields() -> list[pa.Field]:
-    """Return the fields that describe a slide: pressure, speed as recorded and smooth, force along z, phase."""
+    """Return the fields that describe a slide: pressure, raw and filtered speed, force along z, phase."""
     import pyarrow as pa
 
     pressure = pa.field("pressure_count", pa.float32(), metadata={"unit": "count", "quantity": "static_pressure"})
@@ -136,7 +136,7 @@ def pose_fields() -> list[pa.Field]:
 
 
 def target_pose_fields() -> list[pa.Field]:
-    """Return those of the pose that an arm's controller aims at: ``target_position_x_m``, … ``target_orientation_w``."""
+    """Return the fields of the target pose of an arm's controller: ``target_position_x_m``, … ``target_orientation_w``."""
     return [
         float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
         for field in pose_fields()
@@ -153,7 +153,7 @@ def float_field(name: str, unit: str, quantity: str, component: str | None = Non
 
 
 def label_field(name: str) -> pa.Field:
-    """Return an int8 field that holds a label: 0 or 1, or a small number."""
+    """Return an int8 field of a label: 0 or 1, or a small number."""
     import pyarrow as pa
 
     return pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
@@ -162,7 +162,7 @@ def label_field(name: str) -> pa.Field:
 def stream(
     t_ns: Times, columns: Iterable[Any], fields: Sequence[pa.Field], stamp_origin: str | None = None
 ) -> pa.Table:
-    """Return the table of a stream: ``t_ns`` (time,) and one column a field, each (time,), cast to the field's type."""
+    """Return the table of a stream: ``t_ns`` (time,) and one column per field, each (time,), cast to the field's type."""
     import pyarrow as pa
 
     arrays = [pa.array(t_ns, pa.int64())]
@@ -183,7 +183,7 @@ _QUANTITIES = """
     temperature temperature_change text time torque velocity vibration voltage
 """
 QUANTITIES = frozenset(_QUANTITIES.split())
-_PREFIXED = "m g s A K N Pa V W J Hz T G F C H S ohm Ω rad l L bar B eV"  # units that SI prefixes go before
+_PREFIXED = "m g s A K N Pa V W J Hz T G F C H S ohm Ω rad l L bar B eV"  # units with SI prefixes
 _SYMBOLS = _PREFIXED.split()
 _PLAIN = "1 count byte bit % px deg ° degC °C degF °F min h d rpm psi lbf lb in ft gf kgf dB au sample LSB"
 _WITHOUT_PREFIX = _PLAIN.split()
@@ -229,7 +229,7 @@ ALIASES = {word: unit for unit, words in _ALIASES.items() for word in words.spli
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit: symbols with SI prefixes and exponents, multiplied or divided.
+    """Return whether ``text`` is a unit: symbols with SI prefixes and exponents, multiplied or divided.
 
     >>> [is_unit(text) for text in ("kPa", "m/s^2", "N m", "count", "1/s", "Newton", "tactile")]
     [True, True, True, True, True, False, False]
@@ -238,7 +238,7 @@ def is_unit(text: str) -> bool:
 
 
 def unit_from_text(text: str) -> str:
-    """Return the unit that a text means, '' where it is none.
+    """Return the unit that ``text`` names, or ''.
 
     >>> unit_from_text("Newton"), unit_from_text(" counts"), unit_from_text("mm"), unit_from_text("left")
     ('N', 'count', 'mm', '')
@@ -248,7 +248,7 @@ def unit_from_text(text: str) -> str:
 
 
 def describe_unknown_quantity(word: str, declared: Collection[str] = ()) -> str:
-    """Return a sentence about a quantity that is neither in the vocabulary nor ``declared``; '' for one that is.
+    """Return a message about a quantity that is neither in the vocabulary nor ``declared``, else ''.
 
     >>> describe_unknown_quantity("tactle"), describe_unknown_quantity("force")
     ('There is no quantity tactle. Did you mean tactile?', '')
@@ -259,7 +259,7 @@ def describe_unknown_quantity(word: str, declared: Collection[str] = ()) -> str:
 
 
 def describe_unknown_unit(word: str, declared: Collection[str] = ()) -> str:
-    """Return a sentence about a unit that is neither known nor ``declared``; '' for one that is.
+    """Return a message about a unit that is neither known nor ``declared``, else ''.
 
     >>> describe_unknown_unit("Newton"), describe_unknown_unit("kPa")
     ('There is no unit Newton. Did you mean N?', '')

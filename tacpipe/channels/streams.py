@@ -1,4 +1,4 @@
-"""Find in the tables of streams: rates, columns of a quantity, ground truth, gaps, and the stream of a finger."""
+"""Read properties of stream tables: rates, columns of a quantity, ground truth, gaps, and the stream of a finger."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 Table = TypeVar("Table", "pa.Table", "pa.Table | Columns")
-COUNT = "count"  # the unit of readings as a sensor gives them
-EVENTS = "events"  # the stream of what went wrong while recording; no signal
-TRUTH = "gt_"  # how columns with ground truth begin
-_GAP_FACTOR = 3.0  # a step this many times the median step is a gap
-_PIECE_ROWS = 1 << 20  # rows whose clocks are read at once
+COUNT = "count"  # unit of raw readings
+EVENTS = "events"  # stream of problems during recording; not a signal
+TRUTH = "gt_"  # prefix of ground-truth columns
+_GAP_FACTOR = 3.0  # smallest gap as a multiple of the median step
+_PIECE_ROWS = 1 << 20  # rows in memory
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """The clocks of a stream in brief: first and last stamp, rate, and the stamps around each gap."""
+    """Start, end and rate of a stream, and the times around each gap."""
 
     start_ns: int
     stop_ns: int
-    rate_hz: float | None  # computed by the function `rate_hz`
+    rate_hz: float | None  # from the function `rate_hz`
     gap_starts_ns: Times  # (gap,)
     gap_stops_ns: Times  # (gap,)
 
     @property
     def duration_s(self) -> float:
-        """The time from the first to the last sample."""
+        """The time between the first and the last sample."""
         return (self.stop_ns - self.start_ns) / 1e9
 
 
 def read_clocks(columns: Columns) -> Clocks | None:
-    """Return the clocks of a stream; None without stamps, and for fewer than two rows.
+    """Return the clocks of a stream, or None without times or with fewer than two rows.
 
-    They are read in pieces of a million rows. Where no device counts, the median step is that of the first piece.
+    They are read in blocks of a million rows. Without a sample counter, the median step is that of the first block.
     """
     import numpy as np
     import pyarrow as pa
@@ -70,16 +70,16 @@ def read_clocks(columns: Columns) -> Clocks | None:
 
 
 def rate_hz(table: pa.Table | Columns) -> float | None:
-    """Return the rate of a stream's rows: by the device's own counter where there is one, else by the median step.
+    """Return the rate of a stream from its sample counter, or else from the median step.
 
-    None if there are no times, or too few rows.
+    Returns None without times or with fewer than two rows.
     """
     import numpy as np
 
     if "t_ns" not in table.column_names or table.num_rows < 2:
         return None
     step_ns = np.diff(table.column("t_ns").to_numpy())  # (time - 1,)
-    if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
+    if "seq" in table.column_names and step_ns.sum() > 0:  # with a sample counter, late arrivals are not gaps
         return round(float(np.diff(table.column("seq").to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
     median_ns = float(np.median(step_ns))
     return round(1e9 / median_ns, 3) if median_ns else None
@@ -88,66 +88,66 @@ def rate_hz(table: pa.Table | Columns) -> float | None:
 def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
     """Return the rows of a stream before which samples are missing.
 
-    The device's own counter shows them. A stream without a counter misses samples where a step is longer than three times
-    the median step, which is that of the table unless it is given.
+    They are detected with the sample counter. Without a counter, a step longer than three times the median step is a gap;
+    the default ``median_ns`` is that of the table.
     """
     import numpy as np
 
     step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
-    if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
+    if "seq" in table.column_names and step_ns.sum() > 0:  # with a sample counter, late arrivals are not gaps
         return np.flatnonzero(np.diff(table["seq"].to_numpy()) > 1) + 1
     typical_ns = float(np.median(step_ns)) if median_ns is None else median_ns
     return np.flatnonzero(step_ns > _GAP_FACTOR * typical_ns) + 1
 
 
-def of_quantity(table: pa.Table | Columns, quantity: str) -> list[str]:
-    """Return the columns of a stream that hold ``quantity``."""
+def columns_with_quantity(table: pa.Table | Columns, quantity: str) -> list[str]:
+    """Return the columns of a stream with ``quantity``."""
     return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
 
 
-def unit_of(source: pa.Table | pa.Schema, names: Sequence[str]) -> str:
-    """Return the unit of columns; the empty text where they have none, or not all the same."""
+def common_unit(source: pa.Table | pa.Schema, names: Sequence[str]) -> str:
+    """Return the common unit of columns, or '' if they have none or different ones."""
     units = {(source.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
     return next(iter(units)) if len(units) == 1 else ""
 
 
-def axes_of(source: pa.Table | pa.Schema, names: Sequence[str]) -> int:
-    """Return how many axes the taxels of these columns have."""
+def count_axes(source: pa.Table | pa.Schema, names: Sequence[str]) -> int:
+    """Return the number of axes of the taxels in these columns."""
     return len({(source.field(name).metadata or {}).get(b"axis") for name in names})
 
 
 def signal(streams: Mapping[str, pa.Table | Columns], quantity: str) -> tuple[Int64s, AnyArray] | None:
-    """Return stamps (time,) and values (time, channel) of the first stream with ``quantity``; None if there is none."""
+    """Return times (time,) and values (time, channel) of the first stream with ``quantity``, or None."""
     import numpy as np
 
     for table in streams.values():
-        names = of_quantity(table, quantity)
+        names = columns_with_quantity(table, quantity)
         if names:
             values = np.column_stack([table.column(name).to_numpy() for name in names])
             return table.column("t_ns").to_numpy(), values
     return None
 
 
-_NO_CHANNELS = ("time", "mask", "label", "latent", "prediction")  # quantities of columns that no sensor gave
-_SHOWN = 6  # quantities
+_NO_CHANNELS = ("time", "mask", "label", "latent", "prediction")  # quantities of columns that are not from a sensor
+_SHOWN = 6  # number of listed quantities
 
 
-def entry(stream: str) -> str:
-    """Return where a layout file declares the columns of a stream.
+def layout_entry(stream: str) -> str:
+    """Return the entry of a layout file that declares the columns of a stream.
 
-    >>> entry("skin"), entry("")
+    >>> entry("skin"), layout_entry("")
     ('[streams.skin] columns', '[streams.…] columns')
     """
     return f"[streams.{plain(stream) if stream else '…'}] columns"
 
 
-def absent(
+def missing_channel_error(
     recording: str, quantity: str, fields: Iterable[pa.Field] | Mapping[str, Iterable[pa.Field]], *, unit: str = ""
 ) -> TacpipeError:
-    """Return the error of a recording without a channel of ``quantity``.
+    """Return the error for a recording without a channel of ``quantity``.
 
-    ``fields`` are those of all its columns, or of each stream. The error names the quantities that are there, the
-    columns without one, and the line of a layout file that sets it.
+    ``fields`` are those of all columns, or of each stream. The error lists existing quantities and columns without a
+    quantity, and how to declare it in a layout file.
     """
     undeclared: list[str] = []
     counts: dict[str, int] = {}
@@ -169,7 +169,7 @@ def absent(
             streams.add(stream or metadata.get(b"stream", b"").decode())
     descriptions = [f"{count} of {plain(name)}" for name, count in counts.items()]
     descriptions += [f"{len(undeclared)} without a quantity ({listed(undeclared, 3)})"] if undeclared else []
-    table_name = entry(streams.pop() if len(streams) == 1 else "")
+    table_name = layout_entry(streams.pop() if len(streams) == 1 else "")
     setting = f'quantity = "{quantity}"' + (f' and unit = "{unit}"' if unit else "")
     summary = ", ".join(descriptions[-_SHOWN:]) or "none"
     return TacpipeError(
@@ -178,32 +178,32 @@ def absent(
     )
 
 
-def finger(name: str, streams: Mapping[str, Table]) -> Table:
-    """Return the only stream with tactile channels. Raises `TacpipeError`, naming the recording, for none or several."""
-    tactile_streams = [stream for stream, table in streams.items() if of_quantity(table, "tactile")]
+def finger_stream(name: str, streams: Mapping[str, Table]) -> Table:
+    """Return the only stream with tactile channels. Raises `TacpipeError` if there are none or several."""
+    tactile_streams = [stream for stream, table in streams.items() if columns_with_quantity(table, "tactile")]
     if not tactile_streams:
-        raise absent(name, "tactile", {stream: table.schema for stream, table in streams.items()})
+        raise missing_channel_error(name, "tactile", {stream: table.schema for stream, table in streams.items()})
     if len(tactile_streams) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(tactile_streams)} streams with tactile channels: {', '.join(tactile_streams)}; a "
-            f"slide is cut from one. Give recordings of one finger, or of one patch of skin."
+            f"Recording {name} has {len(tactile_streams)} streams with tactile channels: {', '.join(tactile_streams)}; it "
+            f"must have one. Use recordings of one finger or one patch of skin."
         )
     return streams[tactile_streams[0]]
 
 
-def without_spikes(
+def remove_spikes(
     table: pa.Table, rows: int, deviations: float, floor_count: float, names: Sequence[str] | None = None
 ) -> tuple[pa.Table, Int64s]:
-    """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`.
+    """Repair spikes in the tactile channels of a stream with `hampel`; also return their number in each row (time,).
 
-    Of the tactile channels only ``names`` are repaired where they are given.
+    By default, all tactile channels are repaired, otherwise only ``names``.
     """
     import numpy as np
     import pyarrow as pa
 
     from tacpipe.signals.repairs import hampel
 
-    names = of_quantity(table, "tactile") if names is None else list(names)
+    names = columns_with_quantity(table, "tactile") if names is None else list(names)
     if not names:
         return table, np.zeros(table.num_rows, np.int64)
     values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
@@ -215,17 +215,17 @@ def without_spikes(
     return table, spikes.sum(axis=1)
 
 
-GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
-GAP = "_gap"  # how the masks of gaps end
-GAP_MS = "_gap_ms"  # how the attributes of a synchronized recording end that hold the longest time without a gap
+GRID = "grid"  # attribute of synchronized recordings: uniform, logged or fresh
+GAP = "_gap"  # suffix of gap masks
+GAP_MS = "_gap_ms"  # suffix of attributes of synchronized recordings: longest time without a gap
 LOOK_AHEAD_MEAN, LOOK_AHEAD_MAX = "look_ahead_mean_ms", "look_ahead_max_ms"  # attributes of a synchronized recording
-MANY = 0.05  # fraction of rows in gaps of a stream, above which a user is warned
-_APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: further apart, rows are missing between
+WARNING_SHARE = 0.05  # fraction of rows in gaps above which users are warned
+_MAX_STEP = {"logged": 3.0, "fresh": 3.0}  # longest step without missing rows as a multiple of the median step, by grid
 _UNIFORM = 1.5
 
 
-def gaps(table: pa.Table) -> Bools:
-    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
+def gap_mask(table: pa.Table) -> Bools:
+    """Return a mask of rows (time,) in a gap of any stream, from the columns that end in ``_gap``."""
     import numpy as np
 
     gap = np.zeros(table.num_rows, dtype=bool)
@@ -236,34 +236,34 @@ def gaps(table: pa.Table) -> Bools:
 
 
 def gap_shares(table: pa.Table | Columns) -> dict[str, float]:
-    """Return the fraction of rows that lie in a gap of each stream, by the name of the stream."""
+    """Return the fraction of rows in a gap of each stream, by stream."""
     masks = [name for name in table.column_names if name.endswith(GAP)]
     return {name.removesuffix(GAP): float(table.column(name).to_numpy().mean()) for name in masks if table.num_rows}
 
 
 def describe_gaps(*tables: pa.Table | Columns) -> list[str]:
-    """Return one sentence for each stream with more than 5 % of its rows in gaps, in any of some recordings."""
+    """Return a message for each stream with more than 5 % of its rows in gaps in any of ``tables``."""
     shares: dict[str, float] = {}
     for table in tables:
         for stream, share in gap_shares(table).items():
             shares[stream] = max(share, shares.get(stream, 0.0))
     return [
-        f"More than {MANY:.0%} of the rows lie in gaps of stream {stream}, and no window crosses a gap; `tacpipe show` "
-        f"prints the fraction. Synchronize with a longer --gap-ms if its samples come that slowly."
+        f"More than {WARNING_SHARE:.0%} of the rows are in gaps of stream {stream}, and no window crosses a gap; "
+        f"`tacpipe show` prints the fraction. Synchronize with a longer --gap-ms if its samples are that slow."
         for stream, share in shares.items()
-        if share > MANY
+        if share > WARNING_SHARE
     ]
 
 
-def apart(attributes: Mapping[str, str | float | bool | None]) -> float:
-    """Return how many times the median step two rows of a recording may be apart with no row missing between."""
-    return _APART.get(str(attributes.get(GRID, "uniform")), _UNIFORM)
+def max_step(attributes: Mapping[str, str | float | bool | None]) -> float:
+    """Return the longest step without missing rows as a multiple of the median step of a recording."""
+    return _MAX_STEP.get(str(attributes.get(GRID, "uniform")), _UNIFORM)
 
 
 def times(table: pa.Table) -> Int64s:
-    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` if there are none."""
+    """Return the times of the rows in ns (time,). Raises `TacpipeError` if there are none."""
     import numpy as np
 
     if "t_ns" not in table.column_names:
-        raise TacpipeError("There is no column t_ns, so the order of the rows in time is unknown.")
+        raise TacpipeError("There is no column t_ns, so the times of the rows are unknown.")
     return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

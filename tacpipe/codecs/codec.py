@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
 from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, plain
-from tacpipe.signals.runs import breaks as breaks
+from tacpipe.signals.runs import run_starts as run_starts
 
 LEVELS, INCREMENTS = "levels", "increments"
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bools
-from tacpipe.channels.streams import gaps as gaps
+from tacpipe.channels.streams import gap_mask as gap_mask
 from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
@@ -87,7 +87,7 @@ def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchRead
     channels = columns(stored_columns.schema, "tactile")
     with _errors_naming(recording.name):
         codecs.check_channels(codec.channels, channels)
-        begins = codecs.breaks(times(stored_columns))
+        begins = codecs.run_starts(times(stored_columns))
         stored_columns.forget()
         if getattr(codec, "reads", 0) and stored_columns.num_rows > SOME_ROWS:
             return _in_pieces(recording.name, stored_columns, codec, begins)

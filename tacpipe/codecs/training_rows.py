@@ -118,7 +118,7 @@ class StoredRows:
     def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
         """Yield the rows of a recording that a codec may be fitted on."""
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
-        begins, gaps = codec.breaks(tactile.times(stored)), tactile.gaps(stored)
+        begins, gaps = codec.run_starts(tactile.times(stored)), tactile.gap_mask(stored)
         in_contact = np.ones(len(begins), dtype=bool)
         if "contact" in stored.column_names:
             in_contact = stored.column("contact").to_numpy() >= 0

@@ -270,8 +270,8 @@ class Windows(torch.utils.data.Dataset[Window]):
             values = _matrix(matrix, self.dtype, recording.name)
         else:
             values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
-        usable: Bools = ~streams.gaps(table) & np.isfinite(values).all(axis=1)
-        groups = np.cumsum(run_starts(t_ns, streams.apart(recording.attributes)))
+        usable: Bools = ~streams.gap_mask(table) & np.isfinite(values).all(axis=1)
+        groups = np.cumsum(run_starts(t_ns, streams.max_step(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
         return _RecordingRows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 
@@ -299,7 +299,7 @@ def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: st
 def _above_rest(table: pa.Table, matrix: arrays.Arrays, t_ns: Int64s, rest_s: float) -> Floats:
     """Return the channels (time, channel), tactile ones less their median over the first ``rest_s`` seconds."""
     values = matrix.values.astype(np.float64)
-    touch = np.isin(matrix.columns, streams.of_quantity(table, TACTILE))  # (channel,)
+    touch = np.isin(matrix.columns, streams.columns_with_quantity(table, TACTILE))  # (channel,)
     if not touch.any():
         raise UsageError(
             f"None of these channels has the quantity {TACTILE}, so none has a level at rest; leave out rest_s."

@@ -66,7 +66,7 @@ def electrode_change(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Flo
     ``contact_m`` is the radius of the contact (...), ``skin_m`` the deformation of the skin (...), ``centre_m`` the
     centre of the contact on the unrolled core (..., axis), all in metres.
     """
-    distance2 = ((biotac_sp.unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
+    distance2 = ((biotac_sp.unrolled_positions_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
     sigma2 = np.maximum(BREADTH * contact_m, 1e-9) ** 2
     near = np.exp(-distance2 / (2 * sigma2[..., None]))
     fall = GAIN_COUNT * (1 - np.exp(-skin_m / FLUID_M))[..., None] * near

@@ -144,7 +144,7 @@ def touch(situation: Situation, hidden: Unseen) -> Touch:
 def deformation(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
     """Return the contact radius and the deformation of the skin in metres under forces (..., finger).
 
-    The skin's share of the total indentation is E* / E_skin, because both bodies deform in proportion to their compliance.
+    The skin's part of the total indentation is E* / E_skin, because both bodies deform in proportion to their compliance.
     """
     radius = effective_radius_m(TIP_M, situation.curvatures_1_m)
     modulus = effective_modulus_pa(SKIN_PA, situation.compliance_1_pa)

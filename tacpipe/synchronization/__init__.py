@@ -1,1 +1,1 @@
-"""Streams with stamps of their own brought onto one grid: between their samples, or causally from the samples before."""
+"""Resample streams with their own timestamps to a common grid, by interpolation or causally."""

@@ -1,8 +1,8 @@
-"""Streams on a grid while their samples arrive: the rows that `synchronize` makes of the whole of them.
+"""Resample streams to a grid online, with the same rows that `synchronize` computes from complete streams.
 
-A row has the newest sample of each stream that is not after its grid point. Rows are made up to a time that the caller
-states: all samples up to it were pushed. So neither the pieces in which samples come nor the order of streams between
-two such statements changes a row.
+A row has the newest sample of each stream at or before its grid point. Rows are computed up to a time that the caller
+passes when all samples up to it are pushed, so rows depend neither on the chunks of samples nor on the order of streams
+between two calls.
 """
 
 from __future__ import annotations
@@ -16,77 +16,77 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
 from tacpipe.signals.repairs import RANGE, count_wraps
 from tacpipe.signals.resampling import is_overdue, median_before, newest_rows, uniform_offsets
-from tacpipe.synchronization.columns import PAST_NS
+from tacpipe.synchronization.columns import ONLINE_MEDIAN_NS
 
-ROOM = 256  # samples that a buffer holds at first
+INITIAL_ROWS = 256  # initial size of a buffer
 
 
 @dataclass(frozen=True)
-class Reading:
-    """The columns of a stream: their number, and those with a special treatment."""
+class StreamColumns:
+    """The number of columns of a stream, and the columns with special treatment."""
 
-    width: int  # columns of a sample
-    wraps: Sequence[int] = ()  # columns with counts of 16 bits whose wrap-around is undone
-    medians: Sequence[int] = ()  # columns that get the median of their last samples
-    compared: Sequence[int] = ()  # columns that are compared to detect a repeated sample
+    width: int  # number of columns
+    wraps: Sequence[int] = ()  # columns with 16-bit counts to unwrap
+    medians: Sequence[int] = ()  # columns that are filtered with a median
+    compared: Sequence[int] = ()  # columns that are compared to detect repeated samples
 
 
 class GridRows(NamedTuple):
-    """Some rows of a grid, in order; `newest_ns`, `gap` and `values` are by stream."""
+    """Consecutive rows of a grid. `newest_ns`, `gap` and `values` are by stream."""
 
     t_ns: Times  # (row,)
-    has_samples: Bools  # (row,), or True if each stream has a sample; other rows are empty
-    newest_ns: Mapping[str, Times]  # (row,), of the sample that is held
+    has_samples: Bools  # (row,): True if each stream has a sample; other rows are empty
+    newest_ns: Mapping[str, Times]  # (row,): time of the newest sample
     gap: Mapping[str, Bools]  # (row,)
     values: Mapping[str, Floats]  # (row, column)
 
 
 class Grid:
-    """Rows of several streams on the grid of one of them, as `synchronize` holds values."""
+    """Rows of several streams on the grid of one of them, as from `synchronize` with held values."""
 
     def __init__(
         self,
-        streams: Mapping[str, Reading],
+        streams: Mapping[str, StreamColumns],
         master: str,
         kind: str,
         rate_hz: float | None,
         gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
-        """Make a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``.
+        """Prepare a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``.
 
-        ``gap_ns`` is the age by stream above which its newest sample is in a gap.
-        ``origin_ns`` is the first point of a uniform grid that is continued; None: the master's first sample is.
+        ``gap_ns`` is the age of the newest sample above which a stream is in a gap. ``origin_ns`` is the first point of
+        an earlier uniform grid to continue; by default, a grid starts at the master's first sample.
         """
         self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}
         self._master, self._kind, self._rate_hz, self._gap_ns = master, kind, rate_hz, gap_ns
-        self._points = 0  # points of the uniform grid so far
-        self._until_ns: int | None = None  # up to which rows were made
-        self.late = dict.fromkeys(streams, 0)  # samples that came after the rows that they would have changed
+        self._points = 0  # number of computed points of a uniform grid
+        self._until_ns: int | None = None  # time up to which rows are computed
+        self.late = dict.fromkeys(streams, 0)  # numbers of samples that arrived too late for their rows
 
     def continue_from(self, stream: str, levels: AnyFloats) -> None:
-        """Take the first sample of a stream to have wrapped around as often as is nearest to ``levels`` (column,).
+        """Unwrap the first sample of a stream to the values nearest to ``levels`` (column,).
 
-        For a grid that continues a session, in which counts may have run over their end before.
+        It is for a grid that continues a session, in which counts may already have wrapped.
         """
         self._sources[stream].levels = levels
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """The streams of which no sample has come."""
+        """The streams without samples."""
         return tuple(name for name, source in self._sources.items() if source.first_ns is None)
 
     @property
     def origin_ns(self) -> int | None:
-        """The first point of the grid; None before the master's first sample."""
+        """The first point of the grid, or None before the master's first sample."""
         return self._sources[self._master].first_ns if self._origin_ns is None else self._origin_ns
 
     def push(self, stream: str, t_ns: Times, values: AnyFloats) -> None:
-        """Take samples of a stream, (time,) and (time, column), in the order in which they arrived.
+        """Add samples of a stream, (time,) and (time, column), in the order of arrival.
 
-        One with a stamp before that of its predecessor is dropped and counted in `late`; so is, but not dropped, one that
-        `rows` had passed.
+        Samples whose time is before that of an earlier sample are dropped and counted in `late`. Samples within
+        already computed rows are counted, too.
         """
         source = self._sources[stream]
         if len(t_ns):
@@ -102,7 +102,7 @@ class Grid:
         source.push(t_ns, values)
 
     def rows(self, until_ns: int) -> GridRows:
-        """Return the rows up to ``until_ns`` that were not made yet: all samples up to then were pushed."""
+        """Return the new rows up to ``until_ns``. All samples up to this time must have been pushed."""
         after_ns, self._until_ns = self._until_ns, max(until_ns, self._until_ns or until_ns)
         grid_ns = self._grid(after_ns, self._until_ns)
         firsts = [source.first_ns for source in self._sources.values()]
@@ -126,7 +126,7 @@ class Grid:
             return np.zeros(0, np.int64)
         if self._rate_hz is not None:
             origin_ns = master.first_ns if self._origin_ns is None else self._origin_ns
-            if not self._points:  # those before the first sample are the grid's that is continued
+            if not self._points:  # points before the first sample belong to the earlier grid
                 self._points = max(0, int((master.first_ns - origin_ns) * self._rate_hz / 1e9) - 1)
             count = int((until_ns - origin_ns) * self._rate_hz / 1e9) + 2
             points = origin_ns + uniform_offsets(self._points, max(0, count - self._points), self._rate_hz)
@@ -145,24 +145,24 @@ class Grid:
 
 
 class _Source:
-    """The last samples of one stream."""
+    """The latest samples of a stream."""
 
-    def __init__(self, reading: Reading) -> None:
+    def __init__(self, reading: StreamColumns) -> None:
         self.reading = reading
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
         self._wraps, self._compared, self._medians = (
             np.array(columns, np.intp) for columns in (reading.wraps, reading.compared, reading.medians)
         )
-        self._t_ns, self._values = np.zeros(ROOM, np.int64), np.zeros((ROOM, reading.width))
-        self._repeated = np.zeros(ROOM, bool)
-        self._start = self._stop = 0  # rows of the buffers in use
-        self._before: AnyFloats | None = None  # (column,), the sample before, as it came
-        self._turned: Int64s = np.zeros(len(self._wraps), np.int64)
-        self.levels: AnyFloats | None = None  # (column,), that the first sample is nearest to; None: as it comes
+        self._t_ns, self._values = np.zeros(INITIAL_ROWS, np.int64), np.zeros((INITIAL_ROWS, reading.width))
+        self._repeated = np.zeros(INITIAL_ROWS, bool)
+        self._start = self._stop = 0  # used rows of the buffers
+        self._before: AnyFloats | None = None  # (column,): the previous sample, unprocessed
+        self._wrap_counts: Int64s = np.zeros(len(self._wraps), np.int64)
+        self.levels: AnyFloats | None = None  # (column,): values near which the first sample is unwrapped
 
     def push(self, t_ns: Times, values: AnyFloats) -> None:
-        """Take samples whose stamps do not run backwards."""
+        """Add samples with non-decreasing times."""
         before = values[:1] if self._before is None else self._before[None]
         extended = np.concatenate([before, values]) if len(self._wraps) or len(self._compared) else values
         self._reserve(len(t_ns))
@@ -170,11 +170,11 @@ class _Source:
         self._t_ns[added], self._values[added] = t_ns, values
         if self._before is None and self.levels is not None:
             distance = (self.levels - values[0])[self._wraps]
-            self._turned = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
+            self._wrap_counts = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
         if len(self._wraps):
-            turned = self._turned + np.cumsum(count_wraps(extended[:, self._wraps]), axis=0)
-            self._values[added, self._wraps] += RANGE * turned
-            self._turned = turned[-1]
+            wrap_counts = self._wrap_counts + np.cumsum(count_wraps(extended[:, self._wraps]), axis=0)
+            self._values[added, self._wraps] += RANGE * wrap_counts
+            self._wrap_counts = wrap_counts[-1]
         if len(self._compared):
             self._repeated[added] = (extended[1:, self._compared] == extended[:-1, self._compared]).all(axis=1)
             if self._before is None:
@@ -185,29 +185,29 @@ class _Source:
         self.first_ns = int(t_ns[0]) if self.first_ns is None else self.first_ns
 
     def stamps(self) -> tuple[Times, Bools]:
-        """Return the stamps of the samples that are kept (time,), and which repeat the sample before."""
+        """Return the times of the buffered samples (time,), and a mask of samples that repeat the previous one."""
         filled = slice(self._start, self._stop)
         return self._t_ns[filled], self._repeated[filled]
 
     def at(self, grid_ns: Times) -> tuple[Times, Floats]:
-        """Return stamp (grid,) and values (grid, column) of the newest sample at each grid point."""
+        """Return times (grid,) and values (grid, column) of the newest sample at each grid point."""
         filled = slice(self._start, self._stop)
         t_ns, values = self._t_ns[filled], self._values[filled]
         rows = newest_rows(t_ns, grid_ns)
         samples: Floats = values[rows]
         if len(self._medians):
-            samples[:, self._medians] = median_before(t_ns, values[:, self._medians], grid_ns, PAST_NS)
+            samples[:, self._medians] = median_before(t_ns, values[:, self._medians], grid_ns, ONLINE_MEDIAN_NS)
         return t_ns[rows], samples
 
     def forget(self, until_ns: int) -> None:
-        """Let go of samples that no grid point after ``until_ns`` reads."""
+        """Remove samples that no grid point after ``until_ns`` needs."""
         newest = self._start + int(newest_rows(self._t_ns[self._start : self._stop], np.array([until_ns]))[0])
         if len(self._medians):
-            newest = min(newest, int(np.searchsorted(self._t_ns[: self._stop], until_ns - PAST_NS)))
+            newest = min(newest, int(np.searchsorted(self._t_ns[: self._stop], until_ns - ONLINE_MEDIAN_NS)))
         self._start = max(self._start, newest)
 
     def _reserve(self, count: int) -> None:
-        """Make room for some samples behind those that are kept."""
+        """Ensure space for ``count`` samples after the buffered ones."""
         if self._stop + count <= len(self._t_ns):
             return
         filled = slice(self._start, self._stop)

@@ -1,4 +1,4 @@
-"""The channels of a stream on a grid, and the masks that state how far they can be trusted."""
+"""Compute the channels of a stream on a grid, with masks of repeated samples and gaps."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Bools, Floats, Int64s, Times
 
-MEDIAN_NS = (
-    10_000_000  # half width of a median: eight readings of a proximity sensor at 400 Hz, which reduces its noise
-)
-PAST_NS = 2 * MEDIAN_NS  # width of a causal median: as many readings, 10 ms late
+MEDIAN_NS = 10_000_000  # half width of a median: eight readings of a 400 Hz proximity sensor, to reduce noise
+ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median: as many readings, delayed by 10 ms
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
-Keep = Callable[[Any], Any]  # puts values (grid,) aside and returns them
-BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
+Keep = Callable[[Any], Any]  # stores values (grid,), possibly on disk, and returns them
+BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated at once
 
 
 def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, in the order of the stream; ``keep`` takes each as it is made."""
+    """Return field and values of each channel on the grid, in the order of the stream. ``keep`` stores each."""
     import pyarrow as pa
 
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
@@ -46,18 +44,18 @@ def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Ke
             for name, column in zip(
                 block, _between_samples(stream, block, interpolation, grid_ns, rows).T, strict=True
             ):
-                kind = streams.between_type(stream.columns.schema.field(name).type)
+                kind = streams.interpolated_type(stream.columns.schema.field(name).type)
                 grid_columns[name] = _as_stored(
                     streams.grid_field(stream.name, stream.field(name), interpolation, kind), column, keep
                 )
     return [grid_columns[name] for name in stream.channels]
 
 
-def held_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, from samples that had come by each point alone.
+def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
+    """Return field and values of each channel on the grid, computed causally.
 
-    A channel keeps its newest sample, and its type; a proximity sensor has the median of the last `PAST_NS`. Each point
-    needs a sample before it. ``keep`` takes each channel as it is made.
+    The value is the newest sample, with the same type; for a proximity sensor, the median of the last
+    `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it. ``keep`` stores each channel.
     """
     import pyarrow as pa
 
@@ -67,9 +65,9 @@ def held_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridC
     grid_columns = []
     for name in stream.channels:
         if streams.method(stream.columns.schema, name) == "median":
-            kind = streams.between_type(stream.columns.schema.field(name).type)
+            kind = streams.interpolated_type(stream.columns.schema.field(name).type)
             field = streams.grid_field(stream.name, stream.field(name), "median", kind)
-            values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, PAST_NS)
+            values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, ONLINE_MEDIAN_NS)
             grid_columns.append(_as_stored(field, values[:, 0], keep))
         else:
             grid_columns.append(_at_rows(stream, name, rows, "hold", keep))
@@ -77,12 +75,12 @@ def held_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridC
 
 
 def _at_rows(stream: TimedStream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
-    """Return field and values of a channel at some rows, its type kept; ``interpolation`` names the method."""
+    """Return field and values of a channel at ``rows`` with the same type; ``interpolation`` names the method."""
     return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
 
 
 def _blocks(stream: TimedStream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
-    """Return the channels that are interpolated at once: the four of a quaternion, else as many as fit a block."""
+    """Return the channels to interpolate at once: the four of a quaternion, or as many as fit in a block."""
     if interpolation == "slerp":
         parts = [stream.columns.schema.field(name) for name in members]
         return [[members[i] for i in streams.quaternion_order(stream.name, parts)]]
@@ -92,7 +90,7 @@ def _blocks(stream: TimedStream, members: list[str], interpolation: str, points:
 
 
 def _between_samples(stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any) -> Floats:
-    """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
+    """Interpolate channels (grid, channel) from the rows ``used``."""
     import numpy as np
 
     from tacpipe.signals.resampling import linear, median_around, slerp
@@ -113,7 +111,7 @@ def _as_stored(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
 
 
 def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
-    """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
+    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample."""
     import numpy as np
 
     from tacpipe.signals.resampling import in_gap, nearest_rows
@@ -124,19 +122,19 @@ def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int
 
 
 def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
-    """Return how long after each point the last sample arrived that `channels` reads there, shape (grid,), 0 or more."""
+    """Return the time (grid,) from each point to the arrival of the last sample that `channels` uses for it, at least 0."""
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
     if exact is None and any(streams.method(stream.columns.schema, name) == "median" for name in stream.channels):
         rows = np.maximum(rows, np.searchsorted(stream.t_ns, grid_ns + MEDIAN_NS, side="right") - 1)
-    arrived_ns = stream.arrival_ns[np.minimum(rows, len(stream.t_ns) - 1)]
-    ahead_ns: Times = np.maximum(arrived_ns - grid_ns, 0)
-    return ahead_ns
+    arrival_ns = stream.arrival_ns[np.minimum(rows, len(stream.t_ns) - 1)]
+    look_ahead: Times = np.maximum(arrival_ns - grid_ns, 0)
+    return look_ahead
 
 
-def held_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
-    """Return where the newest sample was held, where it is older than ``gap_ns``, and how old it is."""
+def online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
+    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample."""
     from tacpipe.signals.resampling import is_overdue, newest_rows
 
     rows = newest_rows(stream.t_ns, grid_ns)

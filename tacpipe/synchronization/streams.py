@@ -1,4 +1,4 @@
-"""Put the streams of a recording on the host's clock, and choose the grid and how each channel is placed on it."""
+"""Convert the streams of a recording to the host's clock, and choose the grid and the interpolation of each channel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe import printable
 from tacpipe.channels import arm
-from tacpipe.channels.streams import absent, entry
+from tacpipe.channels.streams import layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
 
@@ -19,26 +19,28 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 
-TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
-DEVICE, SEQUENCE = "t_device_ns", "seq"  # a device's own time and number of a sample; they stay as they are
-UNCERTAIN = "t_uncertain_ns"  # column of the recorder with the largest delay of each stamp, no channel
-AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
+TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
+UNCERTAIN = (
+    "t_uncertain_ns"  # column of the recorder with the largest possible delay of each arrival time; not a channel
+)
+NOT_INTERPOLATED = ("label", "time", "mask")  # quantities whose nearest sample is used
 
 
 def channel_names(schema: pa.Schema) -> list[str]:
-    """Return the names of a stream's channels: of all columns but the time and its uncertainty."""
+    """Return the names of a stream's channels: all columns except the time and its uncertainty."""
     return [name for name in schema.names if name not in ("t_ns", UNCERTAIN)]
 
 
 def method(schema: pa.Schema, name: str) -> str:
-    """Return how a channel is interpolated: nearest, linear, median, or slerp and the name of its quaternion."""
+    """Return the interpolation of a channel: nearest, linear, median, or slerp with the name of its quaternion."""
     import pyarrow as pa
 
     field = schema.field(name)
     metadata = field.metadata or {}
     quantity = metadata.get(b"quantity", b"").decode()
     number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
-    if not number or quantity in AS_IT_STANDS or name in (DEVICE, SEQUENCE):
+    if not number or quantity in NOT_INTERPOLATED or name in (DEVICE, SEQUENCE):
         return "nearest"
     if quantity == "proximity":
         return "median"
@@ -48,19 +50,19 @@ def method(schema: pa.Schema, name: str) -> str:
 
 
 def quaternion_order(stream: str, fields: Sequence[pa.Field]) -> list[int]:
-    """Return where x, y, z and w are among the columns of a quaternion. Raises `TacpipeError` for other components."""
+    """Return the indices of x, y, z and w in the columns of a quaternion. Raises `TacpipeError` for other components."""
     parts = [arm.component(field) for field in fields]
     if sorted(parts) != ["w", "x", "y", "z"]:
         raise TacpipeError(
-            f"Stream {stream!r}: the orientation in {listed(field.name for field in fields)} has the components "
-            f"{listed(part or 'unknown' for part in parts)}; a quaternion needs x, y, z and w once each. Set component = "
-            f'"x" and so on in {entry(stream)} of the layout file, or another quantity for what is not a quaternion.'
+            f"Stream {stream!r}: the orientation in {join_names(field.name for field in fields)} has the components "
+            f"{join_names(part or 'unknown' for part in parts)}; a quaternion needs x, y, z and w once each. Set "
+            f'component = "x" and so on in {layout_entry(stream)} of the layout file, or change their quantity.'
         )
     return [parts.index(part) for part in "xyzw"]
 
 
-def between_type(kind: pa.DataType) -> pa.DataType:
-    """Return the type of interpolated values: floats as they are, integers of 16 bits or fewer float32, else float64."""
+def interpolated_type(kind: pa.DataType) -> pa.DataType:
+    """Return the type of interpolated values: unchanged for floats, float32 for up to 16-bit integers, else float64."""
     import pyarrow as pa
 
     if pa.types.is_floating(kind):
@@ -69,7 +71,7 @@ def between_type(kind: pa.DataType) -> pa.DataType:
 
 
 def grid_field(stream: str, channel: pa.Field, interpolation: str, kind: pa.DataType | None = None) -> pa.Field:
-    """Return the field of a channel on the grid: ``<stream>_<column>``, where it came from and how."""
+    """Return the field ``<stream>_<column>`` of a channel on the grid, with stream and interpolation as metadata."""
     import pyarrow as pa
 
     metadata = {**(channel.metadata or {}), b"stream": stream.encode(), b"interpolation": interpolation.encode()}
@@ -85,26 +87,26 @@ def grid_name(stream: str, channel: str) -> str:
     return channel if channel.startswith(TRUTH) else f"{stream}_{channel}"
 
 
-def listed(names: Iterable[Any]) -> str:
-    """Return names with commas between them."""
+def join_names(names: Iterable[Any]) -> str:
+    """Join names with commas."""
     return ", ".join(map(str, names))
 
 
-# quantities of streams that are no signals: times alone, and what a live session records of itself
-OF_SESSIONS = ("time", "plan", "prediction", "latency", "alarm", "material")
+# quantities of streams that are not signals: times, and records of live sessions
+SESSION_QUANTITIES = ("time", "plan", "prediction", "latency", "alarm", "material")
 
 
 @dataclass(frozen=True)
 class TimedStream:
-    """One stream of a recording, and when its samples were taken on the host's clock."""
+    """A stream of a recording with sampling times on the host's clock."""
 
     name: str
     columns: Columns
     t_ns: Times  # (time,)
-    repeated: Bools  # (time,), or True if a sample repeats the one before
-    arrival_ns: Times  # (time,), when the samples arrived, whatever the clock of `t_ns`
-    attributes: dict[str, Attribute] = field(default_factory=dict)  # attributes of the fit of its clock
-    unwrap: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
+    repeated: Bools  # (time,): True if a sample repeats the previous one
+    arrival_ns: Times  # (time,): arrival times on the host's clock
+    attributes: dict[str, Attribute] = field(default_factory=dict)  # results of the clock fit
+    unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels with unwrapped counts
 
     @property
     def channels(self) -> list[str]:
@@ -112,19 +114,19 @@ class TimedStream:
         return channel_names(self.columns.schema)
 
     def field(self, name: str) -> pa.Field:
-        """Return the field of a channel; of an unwrapped one with the type after unwrapping."""
+        """Return the field of a channel. An unwrapped channel has the type after unwrapping."""
         import pyarrow as pa
 
         channel = self.columns.schema.field(name)
         return channel.with_type(pa.int32()) if name in self.unwrapped else channel
 
     def values(self, name: str) -> AnyArray:
-        """Return a channel of numbers (time,)."""
+        """Return a numeric channel (time,)."""
         unwrapped_values = self.unwrapped.get(name)
         return self.columns.column(name).to_numpy() if unwrapped_values is None else unwrapped_values
 
     def at(self, name: str, rows: pa.Array) -> pa.Array:
-        """Return a channel of any type at some rows."""
+        """Return a channel of any type at ``rows``."""
         import pyarrow as pa
 
         unwrapped_values = self.unwrapped.get(name)
@@ -141,27 +143,28 @@ class TimedStream:
 
 
 def is_signal(columns: Columns) -> bool:
-    """Return whether a stream has numbers over time, and no column of bytes; what a model predicted is no signal."""
-    return columns.num_rows != 1 and holds_signal(columns.schema)
+    """Return whether a stream has numbers over time and no binary column. Predictions are not signals."""
+    return columns.num_rows != 1 and may_be_signal(columns.schema)
 
 
-def holds_signal(schema: pa.Schema) -> bool:
-    """Return whether the columns of a stream can be a signal: `is_signal` of more than one row."""
+def may_be_signal(schema: pa.Schema) -> bool:
+    """Return whether a stream with this schema and more than one row is a signal, as in `is_signal`."""
     import pyarrow as pa
 
     channels = [field for field in schema if field.name not in ("t_ns", UNCERTAIN)]
     if any(pa.types.is_binary(field.type) for field in channels):
         return False
     return any(
-        not pa.types.is_string(field.type) and (field.metadata or {}).get(b"quantity", b"").decode() not in OF_SESSIONS
+        not pa.types.is_string(field.type)
+        and (field.metadata or {}).get(b"quantity", b"").decode() not in SESSION_QUANTITIES
         for field in channels
     )
 
 
-def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> TimedStream:
-    """Return a stream with its samples on the host's clock; ``clock`` names the stamps: device, arrival or auto.
+def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> TimedStream:
+    """Convert a stream to the host's clock. ``clock`` selects the times: device, arrival or auto.
 
-    Raises `TacpipeError` for stamps that are absent, run backwards or give no clock.
+    Raises `TacpipeError` if times are missing or decrease, or the device's clock cannot be fitted.
     """
     arrival_ns = _stamps(recording, name, columns)
     stream = TimedStream(name, columns, arrival_ns, _repeated_rows(columns), arrival_ns)
@@ -170,16 +173,18 @@ def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> Ti
     if DEVICE not in columns.column_names:
         if clock == "device":
             raise TacpipeError(
-                f"Recording {recording}: stream {name!r} has no column {DEVICE}, and so no clock of a device. "
-                f"Take `--clock auto`, which uses the device's clock where there is one, or `--clock arrival`."
+                f"Recording {recording}: stream {name!r} has no column {DEVICE}. Use `--clock auto`, which uses the "
+                f"device's clock if there is one, or `--clock arrival`."
             )
         return stream
-    t_ns, attributes = _by_device(recording, name, columns, stream.t_ns)
+    t_ns, attributes = _convert_device_times(recording, name, columns, stream.t_ns)
     return replace(stream, t_ns=t_ns, attributes=attributes)
 
 
-def _by_device(recording: str, stream: str, columns: Columns, arrival_ns: Times) -> tuple[Int64s, dict[str, Attribute]]:
-    """Return when samples were taken by their device's clock, mapped to the host's, and what the fit gave."""
+def _convert_device_times(
+    recording: str, stream: str, columns: Columns, arrival_ns: Times
+) -> tuple[Int64s, dict[str, Attribute]]:
+    """Return the device times of samples converted to the host's clock, and attributes of the fit."""
     import pyarrow as pa
 
     from tacpipe.signals.clocks import fit_clock, host_times
@@ -188,7 +193,7 @@ def _by_device(recording: str, stream: str, columns: Columns, arrival_ns: Times)
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
-            f"it must be whole nanoseconds in each row. Repair it at the source, or take `--clock arrival`."
+            f"it must be integer nanoseconds in each row. Correct it at the source, or use `--clock arrival`."
         )
     device_ns = column.cast(pa.int64()).to_numpy()
     try:
@@ -203,7 +208,7 @@ def _by_device(recording: str, stream: str, columns: Columns, arrival_ns: Times)
 
 
 def _certain(columns: Columns) -> Bools | None:
-    """Return which rows have an arrival that was recorded in time, or None if all have."""
+    """Return a mask of the rows whose arrival was not delayed, or None for all."""
     if UNCERTAIN not in columns.column_names:
         return None
     certain: Bools = columns.column(UNCERTAIN).to_numpy() == 0
@@ -211,18 +216,18 @@ def _certain(columns: Columns) -> Bools | None:
 
 
 def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
-    """Return the stamps of a stream. Raises `TacpipeError` if there are none or where they run backwards."""
+    """Return the arrival times of a stream. Raises `TacpipeError` if there are none, or they decrease."""
     import numpy as np
 
     if "t_ns" not in columns.column_names or not columns.num_rows:
         raise TacpipeError(
-            f"Recording {recording}: stream {stream!r} has no rows with t_ns; nothing can be brought onto a clock. "
-            f"Exclude the recording with `tacpipe label --exclude`, or record it again."
+            f"Recording {recording}: stream {stream!r} has no rows with t_ns. Exclude the recording with "
+            f"`tacpipe label --exclude`, or record it again."
         )
     t_ns: Times = columns.column("t_ns").to_numpy()
-    back = np.diff(t_ns) < 0
-    if back.any():
-        row = int(back.argmax()) + 1
+    decreases = np.diff(t_ns) < 0
+    if decreases.any():
+        row = int(decreases.argmax()) + 1
         raise TacpipeError(
             f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
             f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
@@ -230,10 +235,10 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
     return t_ns
 
 
-def without_wraps(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[TimedStream, int]:
-    """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any.
+def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[TimedStream, int]:
+    """Unwrap the 16-bit tactile counts of a stream; also return the number of channels that wrapped.
 
-    ``keep`` puts the values of such a channel aside and returns them.
+    ``keep`` stores the values of such a channel, possibly on disk, and returns them.
     """
     import pyarrow as pa
 
@@ -251,7 +256,7 @@ def without_wraps(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[Time
 
 
 def _repeated_rows(columns: Columns) -> Bools:
-    """Return which rows repeat the one before in all channels but labels, which are meant to stay."""
+    """Return a mask of rows that repeat the previous one in all channels except labels, which are often constant."""
     import numpy as np
 
     from tacpipe.signals.repairs import repeated_in_columns
@@ -263,21 +268,21 @@ def _repeated_rows(columns: Columns) -> Bools:
 
 
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
-    """Return the name of the stream that sets the grid: the ``requested`` one, or the first with a tactile channel.
+    """Return the name of the stream that defines the grid: ``requested``, or the first with a tactile channel.
 
     Raises `TacpipeError` if there is none.
     """
     if requested:
         if requested not in schemas:
             raise TacpipeError(
-                f"Recording {recording} has no stream {requested!r} to be master; it has {listed(schemas)}."
+                f"Recording {recording} has no stream {requested!r}; --master must be one of {join_names(schemas)}."
             )
         return requested
     for name, schema in schemas.items():
         if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in schema):
             return name
-    reason = absent(recording, "tactile", schemas)
-    raise TacpipeError(f"{reason} Without a tactile stream, name the master among {listed(schemas)} with --master.")
+    reason = missing_channel_error(recording, "tactile", schemas)
+    raise TacpipeError(f"{reason} Or choose the master with --master: {join_names(schemas)}.")
 
 
 def grid(
@@ -289,11 +294,11 @@ def grid(
     *,
     hold_values: bool,
 ) -> tuple[Int64s, Int64s]:
-    """Return the grid points that lie within every stream, and the row of each: of the master, or of the grid itself.
+    """Return the grid points within all streams, and their rows in the master or in the uniform grid.
 
-    A uniform grid is on the phase of the master's first sample. With ``hold_values`` it ends where the last stream does,
-    because nobody knows yet which sample of a stream is its last, and it has one point where stamps are equal.
-    Raises `TacpipeError` if no point is left.
+    A uniform grid starts at the master's first sample. With ``hold_values`` the grid ends with the last stream, because
+    online the last sample of a stream is unknown, and equal times become one point. Raises `TacpipeError` if there are no
+    points.
     """
     import numpy as np
 
@@ -312,23 +317,23 @@ def grid(
         late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
         early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
-            f"Recording {recording}: its streams have no time in common, or no row of {master.name} lies in it. "
-            f"Stream {late.name} starts last, at {printable.moment(int(late.t_ns[0]))}, and {early.name} ends first, at "
-            f"{printable.moment(int(early.t_ns[-1]))}. Leave one of them out with --without, or check their clocks."
+            f"Recording {recording}: no row of {master.name} is within the time range of all streams. Stream {late.name} "
+            f"starts last, at {printable.moment(int(late.t_ns[0]))}, and {early.name} ends first, at "
+            f"{printable.moment(int(early.t_ns[-1]))}. Exclude one of them with --without, or check their clocks."
         )
     return grid_ns[rows], rows
 
 
 def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s) -> Int64s | None:
-    """Return the rows whose stamps are the grid's, or None if the stream has no sample at some grid point.
+    """Return the rows whose times equal the grid points, or None if a grid point has no sample.
 
-    ``grid_rows`` (grid,) are the rows that a stream has there which was stamped along with the grid's.
+    ``grid_rows`` (grid,) are the rows of a stream with the same clock as the grid.
     """
     import numpy as np
 
     rows: Int64s = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
     if rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns):
-        return rows  # one clock for both, equal stamps in a row included
+        return rows  # both have the same clock, possibly with repeated times
     rows = np.searchsorted(t_ns, grid_ns).astype(np.int64)
     is_equal = rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns)
     return rows if is_equal else None

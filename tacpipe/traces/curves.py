@@ -154,7 +154,7 @@ def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Fi
     by_name: dict[str, dict[str, pa.Field]] = {}
     for field in table.schema:
         if described(field).get("quantity") == quantity:
-            shared = arm.of_name(field.name)[1]
+            shared = arm.split_name(field.name)[1]
             by_name.setdefault(shared, {})[arm.component(field)] = field
     return {
         name: [fields_by_part[part] for part in parts]

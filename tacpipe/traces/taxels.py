@@ -80,7 +80,7 @@ def _of_fields(stream: str, finger: str, table: pa.Table, fields: Sequence[pa.Fi
     columns = [field.name for field in fields]
     t_ns, values = table.column(TIME).to_numpy(), matrix(table, columns)
     firsts = fields[::axes]
-    place, unit = places.of_taxels(firsts)
+    place, unit = places.taxel_positions(firsts)
     levels = _rest_levels(fields, values, t_ns)
     names = tuple(field.name.rpartition("_")[0] if axes == 3 else field.name for field in firsts)
     if finger:
@@ -112,7 +112,7 @@ def _by_taxel(fields: Sequence[pa.Field]) -> tuple[list[pa.Field], int]:
     for field in fields:
         about = described(field)
         axis = about.get("axis", "")
-        part, shared = (axis, field.name.removesuffix(axis)) if axis else arm.of_name(field.name)
+        part, shared = (axis, field.name.removesuffix(axis)) if axis else arm.split_name(field.name)
         vectors.setdefault(shared, {})[part] = field
     if vectors and all(set(vector) == set("xyz") for vector in vectors.values()):
         return [vector[axis] for vector in vectors.values() for axis in "xyz"], 3

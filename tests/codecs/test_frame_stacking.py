@@ -67,9 +67,9 @@ def test_later_rows_change_nothing_before_them() -> None:
 
 def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_median() -> None:
     t_ns = np.cumsum([0, 20, 20, 29, 20, 31, 20]).astype(np.int64) * 1_000_000
-    assert codec.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
-    assert codec.breaks(t_ns[:1]).tolist() == [True]
-    assert codec.breaks(t_ns[:0]).tolist() == []
+    assert codec.run_starts(t_ns).nonzero()[0].tolist() == [0, 5]
+    assert codec.run_starts(t_ns[:1]).tolist() == [True]
+    assert codec.run_starts(t_ns[:0]).tolist() == []
 
 
 def test_no_rows_give_no_inputs_of_the_right_width() -> None:

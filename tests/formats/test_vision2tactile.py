@@ -243,7 +243,7 @@ def test_the_published_grasps_lie_on_their_clouds_and_within_the_published_range
             assert np.linalg.norm(cloud.points_m - point_m, axis=1).min() < 1e-6
         for target in biotac_sp.TARGETS:
             table = recording.streams["reading"].select(biotac_sp.columns(target))
-            shares = biotac_sp.normalised(target, np.array([column[0].as_py() for column in table.columns]))
+            shares = biotac_sp.normalise(target, np.array([column[0].as_py() for column in table.columns]))
             assert shares.min() >= 0 and shares.max() <= 1
         assert "duplicate_of" not in recording.attributes
     assert (min(sizes), max(sizes)) == (1021, 5567)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from tacpipe.channels import schema
 from tacpipe.codecs import tactile
-from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError
+from tacpipe.signals.runs import run_starts
 from tacpipe.store.records import Step
 from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward import training as forward_training
@@ -103,7 +103,9 @@ def offline(kind: str, forecaster: Forecaster) -> Any:
     table = shard.content
     if "codec" in KINDS[kind]:
         codec = forecaster.codec
-        latents = codec.encode(tactile.above_rest(table, codec.channels), codec.channels, breaks(tactile.times(table)))
+        latents = codec.encode(
+            tactile.above_rest(table, codec.channels), codec.channels, run_starts(tactile.times(table))
+        )
         for index, name in enumerate(codec.latents):
             field = pa.field(name, pa.float32(), metadata={"quantity": "latent"})
             table = table.append_column(field, pa.array(latents[:, index]))

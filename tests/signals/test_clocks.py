@@ -216,5 +216,5 @@ def test_clocks_that_are_none_are_refused() -> None:
         fit_clock(np.full(500, 3), arrival_ns)
     with pytest.raises(TacpipeError, match=r"0\.001.*0\.009\d* s"):
         fit_clock(device_ns // 1000, arrival_ns)
-    with pytest.raises(TacpipeError, match=r"499 device.*500 arrivals"):
+    with pytest.raises(TacpipeError, match=r"499 device.*500 arrival"):
         fit_clock(device_ns[1:], arrival_ns)

@@ -48,7 +48,7 @@ def test_by_the_axis_mean_all_taxels_begin_at_its_whole_part() -> None:
     np.testing.assert_array_equal(np.diff(tared, axis=0), np.diff(values.astype(float), axis=0))
     with pytest.raises(TacpipeError, match="taxels of 5 axes"):
         axis_mean_level(values, axes=5)
-    with pytest.raises(TacpipeError, match="without rows"):
+    with pytest.raises(TacpipeError, match="has no rows"):
         axis_mean_level(values[:0])
 
 

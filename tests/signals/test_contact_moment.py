@@ -91,7 +91,7 @@ def test_pressures_that_never_rest_are_told_with_what_they_vary_by() -> None:
     pressure[:, 0] += np.arange(400) % 2 * 40.0
     with pytest.raises(TacpipeError, match=r"0\.2 s.*40 counts"):
         settled_rows(pressure, t_ns, 161, LIMITS)
-    with pytest.raises(TacpipeError, match="never rest"):
+    with pytest.raises(TacpipeError, match="never steady"):
         settled_rows(*closing(rows=195), 161, LIMITS)
 
 

@@ -30,7 +30,7 @@ def test_a_grid_ends_at_the_last_point_that_is_not_late() -> None:
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_not_positive_gives_no_grid(rate_hz: float) -> None:
-    with pytest.raises(TacpipeError, match="gives no grid"):
+    with pytest.raises(TacpipeError, match="must be above 0 and at most 1e9"):
         resampling.uniform_grid(0, 1, rate_hz)
 
 
@@ -123,7 +123,7 @@ def test_a_gap_lies_strictly_between_distant_samples_or_outside_all() -> None:
 @pytest.mark.parametrize("signal", [resampling.nearest_rows, lambda t, g: resampling.in_gap(t, g, 1)])
 def test_a_signal_without_samples_is_refused(signal: object) -> None:
     assert callable(signal)
-    with pytest.raises(TacpipeError, match="without samples"):
+    with pytest.raises(TacpipeError, match="has no samples"):
         signal(np.zeros(0, dtype=np.int64), np.array([0]))
 
 

@@ -60,7 +60,7 @@ def test_the_published_crop_begins_101_rows_behind_the_trigger() -> None:
 
 
 def test_no_frames_and_unknown_crops_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="and 0 are to be kept"):
+    with pytest.raises(TacpipeError, match="but 0 are needed"):
         slides.crop_rows((0, 800), 0, "middle", 0)
     with pytest.raises(TacpipeError, match="'end'"):
         slides.crop_rows((0, 800), 400, "end", 0)

@@ -142,7 +142,7 @@ def test_few_rows_slip_nowhere(rows: int) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"off_sigma": 6.0}, "flickers"),
+        ({"off_sigma": 6.0}, "end threshold"),
         ({"on_rows": 0}, "must be positive"),
         ({"noise_floor": 0.0}, "must be positive"),
     ],

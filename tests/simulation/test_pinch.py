@@ -38,7 +38,7 @@ def test_the_pressure_rises_by_140_counts_a_newton_from_that_of_the_untouched_se
 def test_the_electrode_under_the_contact_falls_with_force_and_those_far_off_rise() -> None:
     force = np.repeat(np.linspace(0, 4, 40)[:, None], 2, axis=1)
     electrodes = noiseless_readings(FLAT, force)[:, :, :-1]
-    way = biotac_sp.unrolled_m()[None] - pinch.centre(FLAT, NOTHING)[0][:, None]
+    way = biotac_sp.unrolled_positions_m()[None] - pinch.centre(FLAT, NOTHING)[0][:, None]
     for finger in (0, 1):
         off = np.linalg.norm(way[finger], axis=1)
         assert (np.diff(electrodes[:, finger, off.argmin()]) < 0).all()
@@ -53,7 +53,7 @@ def test_of_what_pressed_electrodes_fall_by_the_others_rise_by_the_share_of_the_
     contact, skin = pinch.deformation(FLAT, np.full((1, 2), 2.0))
     centre = pinch.centre(FLAT, NOTHING)
     change = fingertip_sp.electrode_change(contact, skin, centre)[0, 0]
-    way2 = ((biotac_sp.unrolled_m() - centre[0, 0]) ** 2).sum(axis=1)
+    way2 = ((biotac_sp.unrolled_positions_m() - centre[0, 0]) ** 2).sum(axis=1)
     fall = 2600 * (1 - np.exp(-skin[0, 0] / 0.6e-3)) * np.exp(-way2 / (2 * (1.1 * contact[0, 0]) ** 2))
     assert change.sum() == pytest.approx(-0.65 * fall.sum())
     assert (change >= -fall).all()

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.channels.places import of_taxels
-from tacpipe.channels.streams import of_quantity
+from tacpipe.channels.places import taxel_positions
+from tacpipe.channels.streams import columns_with_quantity
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.registry import load
 from tests.conftest import Lab
@@ -78,8 +78,8 @@ def test_other_streams_stay_and_taxels_lie_on_the_grid(lab: Lab) -> None:
     assert recording.attributes["object"] == "lemon"
     assert list(recording.streams) == ["gel0", "gel2"]
     table = recording.table("gel0")
-    assert len(of_quantity(table, "tactile")) == 3 * 4 * 3
-    places, unit = of_taxels(
+    assert len(columns_with_quantity(table, "tactile")) == 3 * 4 * 3
+    places, unit = taxel_positions(
         [table.schema.field(f"taxel0{row}0{column}_red") for row in (1, 2, 3) for column in (1, 4)]
     )
     assert unit == "grid"
@@ -126,7 +126,7 @@ def pressed_gel(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
 
 def test_markers_become_displacements_in_pixels_or_millimetres(pressed_gel: pa.Table) -> None:
     table = extract({"gel": pressed_gel}, "extract.markers", rows=3, columns=5)["gel"]
-    assert len(of_quantity(table, "tactile")) == 3 * 5 * 2
+    assert len(columns_with_quantity(table, "tactile")) == 3 * 5 * 2
     places = gels.places().reshape(7, 9, 2)[2:5, 2:7].reshape(-1, 2)
     expected = gels.press(places, 1.0) - places
     names = [f"taxel{row:02d}{column:02d}" for row in (1, 2, 3) for column in range(1, 6)]

@@ -348,7 +348,7 @@ def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Recording) -
         slips(slips.params(), shard({"": uneven.slice(0, 1)}))
     with pytest.raises(TacpipeError, match="has a column slip already"):
         slips(slips.params(), shard({"": slips(slips.params(), shard({"": looked_at(np.ones(50))}))}))
-    with pytest.raises(TacpipeError, match="flickers"):
+    with pytest.raises(TacpipeError, match="end threshold"):
         slips(slips.params(on_sigma=1.0), shard({"": looked_at(np.ones(9))}))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tacpipe.channels import schema
 from tacpipe.plugins.registry import load
-from tacpipe.synchronization.causal import Grid, Reading
+from tacpipe.synchronization.causal import Grid, StreamColumns
 from tests.fake_recordings import FakeRecording
 
 T0 = 1_637_771_974_778_354_001
@@ -33,7 +33,7 @@ def streams() -> dict[str, pa.Table]:
 
 
 STREAMS = streams()
-READINGS = {"xela1": Reading(3, wraps=(0, 1, 2), compared=(0, 1, 2)), "near": Reading(1, medians=(0,))}
+READINGS = {"xela1": StreamColumns(3, wraps=(0, 1, 2), compared=(0, 1, 2)), "near": StreamColumns(1, medians=(0,))}
 
 
 @pytest.mark.parametrize("kind", ["uniform", "logged", "fresh"])
@@ -69,7 +69,7 @@ def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int],
 
 
 def test_buffers_stay_small_however_long_samples_come() -> None:
-    grid = Grid({"a": Reading(2)}, "a", "uniform", 50.0, GAPS)
+    grid = Grid({"a": StreamColumns(2)}, "a", "uniform", 50.0, GAPS)
     for block in range(200):
         grid.push("a", T0 + (block * 100 + np.arange(100)) * MS, np.zeros((100, 2)))
         assert len(grid.rows(T0 + (block * 100 + 99) * MS).t_ns) in (5, 6)
@@ -77,7 +77,7 @@ def test_buffers_stay_small_however_long_samples_come() -> None:
 
 
 def test_before_a_stream_has_begun_rows_say_so_and_name_who_is_waited_for() -> None:
-    grid = Grid({"a": Reading(1), "b": Reading(1)}, "a", "uniform", 50.0, GAPS)
+    grid = Grid({"a": StreamColumns(1), "b": StreamColumns(1)}, "a", "uniform", 50.0, GAPS)
     grid.push("a", T0 + np.arange(0, 100, 10) * MS, np.zeros((10, 1)))
     assert grid.waiting == ("b",)
     rows = grid.rows(T0 + 90 * MS)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Times
-from tacpipe.channels.arm import NAMED, Pose
+from tacpipe.channels.arm import DEFAULT_POSE, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
@@ -99,7 +99,11 @@ class Forecaster:
     def pose(self) -> Pose:
         """The arm columns that it was trained on, or None if it was trained without an arm."""
         stored_pose = self.config["inputs"].get("pose")
-        return NAMED if stored_pose is None else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
+        return (
+            DEFAULT_POSE
+            if stored_pose is None
+            else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
+        )
 
     def track(self, recording: Recording) -> Track:
         """Return a recording in the form that the model reads; see `tacpipe.tasks.forward.tracks.track`.

@@ -12,15 +12,14 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.channels import arm as poses
 from tacpipe.channels import streams
 from tacpipe.channels.arm import Pose
-from tacpipe.channels.streams import absent
+from tacpipe.channels.streams import missing_channel_error
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
-from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
-from tacpipe.signals.runs import window_starts
+from tacpipe.signals.runs import run_starts, window_starts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -115,7 +114,7 @@ def slips_of(table: pa.Table | Columns) -> Bools | None:
     return None
 
 
-POSE = poses.NAMED.columns
+POSE = poses.DEFAULT_POSE.columns
 VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
 ARM = POSE + VELOCITY + TURNING
@@ -226,7 +225,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> cod
         )
     channels = tactile.columns(table.schema, "tactile")
     if not channels:
-        raise absent(name, "tactile", table.schema)
+        raise missing_channel_error(name, "tactile", table.schema)
     return codecs.Raw(channels, tuple(tactile.layout(table.schema, channels)))
 
 
@@ -261,11 +260,11 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     if not pose.position and actions != "none":
-        raise poses.no_arm(shard.name, schema)
+        raise poses.missing_arm_error(shard.name, schema)
     return pose
 
 
-def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Track:
+def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.DEFAULT_POSE) -> Track:
     """Return a recording's track, with its stored latents, or its channels if ``codec`` is raw.
 
     ``pose`` contains the names of the arm's columns. Without a position the arm does not move, and without a quaternion
@@ -286,7 +285,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         placed = np.hstack([_position(table, pose), _orientation(table, pose)])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         finger = _opening(table)
-        gaps, slips = tactile.gaps(table), slips_of(table)
+        gaps, slips = tactile.gap_mask(table), slips_of(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     by_joints = _velocity_of_joints(table, pose, placed)
@@ -302,7 +301,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         shard.name,
         t_ns,
         contact,
-        np.cumsum(breaks(t_ns, streams.apart(shard.attributes))),
+        np.cumsum(run_starts(t_ns, streams.max_step(shard.attributes))),
         finite & np.isfinite(finger) & ~gaps,
         latent,
         arm,
@@ -320,7 +319,7 @@ def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     if not pose.position:
         return np.zeros((table.num_rows, 3))
     position = inputs(table, pose.position)
-    scale = np.array([poses.metres(table.schema.field(name)) for name in pose.position])
+    scale = np.array([poses.metres_per_unit(table.schema.field(name)) for name in pose.position])
     return position if (scale == 1.0).all() else position * scale
 
 
@@ -340,7 +339,7 @@ def _opening(table: pa.Table | Columns) -> AnyFloats:
     column = opening(table.schema)
     if not column:
         return np.zeros(table.num_rows)
-    scale = poses.metres(table.schema.field(column))
+    scale = poses.metres_per_unit(table.schema.field(column))
     width = inputs(table, [column])[:, 0]
     return width if scale == 1.0 else width * scale
 
@@ -363,7 +362,7 @@ def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats
 
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the columns of the arm's joint angles and joint speeds, or empty tuples if it has none."""
-    if pose == poses.NAMED:
+    if pose == poses.DEFAULT_POSE:
         numbers = range(1, JOINTS + 1)
         names = tuple(f"robot_joint{n}_rad" for n in numbers), tuple(f"robot_joint{n}_velocity_rad_s" for n in numbers)
         return names if set(names[0] + names[1]) <= set(schema.names) else ((), ())

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.channels import streams
-from tacpipe.channels.arm import NAMED, Pose
+from tacpipe.channels.arm import DEFAULT_POSE, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
@@ -199,7 +199,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
     }
     if unit != headline.COUNT:
         inputs["unit"] = unit
-    if pose != NAMED:
+    if pose != DEFAULT_POSE:
         inputs["pose"] = {"position": pose.position, "orientation": pose.orientation}
     return inputs
 

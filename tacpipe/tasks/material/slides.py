@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
-from tacpipe.channels.streams import absent
+from tacpipe.channels.streams import missing_channel_error
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed
@@ -155,7 +155,7 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Sl
     quantity_bytes = {quantity.encode() for quantity in quantities}
     channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in quantity_bytes]
     if not channels:
-        raise absent(shard.name, " or ".join(quantities), table.schema)
+        raise missing_channel_error(shard.name, " or ".join(quantities), table.schema)
     values = _columns(table, channels)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]

@@ -101,7 +101,7 @@ def reading_measures(
         "n": len(clusters),
     }
     for target, values in predicted.items():
-        true, share, mean = (biotac_sp.normalised(target, counts[target]) for counts in (readings, predicted, constant))
+        true, share, mean = (biotac_sp.normalise(target, counts[target]) for counts in (readings, predicted, constant))
         measures["rmse"][target] = regression.rmse(true, share)
         measures["rmse_counts"][target] = regression.rmse(readings[target], values)
         measures["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, share)
@@ -118,7 +118,7 @@ def by_electrode(readings: Readings, predicted: Readings) -> dict[str, dict[str,
     by_target = {}
     for target, values in predicted.items():
         if biotac_sp.width(target) > 1:
-            true, share = (biotac_sp.normalised(target, counts) for counts in (readings[target], values))
+            true, share = (biotac_sp.normalise(target, counts) for counts in (readings[target], values))
             pairs = zip(regression.rmse_by_value(true, share), regression.r2_by_value(true, share), strict=True)
             by_target[target] = {
                 f"{number:02d}": {"rmse": float(rmse), "r2": _finite(float(r2))}
@@ -224,10 +224,10 @@ def _headlines(
     for part in (True, False):
         rows = np.flatnonzero((is_known == part) & ~in_training)
         for target in predictor.targets:
-            true = biotac_sp.normalised(target, grasps.readings[target])
+            true = biotac_sp.normalise(target, grasps.readings[target])
             errors = {}
             for name, readings in predicted.items():
-                squared = regression.squared_sums(true, biotac_sp.normalised(target, readings[target]))
+                squared = regression.squared_sums(true, biotac_sp.normalise(target, readings[target]))
                 errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
             model = errors.pop(MODEL)
             low, high = biotac_sp.RANGES[target]

@@ -97,7 +97,7 @@ def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str
     for target in biotac_sp.TARGETS:
         mine, batch = (tree["model"][name][target] for name in ("rmse", "rmse_batch_mean"))
         assert 0 < batch <= mine
-        shares = [biotac_sp.normalised(target, rows(table, target)) for table in (true, predicted)]
+        shares = [biotac_sp.normalise(target, rows(table, target)) for table in (true, predicted)]
         by_hand = [
             root_mean_squared_error(shares[0][at : at + 10].ravel(), shares[1][at : at + 10].ravel())
             for at in range(0, 40, 10)
@@ -108,7 +108,7 @@ def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str
 @pytest.mark.parametrize("target", ["e_th", "e_mf"])
 def test_each_electrode_is_told_alone(target: str, result: Result, metrics: dict[str, Any]) -> None:
     streams, mask = result.recordings["predictions"].streams, masks(result)[""]
-    shares = [biotac_sp.normalised(target, rows(streams[name], target)[mask]) for name in ("true", "model")]
+    shares = [biotac_sp.normalise(target, rows(streams[name], target)[mask]) for name in ("true", "model")]
     by_electrode = metrics["model"]["by_electrode"][target]
     assert list(by_electrode) == [f"{n:02d}" for n in range(1, 25)]
     for index, measured in enumerate(by_electrode.values()):
@@ -155,8 +155,7 @@ def test_novel_objects_are_resampled_whole_and_known_ones_by_grasp(result: Resul
     for part, by in (("novel", "object"), ("known", "recording")):
         mask = masks(result)[part]
         true, predicted, constant = (
-            biotac_sp.normalised("pdc_th", rows(streams[name], "pdc_th")[mask])
-            for name in ("true", "model", "constant")
+            biotac_sp.normalise("pdc_th", rows(streams[name], "pdc_th")[mask]) for name in ("true", "model", "constant")
         )
         model, baseline = (regression.squared_sums(true, share) for share in (predicted, constant))
         expected = regression.skill_interval(model, baseline, np.array(about[by])[mask])

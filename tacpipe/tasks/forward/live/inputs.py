@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
 from tacpipe.channels import arm as poses
 from tacpipe.channels.schema import time_field
-from tacpipe.channels.streams import EVENTS, axes_of
+from tacpipe.channels.streams import EVENTS, count_axes
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.live.decoding import BatchColumns
@@ -19,8 +19,8 @@ from tacpipe.printable import listed
 from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tare_level
 from tacpipe.synchronization import streams
-from tacpipe.synchronization.causal import Reading
-from tacpipe.synchronization.streams import holds_signal
+from tacpipe.synchronization.causal import StreamColumns
+from tacpipe.synchronization.streams import may_be_signal
 from tacpipe.tasks.forward import headline, tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 
@@ -68,7 +68,7 @@ class InputLayout:
 
     master: str
     columns: Mapping[str, Sequence[str]]  # columns that are read, by stream
-    readings: Mapping[str, Reading]
+    readings: Mapping[str, StreamColumns]
     tactile_of: Mapping[str, tuple[Indices, Indices]]  # columns and the channels that they hold, by stream
     axes: Mapping[str, int]  # axes of the taxels, by stream
     kinds: Mapping[str, np.dtype[Any]]  # types in which levels at rest are computed, by stream
@@ -92,7 +92,7 @@ class InputLayout:
         """
         import pyarrow as pa
 
-        signals = {name: layouts[name] for name in sorted(layouts) if name != EVENTS and holds_signal(layouts[name])}
+        signals = {name: layouts[name] for name in sorted(layouts) if name != EVENTS and may_be_signal(layouts[name])}
         origin = {
             streams.grid_name(stream, name): (stream, name)
             for stream, schema in signals.items()
@@ -129,7 +129,7 @@ class InputLayout:
             place = placed(names)
             assert place is not None
             tactile_of[stream] = (place[1], np.array(indices, np.intp))
-            axes[stream] = axes_of(grid, names)
+            axes[stream] = count_axes(grid, names)
             kind = np.result_type(*(grid.field(name).type.to_pandas_dtype() for name in names))
             kinds[stream] = kind if kind.kind == "f" else np.dtype(np.float64)
         pose = forecaster.pose
@@ -154,8 +154,8 @@ class InputLayout:
             orientation,
             None if joints[0] is None or joints[1] is None else (joints[0], joints[1]),
             finger,
-            np.array([poses.metres(grid.field(name)) for name in pose.position]),
-            poses.metres(grid.field(opening)) if opening else 1.0,
+            np.array([poses.metres_per_unit(grid.field(name)) for name in pose.position]),
+            poses.metres_per_unit(grid.field(opening)) if opening else 1.0,
         )
 
     def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> tuple[Times, Floats]:
@@ -226,7 +226,7 @@ class InputLayout:
         return levels
 
 
-def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> Reading:
+def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
     """Return what is read of a stream; where its repeated samples matter, all its channels are added to ``names``."""
     import pyarrow as pa
 
@@ -244,7 +244,7 @@ def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master
         and schema.field(name).type.bit_width == 16
     ]
     medians = [index for index, name in enumerate(names) if streams.method(schema, name) == "median"]
-    return Reading(len(names), wraps, medians, compared)
+    return StreamColumns(len(names), wraps, medians, compared)
 
 
 def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Schema) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Float32s, Floats
-from tacpipe.channels.arm import metres
+from tacpipe.channels.arm import metres_per_unit
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.errors import UsageError
 from tacpipe.links import network
@@ -125,7 +125,9 @@ class Targets:
             )
         fields = [fields_by_part[part] for part in parts]
         self._names = [field.name for field in fields]
-        self._scale = np.array([metres(field) if _about(field, "quantity") == POSITION else 1.0 for field in fields])
+        self._scale = np.array(
+            [metres_per_unit(field) if _about(field, "quantity") == POSITION else 1.0 for field in fields]
+        )
         self._kept: deque[tuple[int, Floats]] = deque()
 
     def push(self, batch: Any) -> None:

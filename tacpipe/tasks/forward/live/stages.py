@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tacpipe.channels.streams import GRID, apart
+from tacpipe.channels.streams import GRID, max_step
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params
 
@@ -25,7 +25,7 @@ class CausalStages(NamedTuple):
     @property
     def largest_step(self) -> float:
         """How many periods two rows may be apart with none missing between."""
-        return apart({GRID: self.synchronize.timeline})
+        return max_step({GRID: self.synchronize.timeline})
 
 
 def causal_stages(steps: Sequence[Step]) -> CausalStages:

@@ -241,9 +241,9 @@ class MaterialEngine(Engine):
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:
     """Return the stream with tactile channels. Raises `TacpipeError` if there is not exactly one."""
-    from tacpipe.channels.streams import finger
+    from tacpipe.channels.streams import finger_stream
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
     tables = {name: schema.empty_table() for name, schema in schemas.items()}
-    finger_table = finger("of this rig", tables)
+    finger_table = finger_stream("of this rig", tables)
     return next(name for name, table in tables.items() if table is finger_table)

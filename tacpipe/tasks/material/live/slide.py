@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Float32s
-from tacpipe.channels.streams import EVENTS, finger
+from tacpipe.channels.streams import EVENTS, finger_stream
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params, streams_as_recorded
 from tacpipe.plugins import registry
@@ -131,7 +131,7 @@ class SlideSoFar:
             return Answer(None, cause="no slide has begun")
         table = segmented.streams[STREAM]
         rows = table.num_rows
-        newest_ns = finger("so far", streams).column("t_ns")[-1].as_py()
+        newest_ns = finger_stream("so far", streams).column("t_ns")[-1].as_py()
         is_over = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
         try:
             cut, lacks = self._slide_rows(recording, table)
@@ -281,7 +281,7 @@ def predict(model: Model, recordings: Dataset) -> Result:
 def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
     tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD_STREAMS}
     attributes = recording.attributes
-    table = finger(recording.name, tables)
+    table = finger_stream(recording.name, tables)
     stream = next(name for name, candidate in tables.items() if candidate is table)
     sensor = str(
         attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))

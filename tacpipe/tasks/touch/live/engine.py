@@ -133,8 +133,8 @@ def criterion_levels(touches: Sequence[PredictedReading]) -> Floats:
     by_finger = np.full((len(touches), 2), np.nan)
     for row, touch in enumerate(touches):
         for column, finger in enumerate(("th", "mf")):
-            pressed = biotac_sp.normalised(f"pdc_{finger}", np.array([getattr(touch, f"pdc_{finger}")]))
-            fallen = 1 - biotac_sp.normalised(f"e_{finger}", getattr(touch, f"e_{finger}"))
+            pressed = biotac_sp.normalise(f"pdc_{finger}", np.array([getattr(touch, f"pdc_{finger}")]))
+            fallen = 1 - biotac_sp.normalise(f"e_{finger}", getattr(touch, f"e_{finger}"))
             parts = np.array([pressed.mean(), fallen.mean()])
             finite = np.isfinite(parts)
             by_finger[row, column] = parts[finite].mean() if finite.any() else np.nan

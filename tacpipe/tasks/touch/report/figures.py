@@ -121,8 +121,7 @@ def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
         return []
     squared = [
         np.square(
-            biotac_sp.normalised(finger, rows.predicted[MODEL][finger])
-            - biotac_sp.normalised(finger, rows.true[finger])
+            biotac_sp.normalise(finger, rows.predicted[MODEL][finger]) - biotac_sp.normalise(finger, rows.true[finger])
         )
         for finger in fingers
     ]
@@ -171,7 +170,7 @@ def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequ
 
 def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[charts.DataRow]:
     """Return the electrodes of one fingertip with its skin unrolled, tip up, coloured from -1 to 1."""
-    places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
+    places = 1000 * biotac_sp.unrolled_positions_m()[:, ::-1]  # (electrode, across and along), mm
     return [
         {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
          "Electrode": number, quantity: text}

@@ -331,6 +331,6 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
 
 def _squared(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
     """Return the sum of squares in fractions of the target's range and the number of values, by grasp."""
-    true_fractions, predicted_fractions = (biotac_sp.normalised(target, values) for values in (true, predicted))
+    true_fractions, predicted_fractions = (biotac_sp.normalise(target, values) for values in (true, predicted))
     squared = regression.squared_sums(true_fractions, predicted_fractions)
     return {name: np.array([value, float(true_fractions.shape[1])]) for name, value in zip(names, squared, strict=True)}

@@ -177,7 +177,7 @@ def _rows(
             continue
         constant = rows.predicted.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
         true, described, mean = (
-            biotac_sp.normalised(target, values) for values in (rows.true[target], predicted[target], constant)
+            biotac_sp.normalise(target, values) for values in (rows.true[target], predicted[target], constant)
         )
         parts.append(_TargetRows(true, described, mean, rows.recordings, rows.objects))
     return parts

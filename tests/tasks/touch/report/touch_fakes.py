@@ -147,7 +147,7 @@ def _table(touch: Mapping[str, AnyArray]) -> pa.Table:
     """Return shares of ranges as the stream that holds them, in device counts, with a row of the seen grasp."""
     columns: dict[str, Any] = {}
     for target, shares in touch.items():
-        counts = np.vstack([biotac_sp.counts(target, shares), np.full((1, shares.shape[1]), 1e6)])
+        counts = np.vstack([biotac_sp.to_counts(target, shares), np.full((1, shares.shape[1]), 1e6)])
         names = biotac_sp.value_columns(target)
         columns |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(names)}
     return pa.table(columns)
