@@ -52,7 +52,7 @@ def calibrate(
     training_by_sensor, validation_by_sensor = (classifier.read(part, labelled=True) for part in (training, validation))
     _check_slides(classifier, training_by_sensor, validation_by_sensor)
     calibrations: dict[str, SensorCalibration] = {}
-    about: dict[str, UnknownDescription] = {}
+    descriptions: dict[str, UnknownDescription] = {}
     for sensor in classifier.layouts:
         held_out = set(classifier.config.get("held_out", {}).get(sensor, []))
         training_slides, validation_slides = (
@@ -66,7 +66,7 @@ def calibrate(
         calibrations[sensor], areas = fit_calibration(
             (training_slides.frames, training_slides.materials), scored_slides, classes, request.false_unknown
         )
-        about[sensor] = {
+        descriptions[sensor] = {
             "slides": len(validation_slides),
             "temperature": calibrations[sensor].temperature,
             "rule": calibrations[sensor].rule,
@@ -76,7 +76,7 @@ def calibrate(
             "calibration_error": _calibration_errors(scores, labels, calibrations[sensor].temperature),
         }
     config = classifier.config.copy()
-    config["known"] = about
+    config["known"] = descriptions
     return {**model, CONFIG: model_files.to_json(config), CALIBRATION_FILE: pack_calibrations(calibrations)}
 
 
@@ -242,6 +242,6 @@ def _add_false_known(measures: UnknownMeasures, answered: Bools, materials: Sequ
     measures["false_known"], measures["false_known_n"] = float(answered.mean()), len(answered)
     measures["false_known_materials"] = len(set(materials))
     if len(set(materials)) >= MIN_CLUSTERS:
-        counted = np.ones((len(answered), 1))
-        interval = share_interval(answered[:, None].astype(np.float64), counted, np.array(materials)).first
+        weights = np.ones((len(answered), 1))
+        interval = share_interval(answered[:, None].astype(np.float64), weights, np.array(materials)).first
         measures["false_known_low"], measures["false_known_high"] = interval.low, interval.high

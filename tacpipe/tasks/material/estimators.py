@@ -63,18 +63,18 @@ class FittedEstimator:
         Probabilities are converted to logarithms, so that their softmax restores them. Raises `TacpipeError` for
         another shape.
         """
-        read = self._features(frames)
+        features = self._features(frames)
         if hasattr(self.estimator, "predict_proba"):
-            found: Floats = np.log(np.clip(self.estimator.predict_proba(read), MIN_PROBABILITY, None))
+            values: Floats = np.log(np.clip(self.estimator.predict_proba(features), MIN_PROBABILITY, None))
         else:
-            found = np.asarray(self.estimator.decision_function(read))
-            found = np.stack([-found, found], axis=1) / 2 if found.ndim == 1 else found  # two classes
-        if found.shape != (len(frames), len(self.classes)):
+            values = np.asarray(self.estimator.decision_function(features))
+            values = np.stack([-values, values], axis=1) / 2 if values.ndim == 1 else values  # two classes
+        if values.shape != (len(frames), len(self.classes)):
             raise TacpipeError(
-                f"{type(self.estimator).__name__} returns scores {found.shape} for {len(frames)} slides and "
+                f"{type(self.estimator).__name__} returns scores {values.shape} for {len(frames)} slides and "
                 f"{len(self.classes)} classes; they must be (slide, class)."
             )
-        return found.astype(np.float32)
+        return values.astype(np.float32)
 
     def _features(self, frames: Float32s) -> Float32s:
         features: Float32s = np.asarray(self.features(frames), np.float32)
@@ -163,17 +163,17 @@ def _make_reproducible(content: bytes) -> bytes:
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {member: file.read(member) for member in file.namelist()}
     numbers: dict[Any, int] = {}
-    described = _renumber(json.loads(members[SCHEMA]), numbers)
-    renamed = {SCHEMA: json.dumps(described, indent=1, sort_keys=True).encode()}
+    description = _renumber(json.loads(members[SCHEMA]), numbers)
+    renamed = {SCHEMA: json.dumps(description, indent=1, sort_keys=True).encode()}
     renamed |= {
         _renumber_file_name(member, numbers): content for member, content in members.items() if member != SCHEMA
     }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
         for member, content in sorted(renamed.items()):
-            about = zipfile.ZipInfo(member, MODIFICATION_TIME)
-            about.compress_type = zipfile.ZIP_DEFLATED
-            file.writestr(about, content)
+            info = zipfile.ZipInfo(member, MODIFICATION_TIME)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            file.writestr(info, content)
     return buffer.getvalue()
 
 

@@ -104,9 +104,9 @@ class Evaluated:
     zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's predictions: among all, held-out
     counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,), whether it is evaluated
 
-    def is_right(self, predictor: str, chosen: Bools) -> Bools:
+    def is_right(self, predictor: str, mask: Bools) -> Bools:
         """Return which of the chosen slides a predictor classified correctly."""
-        is_right: Bools = (self.predicted[predictor] == self.slides.materials)[chosen]
+        is_right: Bools = (self.predicted[predictor] == self.slides.materials)[mask]
         return is_right
 
 
@@ -132,8 +132,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         for sensor, slides in _read_slides(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
             if is_learned.any() or not classifier.calibrations:
-                counted = slides.select(is_learned) if classifier.calibrations else slides
-                evaluated[sensor] = _evaluate_sensor(classifier, counted, trained_on)
+                learned_slides = slides.select(is_learned) if classifier.calibrations else slides
+                evaluated[sensor] = _evaluate_sensor(classifier, learned_slides, trained_on)
             advance(len(slides), sensor)
     if not evaluated:
         raise TacpipeError(
@@ -193,8 +193,8 @@ def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
     params = classifier.params
-    mapped = bool(params.aligned_sensor)  # all sensors already have the frozen sensor's classifier
-    if classifier.config.get("joint") and output.latents is not None and not mapped:
+    is_aligned = bool(params.aligned_sensor)  # all sensors already have the frozen sensor's classifier
+    if classifier.config.get("joint") and output.latents is not None and not is_aligned:
         predicted[SWAPPED] = _exchanged_predictions(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames
@@ -203,16 +203,16 @@ def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str
         fitted = by_sensor[sensor]
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
-    counted = np.ones(len(slides), bool)
+    is_counted = np.ones(len(slides), bool)
     if batch := params.dropped_beyond:
-        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer slides than a batch are all counted
+        is_counted[len(slides) // batch * batch or len(slides) :] = False  # fewer slides than a batch are all counted
     evaluated = Evaluated(
         slides,
         np.array([digest in trained_on for digest in slides.digests], bool),
         output,
         predicted,
         np.isin(slides.materials, held_out),
-        counted=counted,
+        counted=is_counted,
     )
     if held_out and output.latents is not None:
         evaluated.zero_shot = _zero_shot_predictions(classifier, sensor, output.latents, held_out)
@@ -257,13 +257,13 @@ def _zero_shot_predictions(
 
 def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> MaterialScores:
     """Return the metrics on seen or on unseen slides."""
-    chosen = {
+    masks = {
         sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
     }
     predictors = sorted({name for result in evaluated.values() for name in result.predicted})
     right = {
         name: {
-            sensor: result.is_right(name, chosen[sensor])
+            sensor: result.is_right(name, masks[sensor])
             for sensor, result in evaluated.items()
             if name in result.predicted
         }
@@ -276,12 +276,12 @@ def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> li
     """Return comparisons of the model with its baselines on each sensor's unseen slides."""
     sensor_headlines = []
     for sensor, result in evaluated.items():
-        chosen = ~result.in_training & result.counted & ~result.held_out
-        names = np.array(result.slides.names)[chosen]
+        mask = ~result.in_training & result.counted & ~result.held_out
+        names = np.array(result.slides.names)[mask]
         right = {
             predictor: {
                 (0, str(name)): (int(correct), 1)
-                for name, correct in zip(names, result.is_right(predictor, chosen), strict=True)
+                for name, correct in zip(names, result.is_right(predictor, mask), strict=True)
             }
             for predictor in result.predicted
         }
@@ -296,9 +296,9 @@ def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Ze
     for sensor, result in evaluated.items():
         if result.zero_shot is None:
             continue
-        chosen = result.held_out & ~result.in_training
-        correct[sensor] = (result.zero_shot[0] == result.slides.materials)[chosen]
-        correct_among_held_out[sensor] = (result.zero_shot[1] == result.slides.materials)[chosen]
+        mask = result.held_out & ~result.in_training
+        correct[sensor] = (result.zero_shot[0] == result.slides.materials)[mask]
+        correct_among_held_out[sensor] = (result.zero_shot[1] == result.slides.materials)[mask]
         chances[sensor] = 1 / len(classifier.config["held_out"][sensor])
     if not correct:
         return None
@@ -344,18 +344,18 @@ def predictions_table(
 
 def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Field, Any]]:
     """Return one column of scores per material."""
-    about = {"quantity": "score"}
+    metadata = {"quantity": "score"}
     return [
-        (pa.field(f"score_{name.zfill(2)}", pa.float32(), metadata=about), scores[:, number])
+        (pa.field(f"score_{name.zfill(2)}", pa.float32(), metadata=metadata), scores[:, number])
         for number, name in enumerate(classifier.names)
     ]
 
 
 def latent_columns(latents: Float32s) -> list[tuple[pa.Field, Any]]:
     """Return one column per latent."""
-    about = {"quantity": "latent"}
+    metadata = {"quantity": "latent"}
     return [
-        (pa.field(f"z{number + 1:02d}", pa.float32(), metadata=about), latents[:, number])
+        (pa.field(f"z{number + 1:02d}", pa.float32(), metadata=metadata), latents[:, number])
         for number in range(latents.shape[1])
     ]
 

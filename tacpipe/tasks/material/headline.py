@@ -256,10 +256,10 @@ def label_field(name: str, values: AnyArray, quantity: str) -> tuple[pa.Field, l
     """Return a column of classes and its values: int32 for whole numbers, otherwise text; unknown classes are null."""
     import pyarrow as pa
 
-    about = {"quantity": quantity}
+    metadata = {"quantity": quantity}
     if values.dtype.kind in "iu":
-        return pa.field(name, pa.int32(), metadata=about), values.tolist()
-    return pa.field(name, pa.string(), metadata=about), [name or None for name in values.tolist()]
+        return pa.field(name, pa.int32(), metadata=metadata), values.tolist()
+    return pa.field(name, pa.string(), metadata=metadata), [name or None for name in values.tolist()]
 
 
 def _is_number(label: Attribute) -> bool:

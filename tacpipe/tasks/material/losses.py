@@ -102,10 +102,10 @@ class BatchPairs:
                 at = (classes == sensor_class).nonzero()[:, 0]
                 members.append(at[torch.randperm(len(at), generator=generator)])
             blocks.append(_stack_padded(members))
-        for place, classes in enumerate(self.classes.values()):
+        for sensor_index, classes in enumerate(self.classes.values()):
             unlabelled = (classes == NONE).nonzero()[:, 0]
             block = torch.full((len(self.classes), len(unlabelled)), NONE)
-            block[place] = unlabelled
+            block[sensor_index] = unlabelled
             blocks.append(block)
         return torch.cat(blocks, dim=1)
 
@@ -173,9 +173,9 @@ class ScaledSlides:
     frames: Tensor  # (slide, time, channel), scaled
     classes: Tensor  # (slide,), from 0; NONE if unlabelled
 
-    def batch(self, chosen: Tensor) -> Tensor:
+    def batch(self, indices: Tensor) -> Tensor:
         """Return the frames of the chosen slides (time, slide, channel)."""
-        return self.frames[chosen].transpose(0, 1).contiguous()
+        return self.frames[indices].transpose(0, 1).contiguous()
 
 
 @dataclass
@@ -230,9 +230,9 @@ class JointWork:
         """Return the sum of all losses of a batch, and its number of rows."""
         output, total = {}, torch.zeros(())
         for sensor, rows in batch.items():
-            chosen = rows[rows != NONE]
-            if len(chosen):
-                output[sensor], loss = self._sensor_losses(sensor, model.get_submodule(sensor), chosen)
+            indices = rows[rows != NONE]
+            if len(indices):
+                output[sensor], loss = self._sensor_losses(sensor, model.get_submodule(sensor), indices)
                 total = total.to(loss.device) + loss
         if self.joint:
             aligned = self._pair_loss(batch, output)
@@ -242,10 +242,10 @@ class JointWork:
                 total = total + self.weights.alignment * aligned
         return total, max(int((rows != NONE).sum()) for rows in batch.values())
 
-    def _sensor_losses(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[NetworkOutput, Tensor]:
+    def _sensor_losses(self, sensor: str, network: nn.Module, indices: Tensor) -> tuple[NetworkOutput, Tensor]:
         """Return the output of a sensor's network for the chosen slides, and its losses without alignment."""
         slides, weights = self.training[sensor], self.weights
-        frames, classes = slides.batch(chosen), slides.classes[chosen]
+        frames, classes = slides.batch(indices), slides.classes[indices]
         if sensor == self.frozen_sensor:
             with torch.no_grad():
                 output: NetworkOutput = network(frames, decode=False)
@@ -260,7 +260,7 @@ class JointWork:
                 total = total + weights.classification * loss
         if output.frames is not None:
             loss = nn.functional.mse_loss(output.frames, frames)
-            self._sums.add(f"{sensor}.reconstruction", loss, len(chosen))
+            self._sums.add(f"{sensor}.reconstruction", loss, len(indices))
             total = total + weights.reconstruction * loss
         return output, total
 
@@ -298,17 +298,17 @@ class JointWork:
                 (classes != NONE).to(valid.device) & valid,
                 (classes != NONE).to(partner_valid.device) & partner_valid,
             )
-            same = (
+            is_same_class = (
                 classes.to(valid.device)[has_class][:, None] == classes.to(valid.device)[partner_has_class]
             )  # (slide, other slide)
-            in_pairs = same.any(dim=1)
+            in_pairs = is_same_class.any(dim=1)
             if in_pairs.any():
                 cosines = (
                     nn.functional.normalize(from_[has_class], dim=1)
                     @ nn.functional.normalize(to[partner_has_class], dim=1).t()
                 )
                 shares = nn.functional.log_softmax(cosines / TEMPERATURE, dim=1)[in_pairs]
-                counted = same[in_pairs]
+                counted = is_same_class[in_pairs]
                 losses.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
         return torch.stack(losses).mean() if losses else None
 

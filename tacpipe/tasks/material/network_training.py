@@ -104,8 +104,8 @@ def train_network(
         config["trained_on"] = recordings.add_earlier(config["trained_on"], start.config["trained_on"])
     training, validation = (
         {
-            name: _scaled_slides(params, config, sensor_slides, scalings[name], held_out_materials, device, place)
-            for place, (name, sensor_slides) in enumerate(part.items())
+            name: _scaled_slides(params, config, sensor_slides, scalings[name], held_out_materials, device, index)
+            for index, (name, sensor_slides) in enumerate(part.items())
         }
         for part in (training_slides, validation_slides)
     )
@@ -116,10 +116,10 @@ def train_network(
     work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
-        built = _build_networks(params, shapes, start, mapped_to).to(device)
-        for name, network in built.items():
+        networks = _build_networks(params, shapes, start, mapped_to).to(device)
+        for name, network in networks.items():
             estimators.check_network(network, params, training[name].frames, shapes[name].classes)
-        return built
+        return networks
 
     trained = loop.train(build, work, loop.Schedule.from_params(params, params.seed), workspace)
     config["validation"] = _best_epochs(trained.history, work.joint)
@@ -197,7 +197,7 @@ def _scaled_slides(
     scaled: Affine,
     held_out_materials: Mapping[str, set[int]],
     device: str,
-    place: int,
+    index: int,
 ) -> ScaledSlides:
     """Return slides as network input; held-out classes and classes without training slides have no label."""
     name = slides.layout.sensor
@@ -206,7 +206,7 @@ def _scaled_slides(
         for number, material in enumerate(config["classes"])
         if material not in held_out_materials[name]
     }
-    materials = readouts.permute_labels(params, slides.materials, place)
+    materials = readouts.permute_labels(params, slides.materials, index)
     classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
@@ -256,19 +256,19 @@ def _build_networks(
     params: NetworkParams, shapes: Mapping[str, AutoencoderShape], start: Classifier | None, frozen: str
 ) -> nn.ModuleDict:
     """Return the networks by sensor; that of ``frozen`` is copied and frozen, and all others use its classifier."""
-    built = nn.ModuleDict(
+    networks = nn.ModuleDict(
         {name: cast(nn.Module, estimators.build_network(params, shape)) for name, shape in shapes.items()}
     )
     if start:
         frozen_network = _reader(start, frozen).network
-        for name, network in built.items():
+        for name, network in networks.items():
             if name == frozen:
                 network.load_state_dict(frozen_network.state_dict())
                 network.requires_grad_(False)
             else:
                 network.get_submodule("classifier").load_state_dict(frozen_network.classifier.state_dict())
                 network.get_submodule("classifier").requires_grad_(False)
-    return built
+    return networks
 
 
 def _best_epochs(history: Sequence[Line], joint: bool) -> BestEpochs:
@@ -288,10 +288,10 @@ def _best_epochs(history: Sequence[Line], joint: bool) -> BestEpochs:
 def _network_baselines(trained: Classifier, training_slides: BySensor, params: Params) -> bytes:
     """Return the mean-level baseline, and a readout of the networks' latents fitted to shuffled labels."""
     arrays: dict[str, np.ndarray] = {}
-    for place, (name, slides) in enumerate(training_slides.items()):
+    for index, (name, slides) in enumerate(training_slides.items()):
         latents = trained.readers[name].read(slides.frames).latents
         assert latents is not None
-        shuffled = np.random.default_rng([params.seed, 3, place]).permutation(slides.materials)
+        shuffled = np.random.default_rng([params.seed, 3, index]).permutation(slides.materials)
         arrays |= readouts.baseline_tensors(MEAN_LEVEL, name, Level.fit(slides.frames, slides.materials))
         arrays |= readouts.baseline_tensors(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
     return readouts.pack(arrays)

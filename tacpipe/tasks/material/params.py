@@ -413,8 +413,8 @@ class Raec(NetworkParams):
         """Raise an error for options of joint learning without joint learning."""
         super().check()
         if not self.joint:
-            given = [(name, getattr(self, name)) for name in ("frozen_sensor", "pairing", "alignment_loss")]
-            odd = [(name, value) for name, value in given if value and value not in ("random", "fixed", "pairs")]
+            options = [(name, getattr(self, name)) for name in ("frozen_sensor", "pairing", "alignment_loss")]
+            odd = [(name, value) for name, value in options if value and value not in ("random", "fixed", "pairs")]
             if odd:
                 name, value = odd[0]
                 option = name.replace("_", "-")

@@ -46,12 +46,12 @@ def fit_rockets(
     """Return the files of random convolutions and a readout per sensor."""
     tensors: Arrays = {}
     baselines: Arrays = {}
-    for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
+    for index, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
         strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
         tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
         if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= baseline_tensors(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
     return _files(config, tensors, baselines)
@@ -64,11 +64,11 @@ def fit_estimators(
     fitted: dict[str, FittedEstimator] = {}
     shuffled: dict[str, FittedEstimator] = {}
     levels: Arrays = {}
-    for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
+    for index, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
         fitted[name] = FittedEstimator.fit(params, frames, materials)
         if params.baselines:
-            permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            permutation = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             levels |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             shuffled[name] = FittedEstimator.fit(params, frames, permutation)
     files = {CONFIG: model_files.to_json(config), ESTIMATORS: pack_estimators(fitted, params)}
@@ -86,12 +86,12 @@ def fit_statistics(
     """
     tensors: Arrays = {}
     baselines: Arrays = {}
-    for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
+    for index, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
         fitted = StatisticsClassifier.fit(frames, materials)
         tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
         if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= baseline_tensors(PERMUTED_LABELS, name, StatisticsClassifier.fit(frames, shuffled))
             for kind, view in LEVEL_VIEWS.items():
@@ -116,15 +116,15 @@ def fit_spectra(
     bands = Bands.common(list(sampled.values()))
     labelled: dict[str, transfer.Labelled] = {}
     baselines: Arrays = {}
-    for place, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), place)
+    for index, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
         free = ~np.isin(materials, list(held_out[name]))
         frames, materials = frames[free], materials[free]
         labelled[name] = transfer.Labelled(
             bands.log_power(frames, sampled[name].rate_hz, sampled[name].speed_m_s), materials
         )
         if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= baseline_tensors(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
     learned = {name: {int(number) for number in sensor_labels.labels} for name, sensor_labels in labelled.items()}
@@ -178,21 +178,21 @@ def _training_arrays(
     params: Minirocket | Statistics | Spectra | Estimator,
     training_slides: Slides,
     validation_slides: Slides | None,
-    place: int,
+    index: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials for training, with those of validation if the params request them."""
-    frames, materials = training_slides.frames, permute_labels(params, training_slides.materials, place)
+    frames, materials = training_slides.frames, permute_labels(params, training_slides.materials, index)
     if params.use_validation and validation_slides is not None and params.labels == "true":
         frames = np.concatenate([frames, validation_slides.frames])
         materials = np.concatenate([materials, validation_slides.materials])
     return frames, materials
 
 
-def permute_labels(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
+def permute_labels(params: Params, materials: np.ndarray, index: int) -> np.ndarray:
     """Return labels, permuted among the slides if the params request it as a control."""
     if params.labels == "true":
         return materials
-    return np.random.default_rng([params.seed, 2, place]).permutation(materials)
+    return np.random.default_rng([params.seed, 2, index]).permutation(materials)
 
 
 def baseline_tensors(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:

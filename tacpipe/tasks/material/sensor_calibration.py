@@ -142,9 +142,9 @@ class ClassDistance:
         return distance
 
 
-def _means(placed: Floats, labels: Ints) -> Floats:
+def _means(components: Floats, labels: Ints) -> Floats:
     """Return the mean of each class (class, component) of slides (slide, component)."""
-    return np.stack([placed[labels == label].mean(axis=0) for label in range(labels.max() + 1)])
+    return np.stack([components[labels == label].mean(axis=0) for label in range(labels.max() + 1)])
 
 
 def _log_distances(slides: Floats, references: Floats) -> Floats:

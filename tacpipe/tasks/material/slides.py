@@ -40,10 +40,10 @@ class SlideLayout:
     def is_compatible(self, other: SlideLayout) -> bool:
         """Return whether both layouts are compatible: rates may differ slightly, as timestamps do, or be unknown."""
         difference_hz = abs(self.rate_hz - other.rate_hz)
-        near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= MAX_RATE_DIFFERENCE * max(
+        is_near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= MAX_RATE_DIFFERENCE * max(
             self.rate_hz, other.rate_hz
         )
-        return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
+        return is_near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
     def to_json(self) -> StoredLayout:
         """Return the layout for `from_json`."""
@@ -75,9 +75,9 @@ class Slides:
         """Return the number of slides."""
         return len(self.names)
 
-    def select(self, chosen: Bools) -> Slides:
+    def select(self, mask: Bools) -> Slides:
         """Return the slides selected by a mask (slide,)."""
-        at = np.flatnonzero(chosen)
+        at = np.flatnonzero(mask)
         return Slides(
             self.layout,
             tuple(self.names[i] for i in at),

@@ -25,21 +25,21 @@ MATERIALS, SLIDES = 6, 240  # number of materials; slides per sensor and materia
 def demo(output: Path) -> Demo:
     """Return the commands of the demo, from simulation to results, which write below ``output``."""
     names = ("touched", "slides", "slides-split", "materials", "materials-results", "joint", "joint-results")
-    place = {name: str(output / name) for name in names}
-    split = ["--split", place["slides-split"]]
+    paths = {name: str(output / name) for name in names}
+    split = ["--split", paths["slides-split"]]
     simulation = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
     paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # the paper uses 2,000 epochs
     commands = [
-        ["simulate", "material", *simulation, "-o", place["touched"]],
-        ["segment", "slides", place["touched"], "-o", place["slides"]],
-        ["split", place["slides"], "-o", place["slides-split"], "--scheme", "random", "--stratify", "sensor,material"],
-        ["train", "material", place["slides"], *split, "-o", place["materials"], "--features", "2000"],
-        ["evaluate", place["materials"], place["slides"], *split, "-o", place["materials-results"]],
-        ["train", "material", place["slides"], *split, "-o", place["joint"], *paper],
-        ["evaluate", place["joint"], place["slides"], *split, "-o", place["joint-results"]],
+        ["simulate", "material", *simulation, "-o", paths["touched"]],
+        ["segment", "slides", paths["touched"], "-o", paths["slides"]],
+        ["split", paths["slides"], "-o", paths["slides-split"], "--scheme", "random", "--stratify", "sensor,material"],
+        ["train", "material", paths["slides"], *split, "-o", paths["materials"], "--features", "2000"],
+        ["evaluate", paths["materials"], paths["slides"], *split, "-o", paths["materials-results"]],
+        ["train", "material", paths["slides"], *split, "-o", paths["joint"], *paper],
+        ["evaluate", paths["joint"], paths["slides"], *split, "-o", paths["joint-results"]],
     ]
-    shortened = [f"{place['joint']} (12 of 2,000 epochs)"]
-    return Demo(commands, [place["materials-results"], place["joint-results"]], shortened=shortened)
+    shortened = [f"{paths['joint']} (12 of 2,000 epochs)"]
+    return Demo(commands, [paths["materials-results"], paths["joint-results"]], shortened=shortened)
 
 
 REQUIREMENTS = Requirements(

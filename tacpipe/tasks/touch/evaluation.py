@@ -317,11 +317,11 @@ def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = N
     fields, arrays = [], []
     for target, values in predicted.items():
         for at, (name, column) in enumerate(zip(biotac_sp.value_columns(target), values.T, strict=True)):
-            about = {"unit": "count", "quantity": "prediction"}
-            fields.append(pa.field(name, pa.float32(), metadata=about))
+            metadata = {"unit": "count", "quantity": "prediction"}
+            fields.append(pa.field(name, pa.float32(), metadata=metadata))
             arrays.append(pa.array(column.astype(np.float32)))
             for percent, band in (bands or {}).items():
-                level = {**about, "quantile": f"{percent / 100:g}"}
+                level = {**metadata, "quantile": f"{percent / 100:g}"}
                 fields.append(pa.field(f"{name}_q{percent}", pa.float32(), metadata=level))
                 arrays.append(pa.array(band[target][:, at].astype(np.float32)))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

@@ -96,8 +96,8 @@ def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
         raise TacpipeError(
             f"{name} has a cloud of {len(cloud)} points; at least {MIN_POINTS} are needed. Segment it again or leave it out."
         )
-    for point, place in (("g1", grasp.g1_m), ("g2", grasp.g2_m)):
-        nearest_m = float(np.linalg.norm(cloud.points_m - place, axis=1).min())
+    for point, position_m in (("g1", grasp.g1_m), ("g2", grasp.g2_m)):
+        nearest_m = float(np.linalg.norm(cloud.points_m - position_m, axis=1).min())
         if nearest_m > FARTHEST_M:
             raise TacpipeError(
                 f"{name}: grasp point {point} lies {nearest_m * 1000:.0f} mm from the nearest point of the cloud; the two "

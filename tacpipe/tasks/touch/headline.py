@@ -43,7 +43,7 @@ def headline(
     range ``range_counts``. The bootstrap resamples grasps if objects are known, otherwise ``objects`` (grasp ->
     object).
     """
-    drawn = None if known_objects else objects
+    clusters = None if known_objects else objects
     compared = {BASELINES.get(name, name.replace("_", " ")): _sums(sums) for name, sums in baselines.items() if sums}
     target_measure = measure(range_counts, "grasps" if known_objects else "objects")
     return pairing.headline(
@@ -54,7 +54,7 @@ def headline(
         compared,
         part=PARTS[known_objects],
         target=TARGETS[target],
-        clusters=drawn,
+        clusters=clusters,
         runs=runs,
     )
 

@@ -119,15 +119,15 @@ class CloudSources:
             rotation = random_rotation(rng, largest_deg)
             wrist = self.wrists[index]
             wrist = None if wrist is None else rotation @ wrist
-            chosen = rng.choice(len(cloud), inputs.points, replace=False, shuffle=False)
-            places = np.concatenate([cloud.points_m[chosen], grasp.g1_m[None], grasp.g2_m[None]]) @ rotation.T
-            places = normalised(inputs.normalisation, places, extent, rotation, wrist)
-            points[row, :, :3] = places[:-2]
+            indices = rng.choice(len(cloud), inputs.points, replace=False, shuffle=False)
+            positions = np.concatenate([cloud.points_m[indices], grasp.g1_m[None], grasp.g2_m[None]]) @ rotation.T
+            positions = normalised(inputs.normalisation, positions, extent, rotation, wrist)
+            points[row, :, :3] = positions[:-2]
             if inputs.coloured:
                 assert cloud.colours is not None
-                points[row, :, 3:] = colours_normalised(inputs.normalisation, cloud.colours[chosen] / 255.0, extent)
+                points[row, :, 3:] = colours_normalised(inputs.normalisation, cloud.colours[indices] / 255.0, extent)
             if inputs.grasp_numbers:
-                numbers[row, :6] = places[-2:].ravel()
+                numbers[row, :6] = positions[-2:].ravel()
             if inputs.posed:
                 assert wrist is not None
                 numbers[row, 6:] = wrist.ravel()
@@ -222,8 +222,8 @@ class PatchSources:
         points = np.empty((len(draws), PATCH_COUNT, count, self.patches.channels), np.float32)
         for row, (index, rng) in enumerate(draws):
             cloud = self.clouds[index]
-            for place, indices in enumerate((*self.near[index], np.arange(len(cloud)))):
-                points[row, place] = cloud[indices[_random_indices(len(indices), count, rng)]]
+            for patch, indices in enumerate((*self.near[index], np.arange(len(cloud)))):
+                points[row, patch] = cloud[indices[_random_indices(len(indices), count, rng)]]
         return points, self.numbers[[index for index, _ in draws]]
 
 
@@ -246,11 +246,13 @@ def _indices_near(points: Floats, place_m: float, radius_m: float) -> Indices:
 def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices:
     """Return ``count`` random indices below ``total``; an index repeats only after all have been used."""
     if count <= total:
-        chosen: Indices = rng.choice(total, count, replace=False, shuffle=False)
-        return chosen
+        indices: Indices = rng.choice(total, count, replace=False, shuffle=False)
+        return indices
     return np.concatenate([np.arange(total), rng.integers(0, total, count - total)])
 
 
-def _grasp_features(grasps: Sequence[Grasp], placed: bool) -> Float32s:
-    rows = [[grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if placed else []) for grasp in grasps]
+def _grasp_features(grasps: Sequence[Grasp], with_position: bool) -> Float32s:
+    rows = [
+        [grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if with_position else []) for grasp in grasps
+    ]
     return np.array(rows, np.float32)

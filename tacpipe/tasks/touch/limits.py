@@ -51,10 +51,10 @@ class Pairs:
         """
         first, second = np.triu_indices(len(objects), 1)
         names = np.asarray(objects)
-        same = (names[first] == names[second]) & (names[first] != "")
-        first, second = first[same], second[same]
-        moved = contacts_m[first] - contacts_m[second]  # (pair, finger, axis)
-        return cls(first, second, 1e3 * np.sqrt(np.square(moved).sum(axis=2).mean(axis=1)))
+        is_same_object = (names[first] == names[second]) & (names[first] != "")
+        first, second = first[is_same_object], second[is_same_object]
+        displacement = contacts_m[first] - contacts_m[second]  # (pair, finger, axis)
+        return cls(first, second, 1e3 * np.sqrt(np.square(displacement).sum(axis=2).mean(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def repeatability(
     resampled grasps; a pair's weight is the product of the counts of its two grasps. They are NaN if there are no
     pairs.
     """
-    near = (pairs.distance_mm >= low_mm) & (pairs.distance_mm < high_mm)
-    first, second = pairs.first[near], pairs.second[near]
+    in_bin = (pairs.distance_mm >= low_mm) & (pairs.distance_mm < high_mm)
+    first, second = pairs.first[in_bin], pairs.second[in_bin]
     if not len(first):
         return Repeatability(0, NOTHING, NOTHING)
     squared = np.square(values[first] - values[second]).sum(axis=1)  # (pair,)
@@ -92,8 +92,8 @@ def repeatability(
         return 1 - ratio, 1 - math.sqrt(ratio * float(np.average(variance_within[kind], weights=weight)) / total)
 
     rng, count = np.random.default_rng(seed), len(values)
-    drawn = [np.bincount(rng.integers(0, count, count), minlength=count).astype(np.float64) for _ in range(RESAMPLES)]
-    resampled = np.array([estimates(weight) for weight in drawn])  # (resample, likeness or pair skill)
+    weights = [np.bincount(rng.integers(0, count, count), minlength=count).astype(np.float64) for _ in range(RESAMPLES)]
+    resampled = np.array([estimates(weight) for weight in weights])  # (resample, likeness or pair skill)
     resampled = resampled[np.isfinite(resampled).all(axis=1)]
     means = estimates(np.ones(count))
     if not len(resampled):
@@ -217,8 +217,8 @@ def limits(
     trial = _Trial(grasps, rows, draws, trees, seed, advance or (lambda *_, **__: None))
     largest_size = max(counts.values()) * (FOLDS - 1) // FOLDS
     curve = [trial.point(size) for size in sorted({min(size, largest_size) for size in sizes})]
-    near = table(grasps.readings, contacts_m, grasps.objects)
-    return Limits(counts, near, curve, trial.skills_with_other_finger(), draws, trees)
+    bins = table(grasps.readings, contacts_m, grasps.objects)
+    return Limits(counts, bins, curve, trial.skills_with_other_finger(), draws, trees)
 
 
 def steps(sizes: Iterable[int], draws: int) -> int:
@@ -262,12 +262,12 @@ class _Trial:
             folds = stratified_folds(self.grasps.objects, rng)
             for fold in range(FOLDS):
                 trained_on, tested = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
-                chosen = sample_grasps(trained_on, self.grasps.objects, size, rng)
-                trained.append(len(chosen))
+                sample = sample_grasps(trained_on, self.grasps.objects, size, rng)
+                trained.append(len(sample))
                 for name, values in readings.items():
-                    leaf = max(1, min(LEAF, len(chosen) // 4))
+                    leaf = max(1, min(LEAF, len(sample) // 4))
                     forest = Forest.fitted(
-                        rows[name][chosen], values[chosen], trees=self.trees, leaf=leaf, seed=self.seed + draw
+                        rows[name][sample], values[sample], trees=self.trees, leaf=leaf, seed=self.seed + draw
                     )
                     constant = np.tile(values[trained_on].mean(axis=0), (len(tested), 1))
                     for at, predicted in enumerate((forest.predict(rows[name][tested]), constant)):

@@ -209,13 +209,13 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
 def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network. Raises `TacpipeError` if the params build anything else."""
     values = sum(biotac_sp.width(target) for target in targets)
-    read = params.point_inputs
-    built = params.build(PointNetworkShape(read.channels, read.grasp_numbers, values))
-    if not isinstance(built, nn.Module):
+    inputs = params.point_inputs
+    module = params.build(PointNetworkShape(inputs.channels, inputs.grasp_numbers, values))
+    if not isinstance(module, nn.Module):
         raise TacpipeError(
-            f"The architecture {params.architecture} built {type(built).__name__}; it must build a torch.nn.Module."
+            f"The architecture {params.architecture} built {type(module).__name__}; it must build a torch.nn.Module."
         )
-    return built
+    return module
 
 
 def check_sizes(params: PointNetwork) -> None:

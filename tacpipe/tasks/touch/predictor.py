@@ -67,8 +67,8 @@ class Baselines:
         follows sensor drift and ignores the grasp.
         """
         names = np.array(self.objects)
-        same = [(names == name) & (names != "") for name in grasps.objects]  # (grasp)(training grasp,)
-        reference_masks = [mask if mask.any() else np.ones_like(mask) for mask in same]
+        is_same_object = [(names == name) & (names != "") for name in grasps.objects]  # (grasp)(training grasp,)
+        reference_masks = [mask if mask.any() else np.ones_like(mask) for mask in is_same_object]
         nearest = [np.argsort(np.abs(self.t_ns - t_ns), kind="stable")[:NEIGHBOUR_COUNT] for t_ns in grasps.t_ns]
         return {
             CONSTANT: {name: np.tile(values.mean(axis=0), (len(grasps), 1)) for name, values in self.readings.items()},
@@ -84,12 +84,12 @@ class Baselines:
 
     def has_training_reading(self, grasps: Grasps) -> Bools:
         """Return a mask (grasp,) of grasps whose reading equals that of a training grasp, because it was logged twice."""
-        before, now = (
+        training_values, evaluated_values = (
             np.concatenate([values[name] for name in self.readings], axis=1)
             for values in (self.readings, grasps.readings)
         )
-        training_rows = {row.tobytes() for row in np.asarray(before, np.float64)}
-        return np.array([row.tobytes() in training_rows for row in np.asarray(now, np.float64)], bool)
+        training_rows = {row.tobytes() for row in np.asarray(training_values, np.float64)}
+        return np.array([row.tobytes() in training_rows for row in np.asarray(evaluated_values, np.float64)], bool)
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
         """Return the tensors that `from_tensors` reads; they do not include the objects' names."""
@@ -220,8 +220,8 @@ class Predictor:
         device = devices.kind()
         with model_files.validated("the model"):
             loaded_members = [
-                _load_member(params, about, tensors_under(f"{number}.", tensors), device)
-                for number, about in enumerate(config["members"])
+                _load_member(params, description, tensors_under(f"{number}.", tensors), device)
+                for number, description in enumerate(config["members"])
             ]
             baselines = None
             if BASELINES in files:
@@ -290,19 +290,23 @@ class Predictor:
         ]
 
 
-def _load_member(params: Params, about: MemberDescription, tensors: dict[str, Tensor], device: str) -> members.Member:
-    targets = tuple(about["targets"])
+def _load_member(
+    params: Params, description: MemberDescription, tensors: dict[str, Tensor], device: str
+) -> members.Member:
+    targets = tuple(description["targets"])
     width = sum(biotac_sp.width(target) for target in targets)
-    if about["kind"] == FOREST:
+    if description["kind"] == FOREST:
         forests = tuple(
             (tuple(group), Forest.from_tensors(tensors_under(f"{number}.", tensors)))
-            for number, group in enumerate(about["groups"])
+            for number, group in enumerate(description["groups"])
         )
         for group, forest in forests:
-            forest.check(len(about["features"]), sum(biotac_sp.width(target) for target in group))
+            forest.check(len(description["features"]), sum(biotac_sp.width(target) for target in group))
         if {target for group, _ in forests for target in group} != {*targets}:
             raise ValueError(f"the forests do not predict {excerpt(targets)}")
-        return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
+        return members.ForestMember(
+            targets, forests, description["coloured"], description["placed"], tuple(description["features"])
+        )
     scale = Affine.from_tensors({name: value.numpy() for name, value in tensors_under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):
         raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")

@@ -195,6 +195,6 @@ def _minus_object_means(values: Floats, objects: Sequence[str]) -> Floats:
     deviations = np.empty_like(values)
     names = np.array(objects)
     for name in set(objects):
-        same: Bools = names == name
-        deviations[same] = values[same] - values[same].mean(axis=0)
+        is_object: Bools = names == name
+        deviations[is_object] = values[is_object] - values[is_object].mean(axis=0)
     return deviations

@@ -26,21 +26,21 @@ OBJECTS, GRASPS = 1, 90  # objects per family, of six families; grasps per objec
 def demo(output: Path) -> Demo:
     """Return the commands of the demo, from simulation to results, which write below ``output``."""
     names = ("pinched", "grasps", "grasps-split", "touch", "touch-results", "pointnet", "pointnet-results")
-    place = {name: str(output / name) for name in names}
-    split = ["--split", place["grasps-split"]]
+    paths = {name: str(output / name) for name in names}
+    split = ["--split", paths["grasps-split"]]
     simulation = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
     paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # the paper uses 250 epochs and 750 points
     commands = [
-        ["simulate", "touch", *simulation, "-o", place["pinched"]],
-        ["segment", "grasps", place["pinched"], "-o", place["grasps"]],
-        ["split", place["grasps"], "-o", place["grasps-split"], "--scheme", "random", "--stratify", "object"],
-        ["train", "touch", place["grasps"], *split, "-o", place["touch"], "--preset", "quick"],
-        ["evaluate", place["touch"], place["grasps"], *split, "-o", place["touch-results"]],
-        ["train", "touch", place["grasps"], *split, "-o", place["pointnet"], *paper],
-        ["evaluate", place["pointnet"], place["grasps"], *split, "-o", place["pointnet-results"]],
+        ["simulate", "touch", *simulation, "-o", paths["pinched"]],
+        ["segment", "grasps", paths["pinched"], "-o", paths["grasps"]],
+        ["split", paths["grasps"], "-o", paths["grasps-split"], "--scheme", "random", "--stratify", "object"],
+        ["train", "touch", paths["grasps"], *split, "-o", paths["touch"], "--preset", "quick"],
+        ["evaluate", paths["touch"], paths["grasps"], *split, "-o", paths["touch-results"]],
+        ["train", "touch", paths["grasps"], *split, "-o", paths["pointnet"], *paper],
+        ["evaluate", paths["pointnet"], paths["grasps"], *split, "-o", paths["pointnet-results"]],
     ]
-    shortened = [f"{place['touch']} (100 of 300 trees)", f"{place['pointnet']} (4 of 250 epochs)"]
-    return Demo(commands, [place["touch-results"], place["pointnet-results"]], [place["grasps"]], shortened=shortened)
+    shortened = [f"{paths['touch']} (100 of 300 trees)", f"{paths['pointnet']} (4 of 250 epochs)"]
+    return Demo(commands, [paths["touch-results"], paths["pointnet-results"]], [paths["grasps"]], shortened=shortened)
 
 
 REQUIREMENTS = Requirements(

@@ -77,10 +77,10 @@ class FittedModel:
     tensors: dict[str, Tensor] = field(default_factory=dict)
     history: list[Line] = field(default_factory=list)
 
-    def add_member(self, described: MemberDescription, tensors: Mapping[str, Tensor]) -> None:
+    def add_member(self, description: MemberDescription, tensors: Mapping[str, Tensor]) -> None:
         """Add a member with its description and its tensors by name."""
         number = len(self.config["members"])
-        self.config["members"].append(described)
+        self.config["members"].append(description)
         self.tensors.update({f"{number}.{name}": value.clone().contiguous() for name, value in tensors.items()})
 
 
@@ -165,8 +165,10 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
 
         def predict(in_training: Bools) -> dict[str, Floats]:
             training_readings = {target: values[in_training] for target, values in readings.items()}
-            grown, _ = _fit_forests(params, rows[in_training], training_readings, groups)
-            return members.average_by_target((group, forest.predict(rows[~in_training])) for group, forest in grown)
+            forests_of_others, _ = _fit_forests(params, rows[in_training], training_readings, groups)
+            return members.average_by_target(
+                (group, forest.predict(rows[~in_training])) for group, forest in forests_of_others
+            )
 
         shrunk = predictor.fit_shrinkage(readings, training.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
@@ -216,7 +218,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
         scale = _output_scale(training, group, params.loss)
         work = _network_work(params, scale, (training_sources, validation_sources), group, device)
         for number in range(params.networks):
-            place = grasps.workspace / f"{'-'.join(group)}-{number}"
+            folder = grasps.workspace / f"{'-'.join(group)}-{number}"
             schedule = loop.Schedule.from_params(params, params.seed + 1000 * number)
             build = functools.partial(_build_network, params, group, device)
             labels: NetworkLabels = {
@@ -227,20 +229,20 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
                 build,
                 work,
                 schedule,
-                place,
+                folder,
                 weight_decay=params.weight_decay,
                 number=at * params.networks + number + 1,
                 count=len(groups) * params.networks,
                 labels=labels,
             )
-            kept = trained.weights if params.select == "best" else trained.last
+            weights = trained.weights if params.select == "best" else trained.last
             parameters += _parameter_count(params, group)
-            about: MemberDescription = {"kind": NETWORK, "targets": list(group)}
-            named = {f"network.{name}": value for name, value in kept.items()}
-            named |= {
+            description: MemberDescription = {"kind": NETWORK, "targets": list(group)}
+            tensors = {f"network.{name}": value for name, value in weights.items()}
+            tensors |= {
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
             }
-            model.add_member(about, named)
+            model.add_member(description, tensors)
             model.history.extend({**line, **labels} for line in trained.history)
     model.config["parameters"] = parameters
 
@@ -250,8 +252,8 @@ def _network_work(
 ) -> TouchWork:
     """Return the training of a network; the first of ``parts`` is for training, the second for validation."""
     training, watched = (
-        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_target_values(grasps, group))).to(device))
-        for drawn, grasps in parts
+        ScaledGrasps(sampler, torch.from_numpy(scale.apply(_target_values(grasps, group))).to(device))
+        for sampler, grasps in parts
     )
     return TouchWork(training, watched, params.batch, params.loss, _loss_weights(group).to(device))
 

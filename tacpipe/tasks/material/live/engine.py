@@ -235,8 +235,8 @@ class MaterialEngine(Engine):
             if not new_tables or self._stop_reason:
                 continue
             self._late += sum(int((table.column("t_ns").to_numpy() <= self._read_ns).sum()) for table in new_tables)
-            before = [self._tables[name]] if name in self._tables else []
-            self._tables[name] = pa.concat_tables([*before, *new_tables]).combine_chunks()
+            stored = [self._tables[name]] if name in self._tables else []
+            self._tables[name] = pa.concat_tables([*stored, *new_tables]).combine_chunks()
 
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:

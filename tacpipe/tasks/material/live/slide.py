@@ -134,8 +134,8 @@ class SlideSoFar:
         newest_ns = finger_stream("so far", streams).column("t_ns")[-1].as_py()
         is_over = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
         try:
-            cut, lacks = self._slide_rows(recording, table)
-            layout, frames = slides_of.frames(cut, self._sensor, self._classifier.quantities)
+            slide, is_incomplete = self._slide_rows(recording, table)
+            layout, frames = slides_of.frames(slide, self._sensor, self._classifier.quantities)
         except TacpipeError as error:
             return Answer(None, rows, 0.0, is_over, str(error))
         answer = Answer(None, rows, min(1.0, len(frames) / self.frames), is_over)
@@ -146,7 +146,7 @@ class SlideSoFar:
         if len(frames) < self.frames and not (self.any_length and answer.fraction >= self._least_fraction):
             enough = f"{self._least_fraction:.0%} of {self.frames}" if self.any_length else str(self.frames)
             return replace(answer, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
-        if not lacks and not self._layout.is_compatible(layout):
+        if not is_incomplete and not self._layout.is_compatible(layout):
             return replace(
                 answer, cause=f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
             )
@@ -302,7 +302,7 @@ def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
         [np.full(len(names), np.nan) if answer.probabilities is None else answer.probabilities for answer in answers],
         np.float32,
     ).reshape(len(rows), len(names))
-    about = {"quantity": "prediction"}
+    metadata = {"quantity": "prediction"}
     materials = [
         "unknown" if answer.probabilities is None else names[int(answer.probabilities.argmax())] for answer in answers
     ]
@@ -311,7 +311,7 @@ def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
         (pa.field("slide", pa.int32()), [row[1] for row in rows]),
         (pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}), [row[2] for row in rows]),
         (pa.field("rows", pa.int32()), [answer.rows for answer in answers]),
-        (pa.field("material", pa.string(), metadata=about), materials),
+        (pa.field("material", pa.string(), metadata=metadata), materials),
         (pa.field("cause", pa.string()), [answer.cause for answer in answers]),
         *(
             (pa.field(f"probability_{name}", pa.float32(), metadata={"quantity": "probability"}), likely[:, number])

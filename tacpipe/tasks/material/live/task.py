@@ -83,7 +83,7 @@ class MaterialLive(LiveTask):
                 f"nothing is touched."
             )
         has_probabilities = classifier.calibrations or classifier.readers[sensor].GIVES_LIKELIHOODS
-        about = MaterialDescription(
+        description = MaterialDescription(
             classifier.names,
             sensor,
             slide.frames,
@@ -96,7 +96,7 @@ class MaterialLive(LiveTask):
             sensors,
             finger,
             slide,
-            about,
+            description,
             every_ns=round(own_settings.every_ms * 1e6),
             settle_ns=round(settings.settle_ms * 1e6),
             pause_ns=round(own_settings.pause_s * 1e9),

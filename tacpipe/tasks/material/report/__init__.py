@@ -117,7 +117,7 @@ def _pooled(methods: Sequence[Method]) -> str:
     runs = [run for method in methods for run in method.details]
     published = all(method.published for method in methods)
     predicted = {name for run in runs for name in run.predictions.predicted}
-    described = [
+    sentences = [
         "Slides named right: accuracy ± standard deviation over runs; in small print, those of all that runs of the method "
         "were evaluated on, then the 95 % interval (Wilson) over slides, each counted once however many runs named it.",
         "Networks have the weights that did best in validation, unless the name states otherwise."
@@ -134,25 +134,25 @@ def _pooled(methods: Sequence[Method]) -> str:
         else "",
         joint.PRINTED_BASIS if published else "",
     ]
-    return " ".join(filter(None, described))
+    return " ".join(filter(None, sentences))
 
 
 def _basis(methods: Sequence[Method]) -> str:
     """Return a description of the data of all methods: slides, training slides, and settings."""
-    described = []
+    sentences = []
     for sensor in sensors_of(methods):
         slides = [run.details.predictions.of(sensor) for method in methods for run in runs_on(method, sensor)]
         names = {str(name) for slide in slides for name in slide.recordings}
         trained = sorted({run.learned[sensor] for method in methods for run in method.details if sensor in run.learned})
         counts = f" after training on {blocks.listed([f'{count:,}' for count in trained])}" if trained else ""
-        described.append(f"{len(names):,} slides of {sensor}{counts}")
+        sentences.append(f"{len(names):,} slides of {sensor}{counts}")
     settings, runs = {}, [run for method in methods for run in method.details]
     for name in ("seed", "epochs"):
         values = {run.params[name] for run in runs if name in run.params and (name == "seed" or run.history)}
         if values:
             settings[name] = ", ".join(str(value) for value in sorted(values))
     settings_text = "; ".join(f"{name} {values}" for name, values in settings.items())
-    return f"Evaluated on {blocks.listed(described)}.{f' Settings: {settings_text}.' if settings_text else ''}"
+    return f"Evaluated on {blocks.listed(sentences)}.{f' Settings: {settings_text}.' if settings_text else ''}"
 
 
 def _not_run(methods: Sequence[Method]) -> str:

@@ -40,16 +40,16 @@ CONFUSION_NOTE = (
 
 def confusion_folds(context: Context) -> list[Fold]:
     """Return the confusions of the best and of the joint method, one chart per sensor."""
-    drawn = []
+    figures = []
     joint = scores.main_method(context.methods)
     for sensor in sensors_of([method for method in context.methods if has_usual_settings(method.settings)]):
         compared = next(
             (method for method in context.comparisons if method.question.part == sensor_title(sensor)), None
         )
         best = compared.best.method if compared and compared.best else None
-        chosen = dict.fromkeys(method for method in (best, joint) if method and runs_on(method, sensor))
-        drawn += [_confusion_chart(method, sensor) for method in chosen]
-    return fold("Which materials are confused", Charts(drawn), SmallPrint(CONFUSION_NOTE)) if drawn else []
+        shown_methods = dict.fromkeys(method for method in (best, joint) if method and runs_on(method, sensor))
+        figures += [_confusion_chart(method, sensor) for method in shown_methods]
+    return fold("Which materials are confused", Charts(figures), SmallPrint(CONFUSION_NOTE)) if figures else []
 
 
 def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
@@ -59,8 +59,8 @@ def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | lis
     tables = []
     for run in runs_on(method, sensor):
         rows = run.details.predictions.of(sensor)
-        described = rows.predicted[MODEL] != NOTHING
-        truth, answers = (rows.named(numbers[described]) for numbers in (rows.materials, rows.predicted[MODEL]))
+        is_predicted = rows.predicted[MODEL] != NOTHING
+        truth, answers = (rows.named(numbers[is_predicted]) for numbers in (rows.materials, rows.predicted[MODEL]))
         tables.append(pd.DataFrame({"truth": truth, "named": answers}))
     rows_of_runs = pd.concat(tables)
     materials = sorted({*rows_of_runs["truth"], *rows_of_runs["named"]})
@@ -74,12 +74,12 @@ def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
     """Return a sentence on the materials that are most often confused with another."""
     wrong = counts - np.diag(np.diag(counts))
     order = np.argsort(-wrong, axis=None, kind="stable")[:MAX_PAIRS]
-    described = []
-    for place in order:
-        row, column = np.unravel_index(place, wrong.shape)
+    phrases = []
+    for index in order:
+        row, column = np.unravel_index(index, wrong.shape)
         if wrong[row, column]:
-            described.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
-    return f"Most often it takes {listed(described)}." if described else "It takes none for another."
+            phrases.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
+    return f"Most often it takes {listed(phrases)}." if phrases else "It takes none for another."
 
 
 def _confusion_chart(method: Method, sensor: str) -> Chart:
@@ -99,8 +99,8 @@ Points = dict[int, tuple[float, float, float]]  # number of training slides -> a
 
 def training_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return validation accuracy and latent difference by epoch."""
-    drawn = [*validation_charts(methods), *alignment_charts(methods)]
-    return blocks.fold("Training", Charts(drawn)) if drawn else []
+    figures = [*validation_charts(methods), *alignment_charts(methods)]
+    return blocks.fold("Training", Charts(figures)) if figures else []
 
 
 def validation_charts(methods: Sequence[Method]) -> list[Chart]:
@@ -109,34 +109,40 @@ def validation_charts(methods: Sequence[Method]) -> list[Chart]:
     Empty if there are no epochs.
     """
     networks = [method for method in methods if has_usual_settings(method.settings)]
-    chosen = [method for family in ("RAEC joint", "RAEC independent") for method in networks if method.family == family]
-    order = [method.name for method in chosen]
-    drawn = []
-    for sensor in sensors_of(chosen):
-        loss_curves = curves_of_methods(chosen, functools.partial(_validation_by_epoch, sensor=sensor))
+    shown_methods = [
+        method for family in ("RAEC joint", "RAEC independent") for method in networks if method.family == family
+    ]
+    order = [method.name for method in shown_methods]
+    figures = []
+    for sensor in sensors_of(shown_methods):
+        loss_curves = curves_of_methods(shown_methods, functools.partial(_validation_by_epoch, sensor=sensor))
         if loss_curves:
             spec = loss_chart(loss_curves, "validation accuracy (%)", order)
             title = blocks.form(
-                "Figure 9", f"validation accuracy on {sensor_title(sensor)}", all(method.published for method in chosen)
+                "Figure 9",
+                f"validation accuracy on {sensor_title(sensor)}",
+                all(method.published for method in shown_methods),
             )
-            drawn.append(Chart(title, spec, "Thick: mean over runs; thin: single runs."))
-    return drawn
+            figures.append(Chart(title, spec, "Thick: mean over runs; thin: single runs."))
+    return figures
 
 
 def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
     """Return Figure 10 of the paper: the distance between paired latents of the sensors; empty if it was not logged."""
-    chosen = [
+    shown_methods = [
         method
         for method in methods
         if (has_usual_settings(method.settings) or scores.is_control(method)) and method.settings["joint"]
     ]
-    loss_curves = curves_of_methods(chosen, alignment_by_epoch)
+    loss_curves = curves_of_methods(shown_methods, alignment_by_epoch)
     if not loss_curves:
         return []
     spec = loss_chart(loss_curves, "mean squared latent difference", log=True)
-    title = blocks.form("Figure 10", "latent difference of training pairs", all(method.published for method in chosen))
+    title = blocks.form(
+        "Figure 10", "latent difference of training pairs", all(method.published for method in shown_methods)
+    )
     caption = ""
-    if any(scores.is_control(method) for method in chosen):
+    if any(scores.is_control(method) for method in shown_methods):
         caption = "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
     return [Chart(title, spec, caption)]
 
@@ -148,17 +154,19 @@ def alignment_by_epoch(run: MaterialResult) -> list[float]:
 
 def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return accuracy by number of training slides, one chart per sensor; empty if all methods have the same number."""
-    chosen = [candidate for candidate in methods if has_usual_settings(candidate.settings, "few", "subsample_sensor")]
-    drawn = []
-    for sensor in sensors_of(chosen):
+    shown_methods = [
+        candidate for candidate in methods if has_usual_settings(candidate.settings, "few", "subsample_sensor")
+    ]
+    figures = []
+    for sensor in sensors_of(shown_methods):
         points: dict[str, Points] = {}
-        for method in chosen:
+        for method in shown_methods:
             fewer = {method.settings["subsample_sensor"], method.settings["few_of"]} - {""}
             if fewer <= {sensor}:
                 _add_points(points, method_title(method), method, sensor)
             if fewer == {sensor}:  # this line ends at the full number of slides of all sensors
                 loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
-                for candidate in chosen:
+                for candidate in shown_methods:
                     if has_usual_settings(candidate.settings) and candidate.key_without(*loose) == method.key_without(
                         *loose
                     ):
@@ -173,25 +181,25 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
                     for part in zip(*(counts_and_accuracies[at] for at in slides), strict=True)
                 )
                 lines.append(Curve(name, slides, mean, low, high))
-            chance = 100 / max(len(chosen[0].details[0].config.get("classes", ())), 1)
+            chance = 100 / max(len(shown_methods[0].details[0].config.get("classes", ())), 1)
             spec = charts.lines(lines, "training slides", "accuracy (%)", level=("chance", chance))
             caption = "Unseen slides, with 95 % intervals; dashed across: chance."
             if any("other sensor whole" in name for name in drawn_points):
                 caption += " Other sensor whole: this one alone has fewer."
             if any("fixed batches" in name for name in drawn_points):
                 caption += " Fixed batches: the same in every epoch, of which a sensor learns from a share."
-            drawn.append(Chart(f"Accuracy on {sensor_title(sensor)} by number of training slides", spec, caption))
-    return blocks.fold("Few slides", Charts(drawn)) if drawn else []
+            figures.append(Chart(f"Accuracy on {sensor_title(sensor)} by number of training slides", spec, caption))
+    return blocks.fold("Few slides", Charts(figures)) if figures else []
 
 
 def _add_points(points: dict[str, Points], name: str, method: Method, sensor: str) -> None:
     """Add the accuracy of a method to a line."""
-    counted = accuracy(runs_on(method, sensor), sensor)
-    if counted is None:
+    result = accuracy(runs_on(method, sensor), sensor)
+    if result is None:
         return
-    described = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
-    if described:
-        points.setdefault(name, {})[max(described)] = (counted.fraction, counted.low, counted.high)
+    slide_counts = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
+    if slide_counts:
+        points.setdefault(name, {})[max(slide_counts)] = (result.fraction, result.low, result.high)
 
 
 def _validation_by_epoch(run: MaterialResult, sensor: str) -> list[float]:
@@ -213,9 +221,9 @@ def latent_folds(methods: Sequence[Method]) -> list[Fold]:
     main = scores.main_method(methods)
     if main is None:
         return []
-    chosen = main, scores.permuted_method(methods, main), scores.independent_method(methods, main)
-    drawn = [chart for method in chosen if method and (chart := _latent_chart(method))]
-    return fold("Latents", Charts(drawn), SmallPrint(LATENT_NOTE)) if drawn else []
+    candidates = main, scores.permuted_method(methods, main), scores.independent_method(methods, main)
+    figures = [chart for method in candidates if method and (chart := _latent_chart(method))]
+    return fold("Latents", Charts(figures), SmallPrint(LATENT_NOTE)) if figures else []
 
 
 def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
@@ -245,8 +253,8 @@ def count_nearest_partners(
     distances = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other sensor)
     partner_names = [partners.get(int(name), int(name)) for name in first_materials]
     is_nearest = [
-        near == name
-        for near, name in zip(second_materials[distances.argmin(axis=1)], partner_names, strict=True)
+        nearest == name
+        for nearest, name in zip(second_materials[distances.argmin(axis=1)], partner_names, strict=True)
         if name in second_materials
     ]
     return int(sum(is_nearest)), len(is_nearest)
@@ -262,7 +270,7 @@ def _latent_chart(method: Method) -> Chart | None:
     partners = {
         int(material): int(partner) for material, partner in method.details[0].config.get("partners", {}).items()
     }
-    same, count = count_nearest_partners(parts[0], parts[1], partners)
+    nearest_count, count = count_nearest_partners(parts[0], parts[1], partners)
     dots: list[charts.DataRow] = [
         {"name": str(name), "x": float(x), "y": float(y), "shape": sensor_title(sensor), "tip": str(recording)}
         for sensor, part, at in zip(sensors, parts, points, strict=True)
@@ -277,7 +285,7 @@ def _latent_chart(method: Method) -> Chart | None:
     )
     spec["layer"].append(charts.joined(_latent_rows(points, parts, partners)))
     partner_text = "the material that it was paired with" if partners else "the same material"
-    caption = f"For {same} of {count} materials, the other sensor's nearest mean is {partner_text}."
+    caption = f"For {nearest_count} of {count} materials, the other sensor's nearest mean is {partner_text}."
     return Chart(f"{method.name}: latents of both sensors", spec, caption)
 
 
@@ -304,8 +312,8 @@ def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str]
     if len(sensors) < 2:
         return None
     joint_run = next((run for run in with_latents if set(sensors) <= set(run.sensors)), None)
-    chosen = [joint_run or next(run for run in with_latents if sensor in run.sensors) for sensor in sensors]
-    parts = [run.predictions.of(sensor) for run, sensor in zip(chosen, sensors, strict=True)]
+    runs_by_sensor = [joint_run or next(run for run in with_latents if sensor in run.sensors) for sensor in sensors]
+    parts = [run.predictions.of(sensor) for run, sensor in zip(runs_by_sensor, sensors, strict=True)]
     if len({_latents_of(part).shape[1] for part in parts}) > 1:
         return None
     return (sensors[0], sensors[1]), parts
@@ -335,14 +343,14 @@ def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
         _describe_counts([shard for shard in shards if shard.attributes.get("sensor", "") == sensor], sensor)
         for sensor in sensors
     ]
-    drawn: list[Chart] = []
+    figures: list[Chart] = []
     for sensor in sensors:
         sensor_shards = [
             shard for shard in shards if shard.attributes.get("sensor", "") == sensor and PROFILE in shard.streams
         ]
         if sensor_shards:
-            drawn += _profile_charts(typical_slide(sensor_shards), sensor, published)
-    return [Fold("The slides", [SmallPrint(" ".join(parts)), *([Charts(drawn)] if drawn else [])])]
+            figures += _profile_charts(typical_slide(sensor_shards), sensor, published)
+    return [Fold("The slides", [SmallPrint(" ".join(parts)), *([Charts(figures)] if figures else [])])]
 
 
 def typical_slide(shards: Sequence[Recording]) -> Recording:
@@ -363,8 +371,8 @@ def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:
         return f"{slides_text} of {sensor_title(sensor)}."
     text = f"{slides_text} of {sensor_title(sensor)}, {len(outside):,} of them outside the protocol"
     reasons = Counter(str(shard.attributes.get("outside_protocol_why", "")) for shard in outside)
-    described = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
-    return text + (f" ({listed(described)})." if described else ".")
+    phrases = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
+    return text + (f" ({listed(phrases)})." if phrases else ".")
 
 
 def _profile_charts(shard: Recording, sensor: str, published: bool) -> list[Chart]:
@@ -384,12 +392,12 @@ def _profile_charts(shard: Recording, sensor: str, published: bool) -> list[Char
             1000.0,
         ),
     )
-    drawn = []
+    figures = []
     for number, title, quantity, columns, scale in profiles:
         lines = {label: scale * table[name].to_numpy() for name, label in columns.items() if name in table.column_names}
         drawn_lines = [Curve(label, time_s, values) for label, values in lines.items() if np.isfinite(values).any()]
         if drawn_lines:
             spec = charts.lines(drawn_lines, "time (s)", quantity, shade=shade, points=False, height=190)
             caption = f"{shard.name}, the slide of median force. Shaded: the slide."
-            drawn.append(Chart(form(number, title, published), spec, caption))
-    return drawn
+            figures.append(Chart(form(number, title, published), spec, caption))
+    return figures

@@ -123,7 +123,7 @@ def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
     """Return the gain of joint learning, one sentence per sensor."""
     if independent is None:
         return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
-    described = []
+    sentences = []
     for sensor in sensors_of([joint]):
         difference = scores.compare_runs(joint, independent, sensor)
         if difference:
@@ -132,8 +132,8 @@ def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
                 "worse": f"hurts RAEC on {sensor_title(sensor)}",
                 "unclear": f"makes no difference to RAEC on {sensor_title(sensor)} that these slides could show",
             }[difference.word]
-            described.append(f"Joint learning {verb}: {_describe_difference(difference)}.")
-    return described
+            sentences.append(f"Joint learning {verb}: {_describe_difference(difference)}.")
+    return sentences
 
 
 def _describe_difference(difference: MethodDifference) -> str:
@@ -155,8 +155,8 @@ def _last_alignment(method: Method) -> float:
 
 
 def _swapped_accuracy(method: Method) -> dict[str, Accuracy]:
-    described = {sensor: accuracy(runs_on(method, sensor), sensor, SWAPPED) for sensor in sensors_of([method])}
-    return {sensor: counted for sensor, counted in described.items() if counted}
+    accuracies = {sensor: accuracy(runs_on(method, sensor), sensor, SWAPPED) for sensor in sensors_of([method])}
+    return {sensor: result for sensor, result in accuracies.items() if result}
 
 
 def swap_table(methods: Sequence[Method]) -> Table | None:
@@ -223,13 +223,13 @@ def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
     result = run.details
     learned = " + ".join(f"{count}" for _, count in sorted(result.learned.items()))
     best_epochs = result.config.get("validation", {}).get("epoch", {}) if result.history else {}
-    described = dict.fromkeys(
+    slide_counts = dict.fromkeys(
         best_epochs[sensor] for sensor in ordered_sensors(best_epochs)
     )  # a single value if sensors were learned jointly
     seconds = f"{float(result.config['seconds']):,.0f}" if "seconds" in result.config else NONE
     return {
         "slides learned from": learned or NONE,
-        "kept epoch": " / ".join(str(epoch) for epoch in described) or NONE,
+        "kept epoch": " / ".join(str(epoch) for epoch in slide_counts) or NONE,
         "epochs": str(len(result.history) or NONE),
         "seconds": seconds,
     }
@@ -247,16 +247,16 @@ def reduction_tables(methods: Sequence[Method]) -> list[Table]:
     A sensor is reduced if it learns from a fraction of the batches, as in the paper, or if its split has fewer slides
     than the other's. If both were run, the paper's method is used.
     """
-    chosen = [method for method in methods if has_usual_settings(method.settings, "subsample_sensor", "few")]
-    if not all(method.published for method in chosen):
+    candidates = [method for method in methods if has_usual_settings(method.settings, "subsample_sensor", "few")]
+    if not all(method.published for method in candidates):
         return []
     described = {
         str(method.settings[name])
-        for method in chosen
+        for method in candidates
         if method.family == JOINT
         for name in ("subsample_sensor", "few_of")
     }
-    return [_reduction_table(chosen, sensor) for sensor in TABLE_NUMBERS if sensor in described]
+    return [_reduction_table(candidates, sensor) for sensor in TABLE_NUMBERS if sensor in described]
 
 
 def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
@@ -265,7 +265,7 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
     rows = []
     for ratio in RATIOS:
         slides = slides_kept(all_slides, BATCH, ratio)
-        same = [
+        comparable = [
             candidate
             for candidate in methods
             if (candidate.settings["subsample_sensor"], candidate.settings["subsample_percent"]) == (reduced, ratio)
@@ -275,7 +275,7 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
         ]
         row: list[str | Cell] = [f"{ratio} %", str(slides)]
         for (kind, sensor), paper in zip(columns, REDUCED[reduced][ratio], strict=True):
-            same_kind = [candidate for candidate in same if candidate.family == kind] or [
+            same_kind = [candidate for candidate in comparable if candidate.family == kind] or [
                 candidate
                 for candidate in fewer
                 if candidate.family == kind and (kind != JOINT or candidate.settings["few_of"] == reduced)
@@ -296,14 +296,18 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
 
 def _reduction_cell(methods: Sequence[Method], sensor: str) -> str | Cell:
     """Return the accuracy of the method with the most runs."""
-    chosen = max(methods, key=lambda method: len(runs_on(method, sensor)), default=None)
-    return scores.accuracy_cell(accuracy(runs_on(chosen, sensor), sensor)) if chosen else NONE
+    method_with_most_runs = max(methods, key=lambda method: len(runs_on(method, sensor)), default=None)
+    return (
+        scores.accuracy_cell(accuracy(runs_on(method_with_most_runs, sensor), sensor))
+        if method_with_most_runs
+        else NONE
+    )
 
 
 def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
     """Return whether a method learned from approximately this number of a sensor's slides."""
-    described = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
-    return bool(described) and SAME_COUNT < max(described) / slides < 1 / SAME_COUNT
+    slide_counts = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
+    return bool(slide_counts) and SAME_COUNT < max(slide_counts) / slides < 1 / SAME_COUNT
 
 
 ZERO_SHOT_NOTE = (
@@ -329,25 +333,25 @@ class HeldOut:
 def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return sections on the classification of held-out materials across sensors; empty if none were held out."""
     rows: list[list[str | Cell]] = []
-    for scored in held_out_methods(methods):
+    for group in held_out_methods(methods):
         rows.append(
             [
-                f"{scored.name}, out of all",
-                sensor_title(scored.sensor),
-                *_zero_shot_cells(scored.results, scored.sensor, scored.materials),
+                f"{group.name}, out of all",
+                sensor_title(group.sensor),
+                *_zero_shot_cells(group.results, group.sensor, group.materials),
             ]
         )
-        among_held_out = [result["among_held_out"] for result in scored.results if "among_held_out" in result]
+        among_held_out = [result["among_held_out"] for result in group.results if "among_held_out" in result]
         if among_held_out:
-            cells = _zero_shot_cells(among_held_out, scored.sensor, scored.materials)
-            rows.append([f"{scored.name}, out of those held out", sensor_title(scored.sensor), *cells])
+            cells = _zero_shot_cells(among_held_out, group.sensor, group.materials)
+            rows.append([f"{group.name}, out of those held out", sensor_title(group.sensor), *cells])
     if not rows:
         return []
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
-    described = blocks.table("Zero shot: accuracy on held-out materials", heads, rows)
+    table = blocks.table("Zero shot: accuracy on held-out materials", heads, rows)
     return blocks.fold(
         "Materials that one sensor never saw",
-        described,
+        table,
         SmallPrint(ZERO_SHOT_NOTE),
         *map(SmallPrint, zero_shot_sentences(methods)),
     )
@@ -355,21 +359,21 @@ def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
 
 def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
     """Return whether one sensor's classifier recognises materials that the other did not learn; by method and sensor."""
-    described = []
-    for scored in held_out_methods(methods):
-        correct, evaluated, low, high = _zero_shot_counts(scored.results, scored.sensor, scored.materials)
-        if not evaluated or not scored.main:
+    sentences = []
+    for group in held_out_methods(methods):
+        correct, evaluated, low, high = _zero_shot_counts(group.results, group.sensor, group.materials)
+        if not evaluated or not group.main:
             continue
-        chance = scored.results[0]["chance"][scored.sensor]
+        chance = group.results[0]["chance"][group.sensor]
         unsure = "which cannot be distinguished from chance"
         word = "above chance" if low > chance else "below chance" if high < chance else unsure
-        described.append(
-            f"Of {sensor_title(scored.sensor)} slides of materials that it never learned, the other sensor's classifier "
-            f"names {scores.format_percent(correct / evaluated)} % right ({scored.kind}, {correct} of {evaluated}; "
+        sentences.append(
+            f"Of {sensor_title(group.sensor)} slides of materials that it never learned, the other sensor's classifier "
+            f"names {scores.format_percent(correct / evaluated)} % right ({group.kind}, {correct} of {evaluated}; "
             f"95 % interval {scores.format_percent(low)} to {scores.format_percent(high)} %), "
             f"{word} ({scores.format_percent(chance)} %)."
         )
-    return described
+    return sentences
 
 
 def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
@@ -379,10 +383,10 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
         if any("zero_shot" in result.metrics for result in method.details):
             groups.setdefault(method.key_without("hold_out"), []).append(method)
     scored_methods = []
-    for same in groups.values():
+    for similar_methods in groups.values():
         runs: list[tuple[ZeroShotAccuracy, Method]] = [
             (result.metrics["zero_shot"], method)
-            for method in same
+            for method in similar_methods
             for result in method.details
             if "zero_shot" in result.metrics
         ]
@@ -426,5 +430,5 @@ def _zero_shot_cells(results: Sequence[HeldOutAccuracy], sensor: str, materials:
         float(np.std([result["accuracy"][sensor] for result in results], ddof=1)) if len(results) > 1 else float("nan")
     )
     chance = float(np.mean([result["chance"][sensor] for result in results]))
-    described = scores.count_cell(correct, evaluated, low, high, spread)
-    return [described, scores.format_percent(chance), str(len(results))]
+    cell = scores.count_cell(correct, evaluated, low, high, spread)
+    return [cell, scores.format_percent(chance), str(len(results))]

@@ -100,8 +100,8 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
         """Split and layout of its slides; results are only pooled if both are equal."""
         split = self.config.get("split", "")
         layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
-        described = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
-        return described, "authors" if "authors" in layouts else "time"
+        scheme = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
+        return scheme, "authors" if "authors" in layouts else "time"
 
 
 def settings(results: Sequence[MaterialResult]) -> list[Settings]:
@@ -133,7 +133,7 @@ def has_usual_settings(settings: Settings, *but: str) -> bool:
 
     The settings in ``but`` may differ.
     """
-    return all(name in but or settings[name] in usual for name, usual in _PLAIN.items())
+    return all(name in but or settings[name] in allowed for name, allowed in _PLAIN.items())
 
 
 def method_title(method: Method) -> str:
@@ -248,7 +248,7 @@ def _settings(run: MaterialResult) -> Settings:
     }
 
 
-def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
+def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], known_fractions: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run if reduced, and the reduced sensors if not all are.
 
     Numbers are rounded to those of earlier runs with about as many slides; their fractions are stored in ``described``.
@@ -259,10 +259,10 @@ def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], describe
         fraction = run.trained[sensor] / max(all_slides[sensor], 1)
         if fraction > _SAME:
             continue
-        same = [earlier for earlier in described if _SAME < earlier / fraction < 1 / _SAME]
-        if not same:
-            described.append(fraction)
-        fewer[sensor] = str(round((same or [fraction])[0] * all_slides[sensor]))
+        similar = [earlier for earlier in known_fractions if _SAME < earlier / fraction < 1 / _SAME]
+        if not similar:
+            known_fractions.append(fraction)
+        fewer[sensor] = str(round((similar or [fraction])[0] * all_slides[sensor]))
     if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
         return {"few": next(iter(fewer.values())), "few_of": ""}
     reductions = ", ".join(f"{sensor_title(sensor)} {count}" for sensor, count in fewer.items())

@@ -101,14 +101,14 @@ def _counted_slides(table: pa.Table, config: MaterialConfig, naming: Naming) -> 
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)
     settings = params_of.counting(registry.load("train.material"), config.get("params", {}))
-    counted: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
-    counted &= sensors != str(settings.get("frozen_sensor", ""))
+    mask: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
+    mask &= sensors != str(settings.get("frozen_sensor", ""))
     for sensor, held_out in config.get("held_out", {}).items():
-        counted &= ~((sensors == sensor) & np.isin(materials, held_out))
+        mask &= ~((sensors == sensor) & np.isin(materials, held_out))
     if settings.get("drop_last"):
         batch = settings["batch"]
         assert isinstance(batch, int)
         for sensor in np.unique(sensors):
             rows = np.flatnonzero(sensors == sensor)
-            counted[rows[len(rows) // batch * batch :]] = False
-    return counted
+            mask[rows[len(rows) // batch * batch :]] = False
+    return mask

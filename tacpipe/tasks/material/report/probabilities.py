@@ -54,14 +54,14 @@ def probability_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return reliability charts and curves of unknown for calibrated models; empty if there are none."""
     reliable, refused, rows = [], [], []
     for sensor in sensors_of(methods):
-        calibrated = [(method, read) for method in methods if (read := read_answers(method, sensor)) is not None]
+        calibrated = [(method, answers) for method in methods if (answers := read_answers(method, sensor)) is not None]
         reliable += [
-            _reliability_chart(f"{sensor_title(sensor)}: {method.name}", method, sensor, read)
-            for method, read in calibrated
+            _reliability_chart(f"{sensor_title(sensor)}: {method.name}", method, sensor, answers)
+            for method, answers in calibrated
         ]
-        curves = [(method.name, read) for method, read in calibrated if {True, False} <= set(read.known)]
+        curves = [(method.name, answers) for method, answers in calibrated if {True, False} <= set(answers.known)]
         refused += [_unknown_chart(sensor_title(sensor), curves)] if curves else []
-        rows += [_table_row(method, sensor, read) for method, read in calibrated]
+        rows += [_table_row(method, sensor, answers) for method, answers in calibrated]
     heads = (
         "",
         "slides",
@@ -93,13 +93,13 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
         if ANSWERS not in files:
             continue
         text = dict.fromkeys(("recording", "sensor", "named", "answer", "label"), str)
-        read = pd.read_csv(io.BytesIO(files[ANSWERS]), dtype=text, keep_default_na=False)
-        read = read[(read.sensor == sensor) & ~read.seen]
+        answers = pd.read_csv(io.BytesIO(files[ANSWERS]), dtype=text, keep_default_na=False)
+        answers = answers[(answers.sensor == sensor) & ~answers.seen]
         rows = run.details.predictions.of(sensor)
         truth = dict(zip(rows.recordings.tolist(), map(str, rows.named(rows.materials).tolist()), strict=True))
-        counted = read.recording.isin(truth) | ~read.known  # known materials: slides as elsewhere on the page
-        read = read[counted].assign(run=number_of, refused=read.answer == UNKNOWN)
-        parts.append(read.assign(right=read.named == read.recording.map(truth)))
+        is_counted = answers.recording.isin(truth) | ~answers.known  # known materials: slides as elsewhere on the page
+        answers = answers[is_counted].assign(run=number_of, refused=answers.answer == UNKNOWN)
+        parts.append(answers.assign(right=answers.named == answers.recording.map(truth)))
     return pd.concat(parts) if parts else None
 
 
@@ -137,9 +137,9 @@ def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
     return curve
 
 
-def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFrame) -> Chart:
+def _reliability_chart(title: str, method: Method, sensor: str, answers: pd.DataFrame) -> Chart:
     """Return a chart of accuracy by predicted probability, before and after the temperature."""
-    known_rows = read[read.known].sort_values("probability", kind="stable")
+    known_rows = answers[answers.known].sort_values("probability", kind="stable")
     bins = np.array_split(
         np.arange(len(known_rows)), int(np.clip(len(known_rows) // MIN_BIN_COUNT, 1, calibration.BINS))
     )
@@ -162,8 +162,8 @@ def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float
     for run in runs_on(method, sensor):
         tree = run.details.metrics.get("calibration", {}).get(sensor, {}).get("before", {})
         for bin_tree in tree.get("reliability", []):
-            place = min(int(bin_tree["confidence"] * calibration.BINS), calibration.BINS - 1)
-            total = sums.setdefault(place, [0.0, 0.0, 0.0])
+            bin_index = min(int(bin_tree["confidence"] * calibration.BINS), calibration.BINS - 1)
+            total = sums.setdefault(bin_index, [0.0, 0.0, 0.0])
             for at, value in enumerate((1.0, bin_tree["confidence"], bin_tree["accuracy"])):
                 total[at] += bin_tree["n"] * value
     return [(probability / n, right / n) for _, (n, probability, right) in sorted(sums.items())]
@@ -171,25 +171,27 @@ def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float
 
 def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]]) -> Chart:
     """Return a chart of true-unknown against false-unknown rates, with the thresholds."""
-    drawn, points = [], []
-    for name, read in chart_lines:
+    lines, points = [], []
+    for name, answers in chart_lines:
         loss_curves = []
-        for _, run_rows in read.groupby("run"):
+        for _, run_rows in answers.groupby("run"):
             known_scores, unknown = (run_rows.score[run_rows.known == flag].to_numpy(float) for flag in (True, False))
             if len(known_scores) and len(unknown):
                 loss_curves.append(100 * unknown_curve(known_scores, unknown))
         runs = np.stack(loss_curves)
         low, high = (runs.min(axis=0), runs.max(axis=0)) if len(runs) > 1 else (None, None)
-        drawn.append(Curve(name, 100 * RATES, runs.mean(axis=0), low, high))
-        lost, unknown_rate = (100 * rate_of(read[read.known == flag], "refused").fraction for flag in (True, False))
+        lines.append(Curve(name, 100 * RATES, runs.mean(axis=0), low, high))
+        lost, unknown_rate = (
+            100 * rate_of(answers[answers.known == flag], "refused").fraction for flag in (True, False)
+        )
         points.append((name, lost, unknown_rate))
     x, y = "slides of known materials answered unknown (%)", "slides of unknown materials answered unknown (%)"
-    spec = charts.lines(drawn, x, y, diagonal=(0, 100), points=False, height=260)
+    spec = charts.lines(lines, x, y, diagonal=(0, 100), points=False, height=260)
     spec["layer"].append(charts.marked(points, x, y))
     return Chart(f"Unknown: {sensor}", spec)
 
 
-def _table_row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str | Cell]:
+def _table_row(method: Method, sensor: str, answers: pd.DataFrame) -> Sequence[str | Cell]:
     """Return a row of the table."""
     trees = [run.details.metrics for run in runs_on(method, sensor)]
     measured = [tree["calibration"][sensor] for tree in trees if sensor in tree.get("calibration", {})]
@@ -202,7 +204,7 @@ def _table_row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str 
         before, after = (float(np.mean([tree[when][measure] for tree in measured])) for when in ("before", "after"))
         return Cell(number(after, 3).text, f"{number(before, 3).text} as trained", after)
 
-    known_rows, unknown_rows = read[read.known], read[~read.known]
+    known_rows, unknown_rows = answers[answers.known], answers[~answers.known]
     return [
         f"{sensor_title(sensor)}: {method.name}",
         f"{known_rows.recording.nunique():,}",
@@ -214,10 +216,10 @@ def _table_row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str 
     ]
 
 
-def _rate_cell(counted: Rate) -> Cell:
+def _rate_cell(rate: Rate) -> Cell:
     """Return a fraction in percent above its interval."""
-    if not counted.slides:
+    if not rate.slides:
         return Cell(NONE)
-    ends = "" if np.isnan(counted.low) else f"{100 * counted.low:.1f} to {100 * counted.high:.1f} "
-    below = f"{ends}of {counted.slides:,}"
-    return Cell(f"{100 * counted.fraction:.1f}", below, counted.fraction)
+    ends = "" if np.isnan(rate.low) else f"{100 * rate.low:.1f} to {100 * rate.high:.1f} "
+    below = f"{ends}of {rate.slides:,}"
+    return Cell(f"{100 * rate.fraction:.1f}", below, rate.fraction)

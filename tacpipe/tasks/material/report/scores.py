@@ -57,10 +57,10 @@ def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL
     1 is perfect, 0 is no better than the time-averaged channels.
     """
     comparable = [run for run in runs if {LEVEL, predictor} <= set(run.details.predictions.predicted)]
-    counted, level = (accuracy(comparable, sensor, name) for name in (predictor, LEVEL))
-    if counted is None or level is None or level.fraction == 1:
+    result, level = (accuracy(comparable, sensor, name) for name in (predictor, LEVEL))
+    if result is None or level is None or level.fraction == 1:
         return float("nan")
-    return 1 - (1 - counted.fraction) / (1 - level.fraction)
+    return 1 - (1 - result.fraction) / (1 - level.fraction)
 
 
 def slides_named_right(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> pd.Series:
@@ -202,11 +202,9 @@ def format_percent(fraction: float) -> str:
     return fixed(100 * fraction, 1)
 
 
-def accuracy_cell(counted: Accuracy | None) -> Cell:
+def accuracy_cell(result: Accuracy | None) -> Cell:
     """Return a cell with an accuracy and its standard deviation over runs, above its counts and interval."""
-    return (
-        count_cell(counted.correct, counted.evaluated, counted.low, counted.high, counted.sd) if counted else Cell(NONE)
-    )
+    return count_cell(result.correct, result.evaluated, result.low, result.high, result.sd) if result else Cell(NONE)
 
 
 def count_cell(correct: int, evaluated: int, low: float, high: float, sd: float) -> Cell:

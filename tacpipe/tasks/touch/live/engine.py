@@ -40,16 +40,16 @@ def requested_grasps(record: Any) -> list[Grasp]:
     return candidates
 
 
-def requested_cloud(record: Any, folder: str, before: Cloud | None) -> Cloud:
+def requested_cloud(record: Any, folder: str, previous: Cloud | None) -> Cloud:
     """Return the cloud of a request: its inline points, a file in ``folder``, or ``before``, the previous request's cloud.
 
     Raises `TacpipeError` if there is no cloud or it cannot be read.
     """
     points_or_file = record.get("cloud")
     if points_or_file is None:
-        if before is None:
+        if previous is None:
             raise TacpipeError("The request has no cloud, and no request before had one.")
-        return before
+        return previous
     if isinstance(points_or_file, str):
         return _file(points_or_file, folder)
     points = np.array(points_or_file, np.float64)
@@ -133,9 +133,9 @@ def criterion_levels(touches: Sequence[PredictedReading]) -> Floats:
     by_finger = np.full((len(touches), 2), np.nan)
     for row, touch in enumerate(touches):
         for column, finger in enumerate(("th", "mf")):
-            pressed = biotac_sp.normalise(f"pdc_{finger}", np.array([getattr(touch, f"pdc_{finger}")]))
-            fallen = 1 - biotac_sp.normalise(f"e_{finger}", getattr(touch, f"e_{finger}"))
-            parts = np.array([pressed.mean(), fallen.mean()])
+            pressure = biotac_sp.normalise(f"pdc_{finger}", np.array([getattr(touch, f"pdc_{finger}")]))
+            contact = 1 - biotac_sp.normalise(f"e_{finger}", getattr(touch, f"e_{finger}"))
+            parts = np.array([pressure.mean(), contact.mean()])
             finite = np.isfinite(parts)
             by_finger[row, column] = parts[finite].mean() if finite.any() else np.nan
     return by_finger
@@ -148,9 +148,9 @@ def rank_grasps(scores: Floats) -> list[int]:
     [2, 1, 3]
     """
     order = np.argsort(-scores, kind="stable")
-    places = np.empty(len(scores), np.int64)
-    places[order] = np.arange(1, len(scores) + 1)
-    return places.tolist()
+    ranks = np.empty(len(scores), np.int64)
+    ranks[order] = np.arange(1, len(scores) + 1)
+    return ranks.tolist()
 
 
 WAITING = 16  # maximum number of queued requests; older ones are dropped
@@ -223,18 +223,18 @@ class TouchEngine(Engine):
 
     def _answered(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
         began_s = time.perf_counter()
-        about = (self.next_seq(), t_ns, int(record["request"]), self._criterion.text)
+        header = (self.next_seq(), t_ns, int(record["request"]), self._criterion.text)
         try:
             cloud = requested_cloud(record, self.requests[stream].folder, self._clouds.get(stream))
             self._clouds[stream] = cloud
             touches = self._predictor.predict_all(cloud, requested_grasps(record))
         except TacpipeError as error:
-            return TouchMessage(*about, cause=str(error), skipped=self.skipped)
+            return TouchMessage(*header, cause=str(error), skipped=self.skipped)
         levels = criterion_levels(touches)
         scores = self._criterion.score(levels)
         ranks = tuple(rank_grasps(scores))
         message = TouchMessage(
-            *about, values(touches), levels, scores, ranks, made_from_t_ns=t_ns, skipped=self.skipped
+            *header, values(touches), levels, scores, ranks, made_from_t_ns=t_ns, skipped=self.skipped
         )
         message.compute_ms = (time.perf_counter() - began_s) * 1e3
         return message

@@ -63,13 +63,13 @@ class TouchReport(TaskReport):
             (
                 "R²",
                 cell(
-                    lambda scored: Cell(blocks.fixed(scored.r2, 2), value=None if math.isnan(scored.r2) else scored.r2)
+                    lambda result: Cell(blocks.fixed(result.r2, 2), value=None if math.isnan(result.r2) else result.r2)
                 ),
             ),
-            ("skill over the constant", cell(lambda scored: blocks.interval(*scored.skill))),
-            ("RMSE over runs", cell(lambda scored: blocks.with_sd(scored.each.mean, scored.each.sd))),
-            ("batch mean", cell(lambda scored: Cell(blocks.fixed(scored.batch_mean, 4), value=scored.batch_mean))),
-            ("MAE (counts)", cell(lambda scored: blocks.number(predictions.to_counts(scored.target, scored.mae), 3))),
+            ("skill over the constant", cell(lambda result: blocks.interval(*result.skill))),
+            ("RMSE over runs", cell(lambda result: blocks.with_sd(result.each.mean, result.each.sd))),
+            ("batch mean", cell(lambda result: Cell(blocks.fixed(result.batch_mean, 4), value=result.batch_mean))),
+            ("MAE (counts)", cell(lambda result: blocks.number(predictions.to_counts(result.target, result.mae), 3))),
         ]
 
     def sentence(self, context: Context) -> tuple[str, str]:
@@ -96,10 +96,10 @@ class TouchReport(TaskReport):
         folds: list[Fold] = []
         for group in groups:
             result = group[0].details[0]
-            place = f": {describe_split(result.split, result.simulated)}" if len(groups) > 1 else ""
-            folds += blocks.fold(f"By object{place}", *tables_by_object(group))
-            drawn = figures.loss_charts(group)
-            folds += blocks.fold(f"Training{place}", Charts(drawn)) if drawn else []
+            suffix = f": {describe_split(result.split, result.simulated)}" if len(groups) > 1 else ""
+            folds += blocks.fold(f"By object{suffix}", *tables_by_object(group))
+            curves = figures.loss_charts(group)
+            folds += blocks.fold(f"Training{suffix}", Charts(curves)) if curves else []
         published = all(grasp.published for grasp in methods)
         paper = [*setting_tables(methods), *generalisation_tables(methods), *figures.figure_8(methods)]
         return [
@@ -130,10 +130,10 @@ class TouchReport(TaskReport):
         rsquared = []
         for known_objects in (True, False):
             for target in run.details.predictions.targets:
-                scored = predictions.score([run.details.predictions], target, known_objects)
+                result = predictions.score([run.details.predictions], target, known_objects)
                 rsquared += (
-                    [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(scored.r2, 2)}"]
-                    if scored
+                    [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(result.r2, 2)}"]
+                    if result
                     else []
                 )
         return {

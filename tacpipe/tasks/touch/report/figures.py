@@ -41,8 +41,10 @@ MAX_GRASPS = 800  # maximum number of grasps in a figure
 def pressure_folds(method: Method) -> list[Fold]:
     """Return one chart per finger for the first run; empty if the method predicts no pressure."""
     rows = method.details[0].predictions
-    drawn = [_pressure_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)]
-    return fold("The pressure, predicted and true", Charts(drawn), about=method.name) if drawn else []
+    figures = [
+        _pressure_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)
+    ]
+    return fold("The pressure, predicted and true", Charts(figures), about=method.name) if figures else []
 
 
 def _pressure_chart(method: Method, target: str) -> Chart:
@@ -98,12 +100,12 @@ def electrode_folds(method: Method) -> list[Fold]:
     fingers = [target for target in FINGERS if target in predicted_targets(method)]
     if not fingers:
         return []
-    drawn = [part for known_objects in (True, False) if (part := _r2_chart(method, fingers, known_objects))]
+    figures = [part for known_objects in (True, False) if (part := _r2_chart(method, fingers, known_objects))]
     rows = method.details[0].predictions
     pairs = [_true_and_predicted(rows, grasp, fingers) for grasp in choose_grasps(rows)]
     return fold(
         "Electrodes",
-        Charts(drawn),
+        Charts(figures),
         SmallPrint(FINGERTIPS),
         *pairs,
         SmallPrint(COLOURS) if pairs else None,
@@ -127,8 +129,10 @@ def choose_grasps(rows: GraspPredictions) -> list[DrawnGrasp]:
     ]
     error = np.sqrt(np.hstack(squared).mean(axis=1))
     order = np.lexsort((rows.recordings, error))
-    places = [(place, int(order[round(place_fraction * (len(order) - 1))])) for place, place_fraction in PLACES.items()]
-    return [DrawnGrasp(place, row, str(rows.recordings[row]), float(error[row])) for place, row in places]
+    rows_by_title = [
+        (title, int(order[round(place_fraction * (len(order) - 1))])) for title, place_fraction in PLACES.items()
+    ]
+    return [DrawnGrasp(title, row, str(rows.recordings[row]), float(error[row])) for title, row in rows_by_title]
 
 
 def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
@@ -154,11 +158,11 @@ def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequ
         finger = methods.FINGER_NAMES[target]
         true, predicted = (touch[target][grasp.row] for touch in (rows.true, rows.predicted[MODEL]))
         constant = rows.predicted.get(CONSTANT, {}).get(target)
-        usual = rows.true[target].mean(axis=0) if constant is None else constant[grasp.row]
-        widest = float(np.abs(true - usual).max()) or 1.0
+        reference = rows.true[target].mean(axis=0) if constant is None else constant[grasp.row]
+        widest = float(np.abs(true - reference).max()) or 1.0
         for title, values in (("true", true), ("predicted", predicted)):
             tips += fingertip(
-                f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
+                f"{finger}, {title}", (reference - values) / widest, [f"{value:.0f}" for value in values], "Counts"
             )
         errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
     part = headlines.PARTS[bool(rows.known[grasp.row])].removesuffix("s")
@@ -170,11 +174,11 @@ def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequ
 
 def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[charts.DataRow]:
     """Return the electrodes of one fingertip with its skin unrolled, tip up, coloured from -1 to 1."""
-    places = 1000 * biotac_sp.unrolled_positions_m()[:, ::-1]  # (electrode, across and along), mm
+    positions_mm = 1000 * biotac_sp.unrolled_positions_m()[:, ::-1]  # (electrode, across and along), mm
     return [
         {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
          "Electrode": number, quantity: text}
-        for number, ((x, y), part, text) in enumerate(zip(places, strength, texts, strict=True), 1)
+        for number, ((x, y), part, text) in enumerate(zip(positions_mm, strength, texts, strict=True), 1)
     ]  # fmt: skip
 
 
@@ -210,9 +214,9 @@ def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[
     if not shards:
         return []
     first = dict.fromkeys(sorted(shards)[:MAX_CLOUDS], "")
-    described = {name: words for name, words in chosen.items() if name in shards} or first
-    drawn = [_cloud_chart(shards[name], words) for name, words in described.items()]
-    return fold("Clouds and their grasps", Charts(drawn), SmallPrint(CLOUD_COLOURS))
+    descriptions = {name: words for name, words in chosen.items() if name in shards} or first
+    figures = [_cloud_chart(shards[name], words) for name, words in descriptions.items()]
+    return fold("Clouds and their grasps", Charts(figures), SmallPrint(CLOUD_COLOURS))
 
 
 def _has_grasp(shard: Recording) -> bool:
@@ -256,7 +260,7 @@ UNWATCHED = (
 
 def loss_charts(methods: Sequence[Method]) -> list[Chart]:
     """Return validation losses of one method per architecture, one chart per target; empty if no run has epochs."""
-    drawn, shown_methods = [], one_per_architecture(methods)
+    figures, shown_methods = [], one_per_architecture(methods)
     for target in (*biotac_sp.TARGETS, ALL):
         curves = context.curves_of_methods(
             shown_methods, functools.partial(losses_by_epoch, target=target, name="val_loss")
@@ -265,8 +269,10 @@ def loss_charts(methods: Sequence[Method]) -> list[Chart]:
             name = headlines.TARGETS.get(target, "one network for all targets")
             spec = context.loss_chart(curves, "validation loss", log=True)
             caption = "Each method's own loss. Thick: mean over runs; thin: single runs."
-            drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched_note(shown_methods)}"))
-    return drawn
+            figures.append(
+                Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched_note(shown_methods)}")
+            )
+    return figures
 
 
 def figure_8(methods: Sequence[Method]) -> list[Chart]:
@@ -287,9 +293,9 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     curves = {name: described for name, loss in loss_names.items() if (described := _loss_curves(method, target, loss))}
     quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
     text = f"training and validation loss by epoch, {method.name}, {headlines.TARGETS.get(target, 'all targets')}"
-    printed = " The paper's figure has 1,000 epochs." if method.published else ""
+    note = " The paper's figure has 1,000 epochs." if method.published else ""
     caption = (
-        f"{describe_training([method])}{printed}{_unwatched_note([method])}{' Simulated.' if method.simulated else ''}"
+        f"{describe_training([method])}{note}{_unwatched_note([method])}{' Simulated.' if method.simulated else ''}"
     )
     return [
         Chart(blocks.form("Figure 8", text, method.published), context.loss_chart(curves, quantity, log=True), caption)
@@ -304,8 +310,10 @@ def losses_by_epoch(result: TouchResult, target: str, name: str) -> list[float]:
     networks: dict[object, list[float]] = {}
     for line in result.history:
         if line.get("target", ALL) == target:
-            described = line.get("val_loss") if name == "val_loss" else line.get("train_loss")
-            networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
+            epoch_loss = line.get("val_loss") if name == "val_loss" else line.get("train_loss")
+            networks.setdefault(line.get("network"), []).append(
+                float("nan") if epoch_loss is None else float(epoch_loss)
+            )
     length = min(map(len, networks.values()), default=0)
     mean = [
         sum(values) / len(values)

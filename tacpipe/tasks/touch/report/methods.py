@@ -87,12 +87,18 @@ def method_names(results: Sequence[TouchResult]) -> list[str]:
     runs, settings_by_key = Counter(keys), {key: settings.settings for key, settings in zip(keys, results, strict=True)}
     names_by_key: dict[str, str] = {}
     for architecture in {settings.architecture for settings in results}:
-        same = {key: settings for key, settings in settings_by_key.items() if settings["architecture"] == architecture}
-        usual = _most_common_settings([(settings, runs[key]) for key, settings in same.items()])
-        distinct = distinct_names([(architecture, settings) for settings in same.values()], usual)
+        settings_of_architecture = {
+            key: settings for key, settings in settings_by_key.items() if settings["architecture"] == architecture
+        }
+        common_settings = _most_common_settings(
+            [(settings, runs[key]) for key, settings in settings_of_architecture.items()]
+        )
+        distinct = distinct_names(
+            [(architecture, settings) for settings in settings_of_architecture.values()], common_settings
+        )
         names_by_key |= {
             key: " · ".join([*_first_names(settings), *marks(differing)])
-            for (key, settings), (_, differing) in zip(same.items(), distinct, strict=True)
+            for (key, settings), (_, differing) in zip(settings_of_architecture.items(), distinct, strict=True)
         }
     return [names_by_key[key] for key in keys]
 
@@ -108,13 +114,13 @@ def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
         by_split.setdefault((result.split, result.simulated), []).append(result)
 
     def place(key: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
-        same = by_split[key]
-        targets = {target for result_of_split in same for target in result_of_split.predictions.targets}
+        results_of_split = by_split[key]
+        targets = {target for result_of_split in results_of_split for target in result_of_split.predictions.targets}
         return (
             key[1],
-            all(result_of_split.architecture != DEFAULT for result_of_split in same),
+            all(result_of_split.architecture != DEFAULT for result_of_split in results_of_split),
             -len(targets),
-            -len(same),
+            -len(results_of_split),
             key[0],
         )
 
@@ -146,10 +152,10 @@ def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
             result_of_split.name,
         )
 
-    chosen: dict[str, Method] = {}
+    by_architecture: dict[str, Method] = {}
     for candidate in sorted(methods, key=place):
-        chosen.setdefault(str(candidate.settings["architecture"]), candidate)
-    return sorted(chosen.values(), key=lambda candidate: candidate.name)
+        by_architecture.setdefault(str(candidate.settings["architecture"]), candidate)
+    return sorted(by_architecture.values(), key=lambda candidate: candidate.name)
 
 
 def predicted_targets(*methods: Method) -> tuple[str, ...]:
@@ -175,7 +181,7 @@ def _most_common_settings(settings_and_runs: Sequence[tuple[Settings, int]]) -> 
 
     Splits and simulated grasps are never marked, because they have their own headings. Colour is part of the base name.
     """
-    usual = []
+    common_settings = []
     for name in sorted({name for settings, _ in settings_and_runs for name in settings}):
         values_and_runs = [(settings[name], runs) for settings, runs in settings_and_runs if name in settings]
         values = [value for value, _ in values_and_runs]
@@ -184,8 +190,8 @@ def _most_common_settings(settings_and_runs: Sequence[tuple[Settings, int]]) -> 
             for candidate in values
         ]
         usual_values = values if name in (*USUAL, "colour", SHORTENED) else [values[weights.index(max(weights))]]
-        usual += [(name, value) for value in usual_values]
-    return usual
+        common_settings += [(name, value) for value in usual_values]
+    return common_settings
 
 
 EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # values of all tables in the paper; Figure 8 has 1,000 epochs
@@ -207,10 +213,10 @@ def caution(methods: Sequence[Method]) -> str:
     if methods and all(method.simulated for method in methods):
         return context.SIMULATED
     counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]
-    same, follow_any = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    follow_same, follow_any = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     return (
-        RECORDED.format(same=f"{same:,}", all=f"{follow_any:,}")
-        if follow_any and same / follow_any >= MAX_IN_A_ROW
+        RECORDED.format(same=f"{follow_same:,}", all=f"{follow_any:,}")
+        if follow_any and follow_same / follow_any >= MAX_IN_A_ROW
         else ""
     )
 
@@ -256,12 +262,12 @@ def describe_schedule(run: TouchResult) -> str:
         return "fitted without epochs"
     params = run.params
     epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
-    described = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
+    schedule = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
     if run.architecture != PAPER or not run.published:
-        return described
+        return schedule
     if (batch, rate) == (BATCH, LEARNING_RATE) and int(epochs or 0) >= EPOCHS:
-        return f"paper schedule ({described})"
-    return f"quick ({described}; the paper: {EPOCHS}, {BATCH}, {LEARNING_RATE})"
+        return f"paper schedule ({schedule})"
+    return f"quick ({schedule}; the paper: {EPOCHS}, {BATCH}, {LEARNING_RATE})"
 
 
 def describe_training(methods: Sequence[Method]) -> str:
@@ -297,7 +303,7 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
     questions = {}
     for known_objects in (True, False):
         rows = run.predictions.of(known_objects)
-        place = 2 * splits.index((run.split, run.simulated)) + (not known_objects)
+        rank = 2 * splits.index((run.split, run.simulated)) + (not known_objects)
         if not len(rows.recordings):
             continue
         objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
@@ -312,7 +318,7 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
             part = headline.PARTS[known_objects]
             if len(splits) > 1:
                 part += f", {describe_split(run.split, run.simulated)}"
-            questions[Question(part, headline.TARGETS[target], place)] = PredictorErrors(
+            questions[Question(part, headline.TARGETS[target], rank)] = PredictorErrors(
                 measure, sums, None if known_objects else objects
             )
     return ComparedRun(

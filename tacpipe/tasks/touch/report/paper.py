@@ -90,19 +90,19 @@ def tables_by_object(methods: Sequence[Method]) -> list[Table]:
     return [object_table for method in one_per_architecture(methods) if (object_table := _table_by_object(method))]
 
 
-def score_cells(scored: Score | None) -> list[str | Cell]:
+def score_cells(result: Score | None) -> list[str | Cell]:
     """Return the cells of a score in the rows `ROWS`."""
-    if scored is None:
+    if result is None:
         return [NONE] * len(ROWS)
-    error = blocks.with_sd(scored.each.mean, scored.each.sd)
-    counts = f"{predictions.to_counts(scored.target, scored.each.mean):.0f}"
+    error = blocks.with_sd(result.each.mean, result.each.sd)
+    counts = f"{predictions.to_counts(result.target, result.each.mean):.0f}"
     return [
         error,
         counts,
-        blocks.fixed(scored.r2, 2),
-        blocks.interval(*scored.skill),
-        f"{scored.grasps:,}",
-        str(scored.runs),
+        blocks.fixed(result.r2, 2),
+        blocks.interval(*result.skill),
+        f"{result.grasps:,}",
+        str(result.runs),
     ]
 
 
@@ -136,10 +136,10 @@ def _table_by_object(method: Method) -> Table | None:
         for name in sorted(names):
             object_runs = [run.rows(run.objects == name) for run in runs]
             row = [cell for target in predicted for cell in _object_cells(object_runs, target, known_objects)]
-            counted = len({str(recording) for run in object_runs for recording in run.of(known_objects).recordings})
+            grasp_count = len({str(recording) for run in object_runs for recording in run.of(known_objects).recordings})
             if not known_objects:
                 kinds[len(rows)] = "quiet"
-            rows.append([name if known_objects else f"{name} (novel)", f"{counted:,}", *row])
+            rows.append([name if known_objects else f"{name} (novel)", f"{grasp_count:,}", *row])
     if not rows:
         return None
     heads = ["", "grasps", *(part for target in predicted for part in (headlines.TARGETS[target], "skill"))]
@@ -148,11 +148,11 @@ def _table_by_object(method: Method) -> Table | None:
 
 def _object_cells(runs: Sequence[GraspPredictions], target: str, known_objects: bool) -> list[str | Cell]:
     """Return the RMSE on an object with that of the object mean, if any, below it, and the skill over the constant."""
-    scored, mean = (predictions.score(runs, target, known_objects, predictor) for predictor in (MODEL, OBJECT_MEAN))
-    if scored is None:
+    result, mean = (predictions.score(runs, target, known_objects, predictor) for predictor in (MODEL, OBJECT_MEAN))
+    if result is None:
         return [NONE, NONE]
     below = blocks.fixed(mean.rmse, 4) if mean and known_objects else ""
-    return [Cell(blocks.fixed(scored.rmse, 4), below, scored.rmse), blocks.signed(scored.skill.mean)]
+    return [Cell(blocks.fixed(result.rmse, 4), below, result.rmse), blocks.signed(result.skill.mean)]
 
 
 TARGET = "pdc_th"  # target for which the paper compares settings
@@ -239,9 +239,9 @@ ESTIMATED = (
 
 def setting_tables(methods: Sequence[Method]) -> list[Block]:
     """Return the tables with at least two evaluated rows."""
-    described = [block for form in FORMS for block in _setting_table(form, methods)]
+    tables = [block for form in FORMS for block in _setting_table(form, methods)]
     published = all(block.published for block in methods)
-    return [*described, *([SmallPrint(SCALES)] if published and described else [])]
+    return [*tables, *([SmallPrint(SCALES)] if published and tables else [])]
 
 
 def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Method]:
@@ -271,11 +271,11 @@ def _setting_table(form: Form, methods: Sequence[Method]) -> list[Block]:
     if len(by_value) < 2:
         return []
     published = all(item.published for item in by_value.values())
-    described = {value: score_on_target(by_value[value]) if value in by_value else None for value in form.names}
-    best_name = min((item.each.mean, name) for value, name in form.names.items() if (item := described[value]))[1]
-    shown_names = {value: name for value, name in form.names.items() if published or described[value]}
+    scores = {value: score_on_target(by_value[value]) if value in by_value else None for value in form.names}
+    best_name = min((item.each.mean, name) for value, name in form.names.items() if (item := scores[value]))[1]
+    shown_names = {value: name for value, name in form.names.items() if published or scores[value]}
     rows: list[list[str | Cell]] = [
-        [name, *score_cells(described[value]), *(_printed_setting(form, value) if published else [])]
+        [name, *score_cells(scores[value]), *(_printed_setting(form, value) if published else [])]
         for value, name in shown_names.items()
     ]
     kinds = {number: "best" for number, name in enumerate(shown_names.values()) if name == best_name}
@@ -294,9 +294,9 @@ def _setting_table(form: Form, methods: Sequence[Method]) -> list[Block]:
         ORDER if form.drawn and published else "",
     ]
     notes += [ESTIMATED] if any(item.settings.get("wrist") == "estimated" for item in by_value.values()) else []
-    drawn = [_setting_chart(form, described, dict(baselines))] if form.drawn else []
+    figures = [_setting_chart(form, scores, dict(baselines))] if form.drawn else []
     table = blocks.table(f"{title}; {headlines.TARGETS[TARGET]}, known objects", heads, rows, kinds)
-    return [table, *drawn, SmallPrint(" ".join(item for item in notes if item))]
+    return [table, *figures, SmallPrint(" ".join(item for item in notes if item))]
 
 
 def _printed_setting(form: Form, value: object) -> list[str | Cell]:
@@ -304,13 +304,11 @@ def _printed_setting(form: Form, value: object) -> list[str | Cell]:
     return [*cells, *([str(form.printed_s[value])] if form.printed_s else [])]
 
 
-def _setting_chart(
-    form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]
-) -> Chart:
+def _setting_chart(form: Form, scores: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> Chart:
     dots = [
         Dot(name, scored.each.mean, scored.each.mean - sd, scored.each.mean + sd, kind)
         for scores_by_name, kind in (
-            ({form.names[value]: scored for value, scored in described.items()}, "model"),
+            ({form.names[value]: scored for value, scored in scores.items()}, "model"),
             (baselines, "baseline"),
         )
         for name, scored in scores_by_name.items()
@@ -327,11 +325,11 @@ PARTS = ("RMSE over runs", "R²", "skill")
 
 def generalisation_tables(methods: Sequence[Method]) -> list[Block]:
     """Return tables of the paper's network and of the default method, for those that predicted two or more targets."""
-    described = []
+    best_pairs = []
     for architecture in (PAPER, DEFAULT):
         pairs = _pairs([block for block in methods if block.settings["architecture"] == architecture])
-        described.append(max(pairs, key=_pair_order, default=None))
-    return [block for pair in described if pair for block in _generalisation_table(*pair)]
+        best_pairs.append(max(pairs, key=_pair_order, default=None))
+    return [block for pair in best_pairs if pair for block in _generalisation_table(*pair)]
 
 
 def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
@@ -387,18 +385,22 @@ def _generalisation_table(known_method: Method, novel: Method) -> list[Block]:
             ),
             strict=False,
         )
-        for (called, first), (_, second) in baselines:
+        for (title_of_baseline, first), (_, second) in baselines:
             kinds[len(rows)] = "quiet"
             rows.append(
-                [f"· {called.partition(':')[0]}", *_pair_cells(first, second), *([NONE] * 3 if published else [])]
+                [
+                    f"· {title_of_baseline.partition(':')[0]}",
+                    *_pair_cells(first, second),
+                    *([NONE] * 3 if published else []),
+                ]
             )
     heads = ["", *(f"test: {part}" for part in PARTS), *(f"novel: {part}" for part in PARTS), "change (%)"]
     heads += ["paper: test", "paper: novel", "change (%)"] if published else []
     simulated = known_method.simulated or novel.simulated
-    chosen = [known_method] if known_method is novel else [known_method, novel]
-    counted = [max(item.grasps for item in described if item) for described in zip(*pairs, strict=True)]
-    evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
-    note = f"{describe_training(chosen)} {evaluated} {TRAINED_ON if published else ''} {caution(chosen)}"
+    distinct_methods = [known_method] if known_method is novel else [known_method, novel]
+    grasp_counts = [max(item.grasps for item in described if item) for described in zip(*pairs, strict=True)]
+    evaluated = f"Evaluated on {grasp_counts[0]:,} grasps of known and {grasp_counts[1]:,} of novel objects."
+    note = f"{describe_training(distinct_methods)} {evaluated} {TRAINED_ON if published else ''} {caution(distinct_methods)}"
     title = f"{blocks.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known_method.name}"
     return [blocks.table(title, heads, rows, kinds), SmallPrint(note)]
 
@@ -410,10 +412,10 @@ def _pair_cells(test: Score | None, novel: Score | None) -> list[str | Cell]:
     return [*_part_cells(test), *_part_cells(novel), change]
 
 
-def _part_cells(scored: Score | None) -> list[str | Cell]:
+def _part_cells(result: Score | None) -> list[str | Cell]:
     """Return the cells of a score in the columns `PARTS`."""
-    error, counts, *more_cells = score_cells(scored)[: len(PARTS) + 1]
-    return [_above_counts(error, str(counts)) if scored else NONE, *more_cells]
+    error, counts, *more_cells = score_cells(result)[: len(PARTS) + 1]
+    return [_above_counts(error, str(counts)) if result else NONE, *more_cells]
 
 
 def _printed_target(target: str) -> list[str | Cell]:

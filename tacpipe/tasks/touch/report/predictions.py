@@ -43,8 +43,8 @@ class GraspPredictions:
         """Number of grasps that follow one of the same object in time order, and number that follow any grasp."""
         if self.t_ns is None or len(self.t_ns) < 2 or len(set(self.objects.tolist())) < 2:
             return 0, 0
-        ordered = self.objects[np.argsort(self.t_ns, kind="stable")]
-        return int((ordered[1:] == ordered[:-1]).sum()), len(ordered) - 1
+        objects = self.objects[np.argsort(self.t_ns, kind="stable")]
+        return int((objects[1:] == objects[:-1]).sum()), len(objects) - 1
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -55,15 +55,16 @@ class GraspPredictions:
         """Return the rows of known objects, of novel objects, or, with None, of all."""
         return self if known_objects is None else self.rows(self.known == known_objects)
 
-    def rows(self, chosen: AnyArray) -> GraspPredictions:
+    def rows(self, selection: AnyArray) -> GraspPredictions:
         """Return the rows selected by a mask (grasp,) or by indices."""
         predicted = {
-            name: {target: values[chosen] for target, values in touch.items()} for name, touch in self.predicted.items()
+            name: {target: values[selection] for target, values in touch.items()}
+            for name, touch in self.predicted.items()
         }
-        true = {target: values[chosen] for target, values in self.true.items()}
-        t_ns = None if self.t_ns is None else self.t_ns[chosen]
+        true = {target: values[selection] for target, values in self.true.items()}
+        t_ns = None if self.t_ns is None else self.t_ns[selection]
         return GraspPredictions(
-            self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns
+            self.recordings[selection], self.objects[selection], self.known[selection], true, predicted, t_ns
         )
 
 

@@ -41,12 +41,14 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
         len(ordered_splits([electrode_chart for method in methods for electrode_chart in method.details])) > 1
     )
     for method in methods:
-        read = _read_coverage(method)
-        if read is None:
+        coverage_rows = _read_coverage(method)
+        if coverage_rows is None:
             continue
         levels = method.details[0].config["quantiles"]["levels"]
         level = (levels[-1] - levels[0]) / 100
-        parts = [(known_objects, read[read.known == known_objects]) for known_objects in (True, False)]
+        parts = [
+            (known_objects, coverage_rows[coverage_rows.known == known_objects]) for known_objects in (True, False)
+        ]
         evaluated = [(known_objects, rows) for known_objects, rows in parts if len(rows)]
         title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
         heads = (
