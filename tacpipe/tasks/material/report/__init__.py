@@ -106,9 +106,9 @@ class MaterialReport(TaskReport):
 
 
 PAIRED = (
-    "A slide that several runs evaluated counts as the fraction of runs that named it right; the interval is from drawing "
-    "slides anew. McNemar's test takes a slide for right where at least half of the runs are; the t test pairs accuracies "
-    "of the same fold."
+    "A slide that several runs evaluated counts as the fraction of runs that classified it correctly; the interval "
+    "is from resampling slides. For McNemar's test, a slide is correct if at least half of the runs are; the t test "
+    "pairs accuracies of the same fold."
 )
 
 

@@ -209,10 +209,10 @@ def _validation_by_epoch(run: MaterialResult, sensor: str) -> list[float]:
 
 
 LATENT_NOTE = (
-    "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
-    "name is at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
-    "slides of the material that it was paired with, so short lines are what alignment makes. Where permuted pairs have "
-    "lines as short, that sensors lie together is not evidence that they measure the same."
+    "Latents of unseen slides on their first two principal components, computed for both sensors together. A colour "
+    "is a material, with its name at the mean of the first sensor's slides. A line connects this to the mean of the "
+    "other sensor's slides of the paired material, so lines are short if the sensors are aligned. If permuted pairs "
+    "have equally short lines, alignment is not evidence that the sensors measure the same."
 )
 
 

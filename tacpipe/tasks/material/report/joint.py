@@ -311,10 +311,10 @@ def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
 
 
 ZERO_SHOT_NOTE = (
-    "The sensor's own labels and pairs of these materials were kept from training; the other sensor's classifier names them "
-    "from its latents, out of all materials or out of the held-out ones alone. Above chance here, and here alone, is "
-    "evidence of something that the sensors share. Slides of one material are right or wrong together, so the interval "
-    "counts each held-out material once, and neither slides nor runs. "
+    "The sensor's own labels and pairs of these materials were excluded from training; the other sensor's classifier "
+    "predicts them from its latents, among all materials or only among the held-out ones. Only an accuracy above "
+    "chance here is evidence of common information of the sensors. Slides of one material are not independent, so "
+    "the interval counts held-out materials, and neither slides nor runs. "
 )
 
 

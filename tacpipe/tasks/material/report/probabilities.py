@@ -25,14 +25,14 @@ UNKNOWN = "unknown"  # answer for a slide that resembles no learned material
 MIN_BIN_COUNT = 20  # minimum number of answers per bin of predicted probability
 RATES = np.linspace(0, 1, 101)  # false-unknown rates at which curves are averaged over runs
 RELIABLE = (
-    "Right against stated, in bins of as many slides each: on the thin line probabilities are frequencies. As trained: in "
-    "bins of the same width. Shaded: 95 % (Wilson) over slides, each counted once."
+    "Accuracy against predicted probability, in bins with equal numbers of slides; on the thin line probabilities "
+    "are frequencies. As trained: in bins of equal width. Shaded: 95 % (Wilson) over slides, each counted once."
 )
 TABLE = (
-    "False unknown: slides of known materials answered unknown. False known: slides of materials that were left out, given "
-    "a name. Right: of the names given to slides of known materials. 95 % intervals are Wilson's over slides, each counted "
-    "once, and of false known over materials, where these are six or more; calibration error, log loss and AUROC are means "
-    "over runs."
+    "False unknown: slides of known materials answered unknown. False known: slides of left-out materials assigned "
+    "to a class. Right: accuracy among the assigned slides of known materials. 95 % intervals are Wilson's over "
+    "slides, each counted once, and for false known over materials, if there are six or more; calibration error, log "
+    "loss and AUROC are means over runs."
 )
 REFUSED = (
     "Each threshold answers some slides of known materials with unknown, and some of materials that were left out of "

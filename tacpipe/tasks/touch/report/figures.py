@@ -76,9 +76,9 @@ def _pressure_chart(method: Method, target: str) -> Chart:
 FINGERS = ("e_th", "e_mf")
 PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # title -> quantile of the error
 FINGERTIPS = (
-    "Fingertips are seen on the pad, the skin rolled out flat, the tip up. R² is about the mean of these grasps: 1 is "
-    "perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact lies on a few electrodes: a mean over 24 "
-    "hides them."
+    "Fingertips are seen from the pad, with the skin unrolled and the tip up. R² is relative to the mean of these "
+    "grasps: 1 is perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact covers few electrodes: a "
+    "mean over 24 hides them."
 )
 COLOURS = (
     "Counts. Blue: lower than the constant, which is the mean of training grasps, so pressed more; orange: higher."
@@ -195,8 +195,8 @@ NEAR_MM = 10.0  # distance to a contact point that is highlighted; a fingertip h
 POINTS = 700  # number of drawn points per cloud
 VIEWS = {"from the camera": 0, "from the side": 2}  # view -> index of the horizontal axis; y is vertical
 CLOUD_COLOURS = (
-    "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the cloud, "
-    "though a finger may touch it."
+    "Blue points are near the first contact, orange ones near the second. The cloud contains only what the camera "
+    "saw, though a finger may touch other parts."
 )
 
 

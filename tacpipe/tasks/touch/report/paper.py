@@ -71,8 +71,8 @@ TEST_AND_NOVEL: Mapping[str, Final] = {  # Figures 10 and 11
     "e_mf": Final(0.05922, 195, 0.10317, 340, 74),
 }
 TRAINED_ON = (
-    "The paper's columns are of RGBPose, trained on 9,000 grasps of its 12 objects (12,000 for novel ones), ours of what "
-    "these runs read and were trained on, and a constant's error on the two sets differs."
+    "The paper's columns are of RGBPose, trained on 9,000 grasps of its 12 objects (12,000 for novel ones). Ours are "
+    "for the inputs and training grasps of these runs, and the error of a constant differs between the two sets."
 )
 SCALES = (
     "The paper's RMSE of one network on the thumb's pressure is 0.01141 in cross-validation (Tables III and IV) and "
@@ -232,8 +232,8 @@ ORDER = (
 )
 
 ESTIMATED = (
-    "How the wrist was turned was not recorded: where it is read here, it is estimated from the two contacts and the "
-    "line of sight, and states nothing that these do not."
+    "The wrist rotation was not recorded: if it is an input here, it is estimated from the two contacts and the line "
+    "of sight, and adds no information to them."
 )
 
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 NAMES = {MODEL: "model", CONSTANT: "constant", OBJECT_MEAN: "mean of the object"}
 EXPLAINED = (
-    "A band holds as often as it states if its coverage lies on the dashed line. Intervals are over grasps of known "
-    "objects, and over novel objects; the baselines have the quantiles of their own errors in training. The narrowest "
-    "band of the right coverage is best, which the pinball loss measures (lower is better)."
+    "A band has its nominal coverage if it is on the dashed line. Intervals are over grasps of known objects, and "
+    "over novel objects; the baselines have the quantiles of their own training errors. The narrowest band with the "
+    "right coverage is best, as measured by the pinball loss (lower is better)."
 )
 ELECTRODES = "Coverage in percent. Blue: more than asked for; orange: less."
 STRONGEST = 0.2  # coverage error with the most saturated colour
