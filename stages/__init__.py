@@ -1,6 +1,6 @@
-"""The built-in stages: the first plug-in, found through entry points like any other."""
+"""Built-in stages, registered through entry points like those of any other plug-in."""
 
-COMMANDS = {  # in the order of `tacpipe --help`; "" where the docstring of the module has the line
+COMMANDS = {  # in the order of `tacpipe --help`; "" if the docstring of the module contains the line
     "ingest": "",
     "simulate": "",
     "extract": "",

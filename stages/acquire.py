@@ -1,8 +1,8 @@
 """Record every stream of a rig.
 
-A rig file names the streams. Each recording is appended to the dataset of ``-o``: ``--trials`` of them, which a key, a
-contact or a tap may start and stop. The bytes of the devices are on disk at once; recordings that a crash cut off are
-completed by the next ``acquire``, or with ``--recover``.
+A rig file names the streams. Each recording is appended to the dataset of ``-o``. ``--trials`` sets the number of
+recordings, which a key, a contact or a tap can start and stop. Device bytes are written to disk immediately; recordings
+that a crash interrupted are completed by the next ``acquire``, or with ``--recover``.
 
 Example: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork
 """
@@ -25,7 +25,7 @@ DRY_RUN_S = 3.0
 
 
 def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
-    """Record the trials of a plan and return the recordings, and a sentence for each stream that was lost."""
+    """Record the trials of a plan. Returns the recordings, and a message for each stream that was lost."""
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, trials, triggers
@@ -52,7 +52,10 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
 
 
 def recover(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal the spools that earlier processes of this user left; return the recordings and the number not sealed."""
+    """Complete the recordings from spools of earlier processes of this user.
+
+    Returns the recordings, and the number of spools that could not be completed.
+    """
     from tacpipe.recording import trials
 
     sealed: list[Recorded] = []
@@ -69,7 +72,7 @@ def recover(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Rec
 
 
 def report_spools_of_others(store: Store) -> None:
-    """Print the owners of the spools that other users left in a shared store."""
+    """Print the owners of spools that other users left in a shared store."""
     from tacpipe.recording import trials
 
     for folder, owner in trials.spools_of_others(store).items():
@@ -77,9 +80,9 @@ def report_spools_of_others(store: Store) -> None:
 
 
 def measure(rig: Rig) -> dict[str, Figures]:
-    """Open every stream for `DRY_RUN_S` and return its figures by name; nothing is recorded.
+    """Open every stream for `DRY_RUN_S` without recording, and return its figures by name.
 
-    Raises `DeviceError` for streams that do not open or send nothing.
+    Raises `DeviceError` if streams do not open or send nothing.
     """
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import clock

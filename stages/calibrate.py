@@ -1,11 +1,11 @@
 """Measure how uncertain a trained model is.
 
 Writes the model with its uncertainty. A model of forecasts or of touch gets quantiles. They are fitted to its errors on
-training recordings and corrected on calibration recordings, so that bands have their stated coverage. A classifier gets
-probabilities that are frequencies, and a threshold for the answer ``unknown``. The predictions do not change.
+training recordings and corrected on calibration recordings, so that bands have their nominal coverage. A classifier
+gets calibrated probabilities, and a threshold for the answer ``unknown``. The predictions do not change.
 
-Calibration recordings have the role calibration in the split, which `tacpipe split --calibration` gives; without any, those
-with the role val. Recordings that the model learned from are refused.
+Calibration recordings have the role calibration in the split, which `tacpipe split --calibration` assigns. If there are
+none, those with the role val are used. Recordings that the model was trained on are refused.
 
 Example: tacpipe calibrate models/forward data/segments --split data/split -o models/forward-calibrated
 """
@@ -27,19 +27,19 @@ LEVELS = CommaList(PositiveInt, min_items=1)
 
 @dataclass(frozen=True)
 class Params:
-    """How a model is to state its uncertainty."""
+    """Uncertainty of a model."""
 
     quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50
     # quantiles: widen bands until their coverage in a new recording is at least their level; else on average
     promise: bool = False
-    # classifiers: fraction of recordings of known classes that may be answered unknown
+    # classifiers: fraction of recordings of known classes that may be classified as unknown
     false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05
-    seed: Seed = 0  # random seed of what is fitted
+    seed: Seed = 0  # random seed of the fit
 
 
 @stage(version=4)
 def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None) -> Result:
-    """Return the model's files and what states its uncertainty."""
+    """Return the files of the model with its uncertainty."""
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
     from tacpipe.plugins.stage import Result

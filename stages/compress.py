@@ -1,8 +1,9 @@
 """Compress tactile channels to a few latents.
 
-They are fitted on the training recordings only, and added as columns ``z00``, ``z01``, …; all other columns and rows
-stay. Channels are those whose field metadata states ``quantity=tactile``; their rest level is taken off before.
-``codec.json`` and ``codec.safetensors`` hold what is needed to go back to counts, and how much is lost on the way.
+Codecs are fitted only on the training recordings. Latents are added as columns ``z00``, ``z01``, …; all other columns
+and rows stay. The channels are those with ``quantity=tactile`` in their field metadata, minus their rest level.
+``codec.json`` and ``codec.safetensors`` contain what is needed to decode latents to counts, and the reconstruction
+error.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ Representation = Annotated[Literal["levels", "increments"], StoredAs("of")]
 
 @dataclass(frozen=True)
 class Params:
-    """How many latents to keep, and of what."""
+    """Number and source of the latents."""
 
-    components: PositiveInt = 20  # latents to keep, at most the number of channels; the paper kept 20
-    # keep as many latents as hold this fraction of the variance instead; 0: as many as components states
+    components: PositiveInt = 20  # number of latents, at most the number of channels; the paper kept 20
+    # keep as many latents as explain this fraction of the variance instead; 0: keep the number in components
     variance: Annotated[float, Range(0, below=1)] = 0.0
     # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
@@ -41,17 +42,17 @@ class AutoencoderParams:
     """Inputs, widths and training of the network."""
 
     frames: Literal[1, 2, 3] = 1  # consecutive rows that it reads: the paper's classes C1, C2 and C3
-    components: PositiveInt = 8  # latents; the paper chose 8
-    # widths of the encoder's hidden layers, as 64,32; empty: those of the class
+    components: PositiveInt = 8  # number of latents; the paper chose 8
+    # widths of the encoder's hidden layers, such as 64,32; empty: those of the class
     hidden: Annotated[str, CommaList(PositiveInt)] = ""
-    # levels: counts above rest; increments: what each row adds to the one before
+    # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
-    search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget, the best is kept; 0: none
+    search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget; the best is kept; 0: none
     epochs: PositiveInt = 100  # maximum number of passes over the training rows
     batch: PositiveInt = 256  # rows per step of the optimiser
     learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
     weight_decay: NonNegativeFloat = 1e-5  # weight decay of Adam
-    patience: PositiveInt = 10  # epochs without a lower error on held-out training recordings after which training ends
+    patience: PositiveInt = 10  # epochs without a lower error on held-out training recordings before training stops
     seed: Seed = 0  # random seed of initial weights and of the order of rows
     PANELS: ClassVar[Panels] = {
         "Model": ("frames", "components", "hidden", "representation", "search"),
@@ -60,7 +61,7 @@ class AutoencoderParams:
     PRESETS: ClassVar[Presets] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
-        """Refuse hidden layers next to a search, which chooses its own widths."""
+        """Raise an error for hidden layers together with a search, which chooses its own widths."""
         if self.search and self.hidden:
             raise UsageError(
                 f"hidden is {self.hidden} and search is {self.search}, which chooses its own widths; give only one of them."
@@ -69,7 +70,7 @@ class AutoencoderParams:
 
 @stage(version=3)
 def fit(params: Params, train: Dataset) -> Result:
-    """Return the principal components of the training recordings' rows in contact that no gap touches."""
+    """Return the principal components of the rows in contact outside of gaps, from the training recordings."""
     from tacpipe.codecs import pca, training_rows
     from tacpipe.plugins.stage import Result
 
@@ -83,7 +84,7 @@ def fit(params: Params, train: Dataset) -> Result:
 
 @stage(version=1)
 def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
-    """Return the autoencoder trained on the training recordings' rows in contact that no gap touches."""
+    """Return the autoencoder trained on the rows in contact outside of gaps, from the training recordings."""
     from tacpipe.codecs import autoencoder_fit, training_rows
     from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
@@ -112,7 +113,7 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     """Compress tactile channels with principal components.
 
     The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Raises `TacpipeError` if
-    the recording's channels are not those the codec was fitted on.
+    the recording's channels differ from those that the codec was fitted on.
 
     Example: tacpipe compress pca data/segments --split data/split -o data/latents
     """
@@ -125,9 +126,9 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
 def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
     """Compress tactile channels with an autoencoder.
 
-    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training recordings
-    are held out to stop the training. Raises `TacpipeError` if the
-    recording's channels are not those the codec was fitted on.
+    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training
+    recordings are held out for early stopping. Raises `TacpipeError` if the recording's channels differ from those that
+    the codec was fitted on.
 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/codes
     """
@@ -137,7 +138,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
 
 
 def _latent_count(components: int, channels: int) -> tuple[int, list[str]]:
-    """Return how many latents are kept, and a note where there are fewer channels than were asked for."""
+    """Return the number of latents, with a note if there are fewer channels than requested latents."""
     if components <= channels:
         return components, []
     return channels, [

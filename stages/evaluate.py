@@ -1,12 +1,12 @@
 """Evaluate a model on recordings, next to its baselines.
 
-Prints how the model compares with the best baseline, with intervals over recordings, and writes it to ``headline.json``,
-and to ``summary.json`` in few numbers, for DVC. Writes ``metrics.json``,
-``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
-predictions of each recording. Recordings that the model was trained on are reported apart, under ``seen``.
+Prints a comparison of the model with the best baseline, with intervals over recordings, and writes it to
+``headline.json``, and as a few numbers for DVC to ``summary.json``. Writes ``metrics.json``, ``horizons.csv`` (errors
+by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (their sums) and the predictions of each recording.
+Recordings that the model was trained on are reported separately, under ``seen``.
 
-With ``--live`` recordings of `tacpipe live -o` are evaluated, given as they were recorded. Published values are compared
-with the offline chain on the same recordings (``live`` of ``metrics.json``, ``live.csv``), and bit for bit with
+``--live`` evaluates recordings of `tacpipe live -o`, which must be unprocessed. Published values are compared with the
+offline chain on the same recordings (``live`` in ``metrics.json``, ``live.csv``), and bit for bit with
 `predict --causal`.
 
 Example: tacpipe evaluate models/forward data/segments --split data/split -o results/forward
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """How recordings are evaluated; nothing depends on who trained the model."""
+    """Settings of the evaluation, which do not depend on the model."""
 
-    # recordings are those of live sessions, as they were recorded: also evaluate what was published
+    # recordings are unprocessed ones of live sessions: also evaluate what was published
     live: bool = added(False)
 
 
@@ -44,7 +44,7 @@ def _as_given(params: Params) -> bool:
 
 @stage(version=7, headline=headline.FILE, as_given=_as_given)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Evaluate a model on recordings, by the measures of the task it was trained for."""
+    """Evaluate a model on recordings with the metrics of its task."""
     from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)
@@ -53,7 +53,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     else:
         with model_files.validated("the model"):
             result = task.evaluate(model, recordings)
-    if headline.FILE not in result.files:  # a task of another package may have none
+    if headline.FILE not in result.files:  # a task from another package may have none
         return result
     summarized = headline.write_summary(headline.read(result.files[headline.FILE]), task.short_names)
     return dataclasses.replace(result, files={**result.files, headline.SUMMARY: summarized})

@@ -1,6 +1,6 @@
 """Compute tactile channels from the frames of cameras.
 
-The camera looks at a gel. Rows do not look ahead, and memory does not grow with a recording.
+The cameras look at gels. Rows do not look ahead, and memory use does not depend on the length of a recording.
 
 Example: tacpipe extract markers data/recordings -o data/markers
 """
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 COLOURS = ("red", "green", "blue")
-ENCODED_FRAMES = 32  # frames that are encoded together
-HELD_OUT = 0.15  # fraction of the training recordings that stop the training
-MAX_CELLS = 10_000  # cells of a grid; each has three columns
+ENCODED_FRAMES = 32  # frames per batch of the encoder
+HELD_OUT = 0.15  # fraction of the training recordings used for early stopping
+MAX_CELLS = 10_000  # maximum number of grid cells, each with three columns
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Params(StreamSelection):
 
     rows: PositiveInt = 6  # rows of the grid
     columns: PositiveInt = 8  # columns of the grid
-    reference_frames: PositiveInt = 5  # first frames, of which the mean is the untouched gel
+    reference_frames: PositiveInt = 5  # number of first frames whose mean is the untouched gel
 
     def check(self) -> None:
-        """Refuse a grid with more cells than a table should have columns."""
+        """Raise an error for a grid with more cells than a table should have columns."""
         if self.rows * self.columns > MAX_CELLS:
             raise UsageError(
                 f"A grid of {self.rows} x {self.columns} cells has more than {MAX_CELLS:,}. Choose fewer rows or columns."
@@ -58,10 +58,10 @@ class Params(StreamSelection):
 def difference(params: Params, recording: Recording) -> RecordingOutput:
     """Measure how the brightness of a gel changes on a grid.
 
-    Each stream of frames becomes a stream of tactile channels with a row per frame: the mean of each cell and colour, in
-    grey levels of 0 to 255, minus that of the untouched gel. The first frames of a recording show the untouched gel, so
-    start a recording before contact. Until there are as many frames as ``--reference-frames``, those so far are taken:
-    no row looks ahead. Streams without frames stay as they are.
+    Each stream of frames becomes a stream of tactile channels with a row per frame: the mean of each cell and colour,
+    in grey levels from 0 to 255, minus that of the untouched gel. The first frames of a recording show the untouched
+    gel, so start a recording before contact. Before there are as many frames as ``--reference-frames``, those so far
+    are used, so that no row looks ahead. Streams without frames stay unchanged.
 
     Example: tacpipe extract difference data/gels -o data/difference
     """
@@ -79,15 +79,15 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class MarkerParams(StreamSelection):
-    """The grid of markers, and their distance on the gel."""
+    """The grid of markers, and their spacing on the gel."""
 
-    rows: PositiveInt = 4  # rows of the grid; of a larger one, those next to the centre of the image
+    rows: PositiveInt = 4  # rows of the grid; of a larger grid, those nearest to the centre of the image
     columns: PositiveInt = 6  # columns of the grid
-    # distance of neighbouring markers on the gel, which makes displacements millimetres; 0: pixels
+    # distance between neighbouring markers on the gel, for displacements in millimetres; 0: pixels
     pitch_mm: Annotated[NonNegativeFloat, Unit("mm")] = 0.0
 
     def check(self) -> None:
-        """Refuse a grid with more markers than a table should have columns."""
+        """Raise an error for a grid with more markers than a table should have columns."""
         if self.rows * self.columns > MAX_CELLS:
             raise UsageError(
                 f"A grid of {self.rows} x {self.columns} markers has more than {MAX_CELLS:,}. Choose fewer rows or columns."
@@ -99,10 +99,10 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     """Track the markers of a gel as tactile channels.
 
     Each stream of frames becomes a stream with a row per frame: the displacement of each marker along x and y since the
-    first frame, and the fraction of the markers that were detected. The first frame shows the untouched gel, so start a
-    recording before contact. A marker that cannot be seen is null. No row looks ahead. A marker that moves by more than
-    half the distance of its neighbours between two frames may be taken for one of them. Streams without frames stay as
-    they are.
+    first frame, and the fraction of detected markers. The first frame shows the untouched gel, so start a recording
+    before contact. A marker that is not visible is null. No row looks ahead. A marker that moves by more than half the
+    distance to its neighbours between two frames may be mistaken for one of them. Streams without frames stay
+    unchanged.
 
     Example: tacpipe extract markers data/gels -o data/markers
     """
@@ -117,18 +117,18 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
 class FrameAutoencoderParams(StreamSelection):
     """Features of the autoencoder, and its training."""
 
-    components: PositiveInt = 16  # features
-    images: PositiveInt = 4000  # images that are learned, evenly spaced over the frames of the training recordings
+    components: PositiveInt = 16  # number of features
+    images: PositiveInt = 4000  # number of training images, evenly spaced over the frames of the training recordings
     epochs: PositiveInt = 20  # maximum number of passes over the training images
     batch: PositiveInt = 64  # images per step of the optimiser
     learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
-    patience: PositiveInt = 5  # epochs without a lower error on held-out training recordings after which training ends
+    patience: PositiveInt = 5  # epochs without a lower error on held-out training recordings before training stops
     seed: Seed = 0  # random seed of initial weights and of the order of images
 
 
 @stage(version=1)
 def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
-    """Return the weights of an encoder that is trained on images of the training recordings."""
+    """Return the weights of an encoder trained on images of the training recordings."""
     from tacpipe.codecs import frame_autoencoder
     from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
@@ -158,7 +158,7 @@ def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fit
     """Encode frames with a small convolutional autoencoder.
 
     Each stream of frames becomes a stream of features with a row per frame. The network is trained on frames of the
-    training recordings, of which 15 % are held out to stop the training. Streams without frames stay as they are.
+    training recordings, of which 15 % are held out for early stopping. Streams without frames stay unchanged.
 
     Example: tacpipe extract autoencoder data/gels --split data/split -o data/features
     """
@@ -174,9 +174,9 @@ def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fit
 class EncoderParams(StreamSelection):
     """The encoder and its weights."""
 
-    encoder: str = "autoencoder"  # name of an encoder; plug-ins may add others
-    weights: str = ""  # file with the weights of the encoder
-    weights_sha256: str = ""  # sha256 of that file; computed if it is left out
+    encoder: str = "autoencoder"  # name of an encoder; plug-ins can add more
+    weights: str = ""  # file with the encoder's weights
+    weights_sha256: str = ""  # sha256 of that file; computed if omitted
 
     def __post_init__(self) -> None:
         """Compute the digest of the weights, which is part of the key."""
@@ -193,10 +193,10 @@ class EncoderParams(StreamSelection):
 
 @stage(version=1)
 def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
-    """Encode frames by an image encoder with given weights.
+    """Encode frames with an image encoder from a weights file.
 
-    Each stream of frames becomes a stream of features with a row per frame. The digest of the weights is part of the key.
-    Streams without frames stay as they are.
+    Each stream of frames becomes a stream of features with a row per frame. The digest of the weights is part of the
+    key. Streams without frames stay unchanged.
 
     Example: tacpipe extract encoder data/gels --weights data/features/encoder.safetensors -o data/codes
     """
@@ -211,7 +211,7 @@ def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
 def _with_channels(
     recording: Recording, compute: Callable[[str, Columns, VideoFormat], pa.RecordBatchReader]
 ) -> RecordingOutput:
-    """Return a recording whose streams of frames are replaced; ``compute`` gets how errors name the stream."""
+    """Return a recording with its streams of frames replaced by ``compute``, whose first argument is the name for errors."""
     from tacpipe.video.stream import read_format
 
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
@@ -235,7 +235,7 @@ def _with_channels(
 def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
     """Return the mean of each cell and colour (row, column, colour) of an image (height, width, colour).
 
-    Where the height or width cannot be divided evenly, cells differ by a pixel.
+    Cells differ by a pixel if the height or width is not divisible.
 
     >>> cell_means(np.arange(12, dtype=np.uint8).reshape(2, 6, 1), 1, 2).tolist()
     [[[4.0], [7.0]]]
@@ -251,7 +251,7 @@ def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
 
 
 def _copied(columns: Columns) -> pa.RecordBatchReader:
-    """Return a stream as it is, read by batches."""
+    """Return an unchanged stream as batches."""
     import pyarrow as pa
 
     batches = (batch for rows in columns.batches() for batch in rows.to_batches())
@@ -259,7 +259,7 @@ def _copied(columns: Columns) -> pa.RecordBatchReader:
 
 
 def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]) -> pa.RecordBatchReader:
-    """Return a stream of the clocks of ``columns`` and of ``values``, row number and values (field,), as they come."""
+    """Return a lazy stream with the clocks of ``columns`` and the ``values``, pairs of row number and values (field,)."""
     import pyarrow as pa
 
     from tacpipe.video.stream import BATCH_ROWS
@@ -280,7 +280,7 @@ def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int
 
 
 def _differences(columns: Columns, video_format: VideoFormat, params: Params) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield row number and differences (cell and colour,) of each frame."""
+    """Yield each frame's row number and brightness differences (cell and colour,)."""
     from tacpipe.video.decoding import decode_frames, read_batches
 
     reference_sum, reference_count = np.zeros((params.rows, params.columns, len(COLOURS))), 0
@@ -294,11 +294,11 @@ def _differences(columns: Columns, video_format: VideoFormat, params: Params) ->
 def _displacements(
     place: str, columns: Columns, video_format: VideoFormat, params: MarkerParams
 ) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield row number and displacements of each frame (marker and axis,), and the fraction of markers detected."""
+    """Yield each frame's row number and marker displacements (marker and axis,), with the fraction of detected markers."""
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
 
-    use_one_thread()  # a stage runs on one core per recording
+    use_one_thread()  # a stage uses one core per recording
     tracker: MarkerTracker | None = None
     for row, image in decode_frames(video_format, read_batches(columns), grey=True):
         if tracker is None:
@@ -317,13 +317,13 @@ def _displacements(
 
 
 def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[int, T]]]:
-    """Yield ``values`` in lists of ``rows``."""
+    """Yield ``values`` in lists of at most ``rows``."""
     while block := list(itertools.islice(values, rows)):
         yield block
 
 
 def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]:
-    """Return about ``count`` shrunk images of all streams of frames, by recording (image, row, column, rgb)."""
+    """Return about ``count`` downscaled images from all streams of frames, by recording (image, row, column, rgb)."""
     from tacpipe.codecs.frame_autoencoder import shrink
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import read_format
@@ -356,7 +356,7 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
 
 
 def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode) -> pa.RecordBatchReader:
-    """Return the features of a stream of frames, with its clocks. The first batch states how many there are."""
+    """Return the features of a stream of frames, with its clocks. The first batch determines the number of features."""
     from tacpipe.video.decoding import decode_frames, read_batches
 
     def features() -> Iterator[tuple[int, AnyFloats]]:
@@ -378,7 +378,7 @@ def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode)
 
 
 def _feature_fields(count: int) -> list[pa.Field]:
-    """Return the fields ``feature01`` …, float32."""
+    """Return the fields ``feature01``, ``feature02``, …, float32."""
     import pyarrow as pa
 
     digits = max(2, len(str(count)))
@@ -404,7 +404,7 @@ def _sha256(path: str) -> str:
 
 
 def _difference_fields(params: Params) -> list[pa.Field]:
-    """Return the fields ``taxel0101_red`` …: row and column from 1 and colour, float32 grey levels."""
+    """Return the fields ``taxel0101_red`` …, named by row and column from 1 and colour, as float32 grey levels."""
     import pyarrow as pa
 
     return [
@@ -438,5 +438,5 @@ def _marker_fields(params: MarkerParams) -> list[pa.Field]:
 
 
 def _place(row: int, column: int, columns: int) -> dict[str, str]:
-    """Return the metadata of a tactile channel at a place of a grid, counted from 1."""
+    """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
     return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}

@@ -1,8 +1,8 @@
 """Read recordings of files into a dataset.
 
-One command per format. Files of a robot or a lab (bags, MCAP, HDF5, Zarr, LeRobot, XDF) state their streams, and a layout
-file adds what they leave out; ``table`` reads a lab's own tables, which a layout file describes. The other commands read
-published data sets. ``--guess`` prints a first layout, ``--dry-run`` describes what would be read.
+One command per format. Files of a robot or a lab (bags, MCAP, HDF5, Zarr, LeRobot, XDF) declare their streams, and a
+layout file adds what they omit; ``table`` reads a lab's own tables, which a layout file describes. The other commands
+read published datasets. ``--guess`` prints a first layout, and ``--dry-run`` describes what would be read.
 
 Example: tacpipe ingest mcap FOLDER -o data/recordings
 """
@@ -31,8 +31,8 @@ XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), Conta
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
-    Each bag is a recording, each topic a stream. Common messages have names, quantities and units; others are read
-    by their definition. The time of a row is the stamp of its header, or the log time if there is none.
+    Each bag is a recording, and each topic a stream. Common messages have predefined names, quantities and units;
+    others are read by their definition. The time of a row is the stamp of its header, or the log time if there is none.
 
     Example: tacpipe ingest rosbag FOLDER -o data/recordings
     """
@@ -43,8 +43,8 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read MCAP files (ROS, JSON or protobuf messages).
 
-    Each file is a recording, each topic a stream. Usual messages have names, quantities and units of their own; others
-    are read by their definition. The time of a row is its header's stamp, or the log time where there is none.
+    Each file is a recording, and each topic a stream. Common messages have predefined names, quantities and units;
+    others are read by their definition. The time of a row is the stamp of its header, or the log time if there is none.
 
     Example: tacpipe ingest mcap FOLDER -o data/recordings
     """
@@ -55,9 +55,9 @@ def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
-    A group such as demo_0 is a recording, else the file is one. A group of arrays of one length is a stream, with the stamps
-    next to them or the rate in an attribute. ``--guess`` prints what the files declare as a layout file,
-    to which rates, quantities and units can be added.
+    A group such as demo_0 is a recording; without such groups, the file is one. A group of arrays of the same length is
+    a stream, with time stamps in the group or a rate in an attribute. ``--guess`` prints what the files declare as a
+    layout file, to which rates, quantities and units can be added.
 
     Example: tacpipe ingest hdf5 demos -o data/recordings
     """
@@ -68,8 +68,8 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 
-    Streams, channels and units are as the file declares them; a layout file corrects them. Stamps are on the
-    clock of the computer that recorded, and as they were sent in ``t_device_ns``.
+    Streams, channels and units are as the file declares them; a layout file can correct them. Stamps are on the clock
+    of the recording computer; the original ones are in ``t_device_ns``.
 
     Example: tacpipe ingest xdf sessions -o data/recordings
     """
@@ -82,8 +82,8 @@ def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
 def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
 
-    An episode is a recording, a feature a stream, the task a label. Stamps are frame_index / fps where the timestamps agree
-    with it. Exports of tacpipe give the original streams.
+    An episode is a recording, a feature a stream, and the task a label. Stamps are frame_index / fps if the timestamps
+    agree with it. Exports of tacpipe give the original streams.
 
     Example: tacpipe ingest lerobot datasets/pusht -o data/recordings
     """
@@ -98,7 +98,7 @@ class ZarrParams(Params):
 
 
 def preview_zarr(params: ZarrParams, source: Path) -> str:
-    """Return a description of the streams that would be read from Zarr stores."""
+    """Describe the streams that would be read from Zarr stores."""
     from tacpipe.formats.arrays.zarr import allow_missing_chunks
 
     with allow_missing_chunks(filled=params.fill_missing_chunks):
@@ -109,8 +109,9 @@ def preview_zarr(params: ZarrParams, source: Path) -> str:
 def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
     """Read Zarr stores, such as replay buffers of UMI.
 
-    Folders and .zarr.zip files, format 2 and 3. Where meta/episode_ends cuts the arrays into episodes each is a recording,
-    else the store is one. The rate, which replay buffers do not hold, comes from a layout file; ``--guess`` prints one.
+    Folders and .zarr.zip files, format 2 and 3. If meta/episode_ends divides the arrays into episodes, each is a
+    recording; otherwise the store is one. The rate, which replay buffers do not contain, comes from a layout file;
+    ``--guess`` prints one.
 
     Example: tacpipe ingest zarr replay.zarr.zip --layout layout.toml -o data/recordings
     """
@@ -122,12 +123,12 @@ def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class TableParams(StreamSelection):
-    """How the tables are laid out."""
+    """Layout of the tables."""
 
     layout: Annotated[str, TomlFile()] = ""  # layout file; docs/reference/layout.md describes its entries
 
     def check(self) -> None:
-        """Raise `UsageError` for a layout that is missing or wrong, before any file is looked for."""
+        """Raise `UsageError` for a missing or invalid layout, before files are searched."""
         self.parsed()
 
     def parsed(self) -> layouts.Layout:
@@ -138,7 +139,7 @@ class TableParams(StreamSelection):
 
 
 def discover_table(params: TableParams, source: Path) -> dict[str, Source]:
-    """Return the files and labels of each recording below ``source``."""
+    """Return the files and labels of each recording in ``source``."""
     from tacpipe.formats.table import recordings
 
     layout = params.parsed()
@@ -146,7 +147,7 @@ def discover_table(params: TableParams, source: Path) -> dict[str, Source]:
 
 
 def preview_table(params: TableParams, source: Path) -> str:
-    """Return what would be read, in words."""
+    """Describe in words what would be read."""
     from tacpipe.formats.table import recordings
 
     layout = params.parsed()
@@ -154,14 +155,14 @@ def preview_table(params: TableParams, source: Path) -> str:
 
 
 def guess_table(source: Path) -> str:
-    """Return the text of a first layout."""
+    """Return the text of a guessed layout."""
     from tacpipe.formats.table import guess
 
     return guess.guess_layout(source)
 
 
 def why_unread_table(params: TableParams, source: Path) -> Callable[[str], str]:
-    """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
+    """Return a function from the path of a file in ``source`` to the reason why it is not read."""
     return contained.why_unread(params.parsed(), source)
 
 
@@ -169,8 +170,8 @@ def why_unread_table(params: TableParams, source: Path) -> Callable[[str], str]:
 def table(params: TableParams, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
     """Read a lab's own tables (CSV, Excel, Parquet, NumPy).
 
-    A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
-    come from. Start with ``--guess``, replace each "?" in what it prints, look at the result with ``--dry-run``.
+    A layout file names the files of each recording, their columns with quantity and unit, and the sources of time
+    stamps and labels. Start with ``--guess``, replace each "?" in its output, and check the result with ``--dry-run``.
 
     Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
     """

@@ -1,9 +1,9 @@
 """Predict recordings with a trained model, row by row.
 
-`tacpipe evaluate` reports the errors of the predictions. With ``--causal`` each prediction reads only samples that had
-arrived by then, from original recordings. It equals that of a live session bit for bit. A classifier gives the final
-answer of each recording. ``--quantiles 10,50,90`` adds quantiles of a model that `tacpipe calibrate` made, also to causal
-forecasts.
+`tacpipe evaluate` reports the errors of the predictions. With ``--causal``, each prediction uses only samples that had
+arrived by then, from unprocessed recordings. It equals that of a live session bit for bit. A classifier predicts the
+final answer of each recording. ``--quantiles 10,50,90`` adds quantiles of a model calibrated by `tacpipe calibrate`,
+also to causal forecasts.
 
 Example: tacpipe predict models/forward data/segments -o data/predictions
 """
@@ -31,13 +31,14 @@ class Params:
     """Contents of the predictions."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
-    # read no sample that had not arrived yet, as a live session; give recordings as they were recorded
+    # use only samples that had arrived, as in a live session; requires unprocessed recordings
     causal: bool = added(False)
-    # accept, with --causal, a model that was trained on rows that look ahead
+    # accept, with --causal, a model trained on rows that look ahead
     allow_look_ahead: bool = added(False)
-    # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
+    # quantiles to add, in percent, such as 10,50,90, of a model calibrated by `tacpipe calibrate`; empty: none
     quantiles: Annotated[str, CommaList(PositiveInt)] = added("")
-    # classifiers: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
+    # classifiers: add calibrated probabilities and the answer, a name or unknown; requires a model from `tacpipe
+    # calibrate`
     probabilities: bool = added(False)
 
 
@@ -47,7 +48,7 @@ def _as_given(params: Params) -> bool:
 
 @stage(version=1, as_given=_as_given)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Return the predictions for each recording, with the time at which each was available."""
+    """Return each recording's predictions, with the time at which each was available."""
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))
@@ -62,7 +63,7 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
 
 
 def _refuse_unstated(task: Task, request: PredictionRequest) -> None:
-    """Raise `UsageError` for a kind of uncertainty that no model of the task states."""
+    """Raise `UsageError` for a kind of uncertainty that the task's models do not provide."""
     from tacpipe.errors import UsageError
 
     requested = {"quantiles": bool(request.quantiles), "probabilities": request.probabilities}

@@ -1,7 +1,7 @@
 """Show results on one self-contained HTML page.
 
-Each task has a section: the best method and its gain, a chart and a table, then details in sections that fold. Results
-of the same task are compared, with seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
+Each task has a section: the best method and its gain, a chart and a table, then details in collapsible sections.
+Results of the same task are compared, with seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
 and grasps are drawn next to results of a task that uses them.
 
 Example: tacpipe report results/forward -o report.html
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 class Params:
     """Contents of the page."""
 
-    title: str = ""  # heading of the page; without one, what its tasks predict
-    traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
+    title: str = ""  # heading of the page; empty: what its tasks predict
+    traces: NonNegativeInt = 2  # number of recordings whose predictions are drawn, for each forecast shown in full
 
 
 @stage(version=11)
 def report(params: Params, results: Datasets) -> Result:
-    """Return one page: the answer, charts, tables, and where every number comes from."""
+    """Return a page with the answer, charts, tables, and the source of every number."""
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

@@ -1,12 +1,12 @@
 """Mark contacts in synchronized recordings.
 
-Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
+Rows in contact with any finger are numbered by contact from 0 in the column ``contact``; all others have -1. Each
 tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
-median of the first seconds (``rest``), whatever ``tare`` is. A stream in counts has the thresholds of ``on_count``
-and ``off_count``, unless ``thresholds`` is noise. One in any other unit has those of ``on_level`` and ``off_level``
-or of its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
-``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without a
-contact has a note.
+median of the first seconds (``rest``), regardless of ``tare``. A stream in counts uses the thresholds ``on_count``
+and ``off_count``, unless ``thresholds`` is noise. A stream in any other unit uses ``on_level`` and ``off_level``,
+or thresholds from its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
+``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without
+contact gets a note.
 
 Example: tacpipe segment contacts data/synced -o data/segments
 """
@@ -37,34 +37,36 @@ if TYPE_CHECKING:
 class Params(StreamSelection):
     """Criteria for contact and for the level without load.
 
-    Thresholds in counts are for streams in counts, and stem from 52 published pick-and-move trials of a XELA uSkin: at
-    rest the load stays below 6 counts, in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts
-    remain for seconds. Those of streams in any other unit follow from the noise at rest, unless they are given.
+    Thresholds in counts are for streams in counts, and are based on 52 published pick-and-move trials of a XELA uSkin:
+    at rest the load stays below 6 counts, in the grasp above 240 and mostly above 1000, and after a drop up to 65
+    counts remain for seconds. Thresholds of streams in any other unit are computed from the noise at rest unless
+    specified.
     """
 
-    # free: nothing is touched at first; grasped: all of the recording is one contact
+    # free: the recording starts without contact; grasped: all of the recording is one contact
     begins: Literal["free", "grasped"] = "free"
     # time at the start whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
     # mean change of a finger's taxels from rest at which contact starts
     on_count: Annotated[PositiveFloat, Unit("count")] = 120.0
-    off_count: Annotated[NonNegativeFloat, Unit("count")] = 80.0  # mean change below which it ends
-    merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # largest gap between two contacts that are merged
-    min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # shortest contact that is kept
-    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that belongs to it
-    # on_count for streams in other units, in their unit; None: from noise at rest
+    off_count: Annotated[NonNegativeFloat, Unit("count")] = 80.0  # mean change below which contact ends
+    merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # maximum gap between two contacts that are merged
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # minimum duration of a contact
+    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that is included in it
+    # on_count for streams in other units, in their unit; None: computed from the noise at rest
     on_level: PositiveFloat | None = added(None)
-    # level below which it ends there; None: two thirds of where it starts
+    # off_count for streams in other units; None: two thirds of the level at which contact starts
     off_level: NonNegativeFloat | None = added(None)
-    # level that `rest` names: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
+    # level in `rest`: median of rest_s; first row; axis_mean: all taxels start at their axis' mean
     tare: Literal["median", "first", "axis_mean"] = "median"
-    # thresholds of streams in counts: unit, on_count and off_count; noise, from their noise at rest as in other units
+    # thresholds of streams in counts: unit, on_count and off_count; noise, computed from noise at rest as in other
+    # units
     thresholds: Literal["unit", "noise"] = added("unit")
-    # rest_s to use: start of the recording; lowest: those in which the channels are lowest together
+    # position of rest_s: start of the recording; lowest: where the channels together are lowest
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Refuse contacts that end above where they begin, and thresholds in counts that would do nothing."""
+        """Raise an error for contacts that end above their start level, and for thresholds without effect."""
         if self.thresholds == "noise" and (self.on_count, self.off_count) != (Params.on_count, Params.off_count):
             raise UsageError(
                 f"thresholds is noise, and on_count {self.on_count:g} and off_count {self.off_count:g} would do nothing; "
@@ -79,7 +81,7 @@ class Params(StreamSelection):
 
 @stage(version=2)
 def contacts(params: Params, recording: Recording) -> RecordingOutput:
-    """Return the recording with the number of the contact in each row."""
+    """Return the recording with each row's contact number."""
     import numpy as np
     import pyarrow as pa
 
@@ -143,7 +145,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:
-    """Refuse thresholds in a unit that no stream has: they would do nothing."""
+    """Raise an error for thresholds in a unit that no stream has, because they would have no effect."""
     if params.on_level is not None and params.on_level <= 0:
         raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
     described = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
@@ -160,7 +162,7 @@ def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Co
 
 
 def _with_given_levels(params: Params, thresholds: Thresholds) -> Thresholds:
-    """Return the thresholds of a stream in another unit than counts: those of the params, else ``thresholds``."""
+    """Return the thresholds of a stream that is not in counts: those in the params, or otherwise ``thresholds``."""
     from tacpipe.signals.contact import OFF_FRACTION
 
     on = thresholds.on if params.on_level is None else params.on_level
@@ -170,7 +172,7 @@ def _with_given_levels(params: Params, thresholds: Thresholds) -> Thresholds:
 def _threshold_attributes(
     units: Mapping[str, str], limits: Sequence[Thresholds], fixed: Collection[str]
 ) -> dict[str, Attribute]:
-    """Return the attributes that record by which thresholds streams other than the ``fixed`` were segmented."""
+    """Return attributes with the thresholds of streams that are not in ``fixed``."""
     described: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if stream not in fixed and math.isfinite(on):
@@ -186,7 +188,7 @@ def _no_contact(
     largest: Sequence[float],
     fixed: Collection[str],
 ) -> str:
-    """Return the note on a recording without a contact: thresholds, largest load, and what to do."""
+    """Return the note for a recording without contact: thresholds, maximum load, and what to do."""
     descriptions = [
         f"{stream or 'the sensor'} starts contact at a load of {_number(on)} {unit}".rstrip()
         + f" and reaches {_number(largest_load)} {unit}".rstrip()
@@ -203,12 +205,12 @@ def _no_contact(
 
 
 def _number(value: float) -> str:
-    """Return a number with three digits that count, without an exponent where it can be."""
+    """Format a number with three significant digits, if possible without an exponent."""
     return f"{float(f'{value:.3g}'):g}"
 
 
 def _sensors(name: str, schema: pa.Schema) -> dict[str, list[str]]:
-    """Return the tactile columns of each stream, taxel by taxel."""
+    """Return the tactile columns of each stream, grouped by taxel."""
     columns_by_stream: dict[str, list[str]] = {}
     for field in schema:
         metadata = field.metadata or {}

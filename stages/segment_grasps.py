@@ -1,9 +1,9 @@
 """Cut out the grasped object and the tactile reading.
 
-Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
-of each channel after contact, stamped where it begins; ``contact_ns`` is the time when both fingers first touched. Other
-streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
-already stays as it is; a planned one has no ``biotac_sp``, and gets no ``reading``.
+Converts ``scene``, ``grasp`` and ``biotac_sp`` to ``cloud``, the object's points, and ``reading``, one row: the median
+of each channel after contact, stamped at its start; ``contact_ns`` is the time when both fingers first touched. Other
+streams of one row stay, such as ``grasp`` and the truth of a simulated grasp. A grasp that already has ``cloud`` and
+``grasp`` stays unchanged; a planned grasp has no ``biotac_sp``, and gets no ``reading``.
 
 Example: tacpipe segment grasps data/pinched -o data/grasps
 """
@@ -30,32 +30,32 @@ FINISHED = ("cloud", "grasp")
 class Params(StreamSelection):
     """Criteria for the grasped object in a camera's view and for contact in the readings of two BioTac SP.
 
-    Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
+    Lengths are for a depth camera about a metre above a table, where its noise is 2 mm.
     """
 
-    # distance from the plane of the table within which points belong to it; larger for a noisy table
+    # maximum distance of points from the plane of the table that belong to it; larger for a noisy table
     plane_mm: Annotated[PositiveFloat, Unit("mm")] = 6.0
-    # fraction of the scene's points that the table must hold
+    # fraction of the scene's points that the table must contain
     plane_fraction: Annotated[Fraction, StoredAs("plane_share")] = 0.2
     plane_trials: PositiveInt = 1000  # random samples to find a plane
     seed: Seed = 0  # random seed of these samples
-    # largest distance between neighbouring points of one object
+    # maximum distance between neighbouring points of one object
     cluster_mm: Annotated[PositiveFloat, Unit("mm")] = 12.0
-    cluster_points: PositiveInt = 6  # neighbours within that distance that a point must have; else it is stray
-    object_points: PositiveInt = 50  # points that an object must have; fewer are noise of the table
-    # largest distance of the object from the line between the fingers, or from its sight line
+    cluster_points: PositiveInt = 6  # minimum number of neighbours within that distance; points with fewer are stray
+    object_points: PositiveInt = 50  # minimum number of points of an object; fewer are noise of the table
+    # maximum distance of the object from the line between the fingers, or from its sight line
     near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
-    # nearest points whose mean distance identifies stray points at the object's rim
+    # number of nearest points whose mean distance identifies stray points at the object's rim
     outlier_neighbours: PositiveInt = 20
-    # standard deviations of that distance above its mean, beyond which it is stray
+    # standard deviations of that distance above its mean beyond which a point is stray
     outlier_deviations: PositiveFloat = 5.0
     # time at the start whose median is each finger's pressure without load
     rest_s: Annotated[PositiveFloat, Unit("s")] = 0.5
-    # pressure above rest from which a finger is in contact; noise is 0.25
+    # pressure above rest at which a finger is in contact; noise is 0.25
     on_count: Annotated[PositiveFloat, Unit("count")] = 20.0
-    # time for which both fingers must press, and whose median is the reading
+    # time for which both fingers must press, and over which the reading is the median
     settle_s: Annotated[PositiveFloat, Unit("s")] = 0.2
-    settled_count: Annotated[NonNegativeFloat, Unit("count")] = 3.0  # largest variation of the pressure in that time
+    settled_count: Annotated[NonNegativeFloat, Unit("count")] = 3.0  # maximum variation of the pressure in that time
 
 
 @stage(version=2)
@@ -104,7 +104,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the reading once the fingers had closed, as one row, and the time when both first touched."""
+    """Return the reading after both fingers closed, as one row, and the time when both first touched."""
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema

@@ -1,13 +1,13 @@
 """Cut out the slide of each recording.
 
-All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
+All slides have the same number of frames, and isolated outliers in tactile readings are replaced by a median.
 
-The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
-changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
+The slide starts when the static pressure first reaches its trigger, and lasts until the end, regardless of pressure
+changes; if the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
 ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
 ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
-then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
-positions if nothing else gives its speed. Such a slide has no protocol to check.
+then the slide consists of the rows in which the taxels' mean change from rest exceeds its threshold and the arm moves,
+according to its positions if there is no other source of its speed. Such a slide is not compared with a protocol.
 
 Example: tacpipe segment slides data/touched -o data/slides
 """
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
-BLOCK_ROWS = 1 << 14  # rows that are looked at at once
-USUAL_SPEED = 0.75  # quantile of the speed in contact: that of the slide, which is most of it
+BLOCK_ROWS = 1 << 14  # rows per block
+USUAL_SPEED = 0.75  # quantile of the speed in contact, most of which is the slide
 _KEPT_WHOLE = (
     "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
     "sensor is touched and the arm moves."
@@ -52,46 +52,46 @@ _KEPT_WHOLE = (
 class Params(StreamSelection):
     """Limits of a slide, the choice of its frames, and the protocol of the recordings.
 
-    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the
-    finger's pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1
-    s. Over 800 slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
+    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), started when the
+    finger's pressure reached 40 counts. Half the speed is midway between rest and slide, and the ramp takes 0.1 s. Over
+    800 slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest slide lasts 5.95 s.
     """
 
     # static pressure whose first crossing starts the slide
     pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
-    # fraction of speed_m_s above which the arm slides; only where the arm was recorded
+    # fraction of speed_m_s above which the arm slides; only if the arm was recorded
     moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
-    steady_frames: PositiveInt = 5  # rows that the arm must move so fast, so that a single wrong reading does not count
-    # frames to keep: middle ones; offset: those from offset_frames behind the trigger on; none: all
+    steady_frames: PositiveInt = 5  # number of rows for which the arm must move so fast, to ignore isolated outliers
+    # frames to keep: middle ones; offset: those from offset_frames after the trigger; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
-    frames: PositiveInt = 400  # rows that are kept; recordings without static pressure are kept whole
+    frames: PositiveInt = 400  # number of rows to keep; recordings without static pressure are kept whole
     # rows between trigger and kept frames with crop offset; the authors' files have 101
     offset_frames: NonNegativeInt = 101
-    # rows around a tactile reading, odd, whose median replaces it if it is a spike; 1: never
+    # number of rows around a tactile reading, odd, whose median replaces a spike; 1: never
     spike_frames: PositiveInt = 7
-    # scaled median absolute deviations of these rows, beyond which it is a spike
+    # scaled median absolute deviations of these rows beyond which a reading is a spike
     spike_deviations: NonNegativeFloat = 5.0
-    # smallest height of a spike; contact changes readings by 0 to 235
+    # minimum height of a spike; contact changes readings by 0 to 235
     spike_count: Annotated[NonNegativeFloat, Unit("count")] = 255.0
     speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the protocol
-    # fraction by which the slide's median speed may differ; published ones do by 0.016
+    # fraction by which the slide's median speed may differ; published slides differ by up to 0.016
     speed_tolerance: NonNegativeFloat = 0.05
-    min_s: Annotated[NonNegativeFloat, Unit("s")] = 5.5  # shortest slide within the protocol
-    # smallest mean pressure within the protocol; below, the finger hardly touched
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 5.5  # minimum duration of a slide within the protocol
+    # minimum mean pressure within the protocol, below which the finger hardly touches
     pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
-    # largest mean pressure within the protocol; above, the finger was pressed too hard
+    # maximum mean pressure within the protocol, above which the finger is pressed too hard
     pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
-    # signal that starts and ends the slide: static pressure; load: the taxels' mean change from rest, of any sensor
+    # signal that starts and ends the slide: static pressure; load: the taxels' mean change from rest, for any sensor
     trigger: Literal["pressure", "load"] = added("pressure")
-    # load at which the slide begins, in the unit of the taxels; None: from their noise at rest
+    # load at which the slide starts, in the unit of the taxels; None: computed from their noise at rest
     load_trigger: PositiveFloat | None = added(None)
     # time whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)
-    # rest_s to use: start of the recording; lowest: those in which the channels are lowest together
+    # position of rest_s: start of the recording; lowest: where the channels together are lowest
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Refuse an even median, bounds of the pressure with nothing between them, and a load that would do nothing."""
+        """Raise an error for an even median, for inconsistent pressure limits, and for a load without effect."""
         if self.load_trigger is not None and self.trigger != "load":
             raise UsageError(
                 f"load_trigger is {self.load_trigger:g} and trigger is {self.trigger}; give --trigger load with it."
@@ -109,7 +109,7 @@ class Params(StreamSelection):
 
 @stage(version=1)
 def slides(params: Params, recording: Recording) -> RecordingOutput:
-    """Return the slide of a recording, with its measures as attributes."""
+    """Return the slide of a recording, with its metrics as attributes."""
     from tacpipe.channels import arm
     from tacpipe.channels.streams import finger_stream, remove_spikes
     from tacpipe.datasets.overview import columns_of, streams_of
@@ -155,7 +155,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | Columns]) -> RecordingOutput:
-    """Return the slide of a sensor of any unit: the rows in contact, and of these those in which the arm moves."""
+    """Return the slide of a sensor with any unit: the rows in contact in which the arm moves, if it was recorded."""
     import numpy as np
     import pyarrow as pa
 
@@ -167,7 +167,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
 
     stream = finger_stream(name, streams)
     t_ns, names = stream.column("t_ns").to_numpy(), columns_with_quantity(stream, "tactile")
-    measured = np.ones(len(names), bool)  # (channel,): it has a value in each row
+    measured = np.ones(len(names), bool)  # (channel,), whether it has a value in each row
 
     def blocks() -> Iterator[AnyArray]:
         nonlocal measured
@@ -183,7 +183,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     else:
         limits = Thresholds(params.load_trigger, OFF_FRACTION * params.load_trigger)
     unit = common_unit(stream.schema, names)
-    release()  # the memory of the channels
+    release()  # frees the memory of the channels
     profile = arm.profile(streams, t_ns, by_place=True)
     release()
     try:
@@ -200,7 +200,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
         raise TacpipeError(f"Recording {name}: {error}") from error
     kept_rows = slice(first, stop)
     height = params.spike_count if unit == COUNT else limits.on
-    begin, end = max(0, first - params.spike_frames), stop + params.spike_frames  # what the medians of kept rows are of
+    begin, end = max(0, first - params.spike_frames), stop + params.spike_frames  # rows that the medians read
     pieces, count = [], 0
     for some in _batches(stream, stream.schema.names):
         pieces.append(some.slice(max(0, begin - count), max(0, end - max(begin, count))))
@@ -222,7 +222,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
 
 
 def _batches(stream: pa.Table | Columns, names: Sequence[str]) -> Iterator[pa.Table]:
-    """Yield columns of a stream some rows at a time."""
+    """Yield columns of a stream in batches of rows."""
     import pyarrow as pa
 
     if not isinstance(stream, pa.Table):

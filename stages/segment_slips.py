@@ -1,9 +1,9 @@
 """Mark slips and drops of a held object.
 
-They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
-recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
-contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
-Outside of contacts, after a drop and where there is no reading nothing slips. Rows need one rate, as of
+They are detected from the object's distance to the wrist. Adds the labels ``slip``, detected from the whole
+recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it after ``segment contacts``: each
+contact is a grasp, and a drop lasts until the next one. Without the column ``contact``, the whole recording is one.
+There is no slip outside of contacts, after a drop, or without a reading. Rows need a constant rate, as from
 ``synchronize --rate-hz 50``.
 
 Example: tacpipe segment slips data/even-contacts -o data/slips
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
-EVEN = 0.01  # fraction of a step between rows, by which it may differ from the others for a filter of even steps
+EVEN = 0.01  # maximum relative difference between steps that a filter for even steps accepts
 
 
 @dataclass(frozen=True)
@@ -38,30 +38,30 @@ class Params(StreamSelection):
     """Criteria for slip and drop in the readings of a proximity sensor that looks at the held object.
 
     Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
-    taken as so many counts as ``count_per_mm`` makes of them, and never saturate. One millimetre is 8 counts on the
-    published rig, its fingers' patch 25 mm, its noise 0.8 counts and its smallest reading 544.
+    converted to counts with ``count_per_mm``, and never saturate. One millimetre is 8 counts on the published rig, its
+    fingers' patch is 25 mm, its noise 0.8 counts and its smallest reading 544.
     """
 
-    channel: str = ""  # column with the readings; empty for the only one whose quantity is proximity
+    channel: str = ""  # column with the readings; empty: the only one whose quantity is proximity
     # cut-off of the low-pass filter applied before the rate is computed
     cutoff_hz: Annotated[PositiveFloat, Unit("Hz")] = 5.0
     # time after the grasp without slip, from which noise and level are estimated
     still_s: Annotated[PositiveFloat, Unit("s")] = 0.5
-    on_sigma: PositiveFloat = 5.0  # times the rate's noise, beyond which slip begins
-    off_sigma: PositiveFloat = 2.0  # times the rate's noise, below which it ends
-    on_frames: PositiveInt = 3  # rows that it must be beyond
-    off_frames: PositiveInt = 5  # rows that it must be below
-    # least noise of the rate; one count of a reading gives 10
+    on_sigma: PositiveFloat = 5.0  # rate above which a slip starts, in multiples of its noise
+    off_sigma: PositiveFloat = 2.0  # rate below which a slip ends, in multiples of its noise
+    on_frames: PositiveInt = 3  # number of consecutive rows above on_sigma that start a slip
+    off_frames: PositiveInt = 5  # number of consecutive rows below off_sigma that end a slip
+    # minimum noise of the rate; a change of one count is a rate of 10
     noise_floor: Annotated[PositiveFloat, Unit("count/s")] = 3.0
-    # largest change of readings that counts as no change of level
+    # maximum change of readings that counts as no change of level
     level_count: Annotated[PositiveFloat, Unit("count")] = 0.75
-    patch_mm: Annotated[PositiveFloat, Unit("mm")] = 25.0  # slipped distance from which an object is lost
+    patch_mm: Annotated[PositiveFloat, Unit("mm")] = 25.0  # slipped distance at which an object is lost
     count_per_mm: Annotated[PositiveFloat, Unit("count/mm")] = 8.0  # sensitivity of the sensor
-    # largest reading of a lost object: nothing is within the sensor's range
+    # maximum reading of a lost object: nothing is within the sensor's range
     saturated_count: Annotated[NonNegativeFloat, Unit("count")] = 544.0
 
     def check(self) -> None:
-        """Refuse slips that end above where they begin."""
+        """Raise an error for slips that end above their start level."""
         if self.off_sigma > self.on_sigma:
             raise UsageError(
                 f"off_sigma is {self.off_sigma:g}, above on_sigma, {self.on_sigma:g}; a slip must end at or below the rate "
@@ -103,7 +103,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     values = slip.fill_missing(readings)
     labels = {name: np.zeros(len(t_ns), dtype=bool) for name in ("slip", "slip_online", "dropped")}
     grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
-    for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
+    for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has a separate level and noise
         grasp_values, is_held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
         lost = slip.dropped(grasp_values, still_rows, patch_count, saturated)
         lost_online = slip.dropped_online(grasp_values, still_rows, patch_count, saturated)
@@ -125,7 +125,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
 
 
 def _proximity(name: str, channel: str, table: Columns) -> str:
-    """Return the column with the distance of the object."""
+    """Return the column with the object's distance."""
     proximity_columns = columns_with_quantity(table, "proximity")
     if channel:
         if channel not in table.column_names:
@@ -144,7 +144,7 @@ def _proximity(name: str, channel: str, table: Columns) -> str:
 
 
 def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeError:
-    """Return the error of a proximity in another unit than counts or a length."""
+    """Return the error for a proximity in a unit other than counts or a length."""
     stream = (table.schema.field(channel).metadata or {}).get(b"stream", b"").decode()
     return TacpipeError(
         f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
@@ -153,7 +153,7 @@ def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeE
 
 
 def _rate_hz(name: str, t_ns: Times) -> float:
-    """Return how many rows there are a second. Raises `TacpipeError` if their steps are not even."""
+    """Return the number of rows per second. Raises `TacpipeError` if the steps are not even."""
     import numpy as np
 
     if len(t_ns) < 2:

@@ -28,17 +28,17 @@ Families = Annotated[
 class Params:
     """Motions of the simulated pick-and-move rig, and the noise and latency of its streams."""
 
-    trials: PositiveInt = 24  # recordings
+    trials: PositiveInt = 24  # number of recordings
     seed: Seed = 0  # random seed
     # length of a recording: approach, grasp, lift and move, then further moves
     duration_s: Annotated[float, Range(4), Unit("s")] = 12.0
     # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
     protocol: Literal["mixed", "controlled", "kinaesthetic"] = "mixed"
-    # largest load of the plan as a fraction of the friction limit; above 1 the object slips; 0: random
+    # maximum load of the plan as a fraction of the friction limit; above 1 the object slips; 0: random
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # factor of the drawn friction; with 4 nothing slips
     grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip weakens without warning
-    grip_loss: Fraction = 0.2  # fraction of the grip force that is lost then
+    grip_loss: Fraction = 0.2  # fraction of the grip force that is then lost
     # sideways distance from the grasp to the centre of mass; it twists the object
     lever_m: Annotated[NonNegativeFloat, Unit("m")] = 0.0
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
@@ -47,15 +47,15 @@ class Params:
     # fraction of tactile frames that repeat the one before; 0.75 is like the 2021 rig
     hold_probability: Fraction = 0.07
     drop_probability: Fraction = 0.002  # fraction of samples that are lost
-    # times the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
+    # multiple of the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
     noise_scale: NonNegativeFloat = 1.0
     # mean and standard deviation of a tactile frame's latency
     tactile_jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 2.0
     # mean and standard deviation of the latency of an arm state or a proximity reading
     robot_jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.5
-    # largest offset of the sensors' own clocks (t_device_ns)
+    # maximum offset of the sensors' own clocks (t_device_ns)
     clock_offset_ms: Annotated[NonNegativeFloat, Unit("ms")] = 80.0
-    clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # largest skew of a device's own clock
+    clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # maximum skew of a device's own clock
 
 
 @stage(version=2)
@@ -76,26 +76,26 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class MaterialParams:
-    """Surfaces that the simulated rig of two unlike sensors slides over, and the noise of the sensors."""
+    """Surfaces over which the simulated rig slides two different sensors, and the noise of the sensors."""
 
-    # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
+    # number of recordings, which alternate between BioTac and RoboSkin and cycle through the materials
     trials: PositiveInt = 200
     seed: Seed = 0  # random seed
-    materials: PositiveInt = 20  # materials
-    sessions: PositiveInt = 1  # sessions per material, which take its trials in turn
+    materials: PositiveInt = 20  # number of materials
+    sessions: PositiveInt = 1  # number of sessions per material, between which its trials alternate
     identical_materials: bool = False  # all classes are the same material; only their sessions differ
     # shared: both sensors measure the same materials; independent: each has its own twenty
     spectra: Literal["shared", "independent"] = "shared"
-    # factor of the offsets, gains and drift that the trials of a session share
+    # multiple of the offsets, gains and drift that the trials of a session share
     session_scale: NonNegativeFloat = 1.0
-    # factor of noise, drift and the offsets of each trial
+    # multiple of the noise, drift and offsets of each trial
     noise_scale: NonNegativeFloat = 1.0
     force_n: Annotated[PositiveFloat, Unit("N")] = 1.0  # mean force of a slide; it varies by 5 % from trial to trial
     speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the arm that draws the BioTac
     # mean speed of the material over RoboSkin; it varies by 30 %
     roboskin_speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.05
     pac: bool = True  # simulate the BioTac's vibration channels; they are zero otherwise
-    # slides of a BioTac per material from one with the arm's streams to the next; 0: none
+    # number of a material's BioTac slides from one with the arm's streams to the next; 0: none
     arm_every: NonNegativeInt = 20
     jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.1  # mean and standard deviation of a reading's latency
 
@@ -120,24 +120,24 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
 class TouchParams:
     """Objects on the simulated table, their grasps, and the noise of camera and fingertips."""
 
-    trials: PositiveInt = 360  # recordings, each a grasp; the objects take turns
+    trials: PositiveInt = 360  # number of recordings, one per grasp; the objects alternate
     seed: Seed = 0  # random seed
     families: Families = "all"  # families of objects, or all
-    objects: PositiveInt = 5  # named objects of each family
-    # stiffness of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
+    objects: PositiveInt = 5  # number of named objects in each family
+    # stiffness of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, different for each object
     stiffness: Literal["mixed", "rigid", "elastic", "foam"] = "mixed"
-    spheres: bool = False  # spheres of different sizes, seen from distances in proportion, grasped through the centre
-    one_pose: bool = False  # each object lies in one pose, and is only shifted and rotated about the vertical
-    shift: Fraction = 0.5  # largest fraction of half the cloud's length by which grasps lie off its middle
+    spheres: bool = False  # spheres of different sizes, seen from proportional distances, grasped through the centre
+    one_pose: bool = False  # each object has a single pose, and is only shifted and rotated about the vertical
+    shift: Fraction = 0.5  # maximum offset of grasps from the cloud's middle, as a fraction of half its length
     # standard deviation of the logarithm of the closing effort, which no stream shows
     effort_spread: NonNegativeFloat = 0.15
-    # times the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
+    # multiple of the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
     noise_scale: NonNegativeFloat = 1.0
     drift_count_day: Annotated[NonNegativeFloat, Unit("count/day")] = 30.0  # root mean square drift of the sensors
-    raw: bool = False  # the camera's whole view and the sensors over time, as before `segment grasps`
+    raw: bool = False  # the camera's whole view and the sensors over time, for `segment grasps`
 
     def check(self) -> None:
-        """Refuse whole views of spheres of all sizes, which have no table."""
+        """Raise an error for whole views of spheres of different sizes, which have no table."""
         if self.raw and self.spheres:
             raise UsageError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")
 
@@ -163,17 +163,17 @@ def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
 class GelParams:
     """Trials of the simulated pick-and-move rig with a gel in each finger, and the cameras behind the gels."""
 
-    trials: PositiveInt = 12  # recordings
+    trials: PositiveInt = 12  # number of recordings
     seed: Seed = 0  # random seed
     # length of a recording: approach, grasp, lift and move, then further moves
     duration_s: Annotated[float, Range(4), Unit("s")] = 6.0
-    # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
+    # maximum load of the plan as a fraction of the friction limit; above 1 the object slips; 0: random
     effort: NonNegativeFloat = 0.0
-    friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
-    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
+    friction_scale: PositiveFloat = 1.0  # factor of the drawn friction; with 4 nothing slips
+    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip weakens without warning
     frame_rate_hz: Annotated[PositiveInt, Unit("Hz")] = 25  # frames per second of each camera
     drop_probability: Fraction = 0.002  # fraction of frames that are lost
-    noise_scale: NonNegativeFloat = 1.0  # times the noise of the cameras
+    noise_scale: NonNegativeFloat = 1.0  # multiple of the noise of the cameras
     # mean and standard deviation of a frame's latency
     jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 2.0
 

@@ -19,26 +19,26 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.plugins.stage import Roles
 
-SHOWN = 5  # folds that a note lists before it counts the rest
+SHOWN = 5  # maximum number of folds listed in a note; further ones are counted
 
 
 @dataclass(frozen=True)
 class Split:
-    """Params that all schemes have."""
+    """Params of all schemes."""
 
     scheme: str
-    # fraction of the recordings to validate on; if the scheme selects the test recordings, of the others
+    # fraction of the recordings for validation; of the remaining ones if the scheme selects the test recordings
     val: Annotated[float, Range(0, below=1)] = 0.15
-    # fraction, as val, that only `tacpipe calibrate` uses; forward needs some for it
+    # fraction, as for val, that only `tacpipe calibrate` uses; the task forward requires it for calibration
     calibration: Annotated[float, Range(0, below=1)] = added(0.0)
     seed: Seed = 0  # random seed of every draw
-    stratify: Names = ""  # attributes whose values are spread evenly over the roles; empty for none
-    few: NonNegativeInt = 0  # maximum number of recordings to train on; others are unused; 0 for all
-    few_by: str = ""  # attribute, such as sensor; few counts the recordings of each of its values; empty: of all
-    few_of: str = ""  # attribute=value of the recordings that few limits, such as sensor=roboskin; empty for all
+    stratify: Names = ""  # attributes whose values are spread evenly over the roles; empty: none
+    few: NonNegativeInt = 0  # maximum number of training recordings; others are unused; 0: all
+    few_by: str = ""  # attribute, such as sensor, to each of whose values few applies separately; empty: to all
+    few_of: str = ""  # attribute=value of the recordings that few limits, such as sensor=roboskin; empty: all
 
     def check(self) -> None:
-        """Refuse options that need few, and an attribute without a value."""
+        """Raise an error for options that need few, and for an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
             option = "few_by" if self.few_by else "few_of"
             raise UsageError(
@@ -50,12 +50,12 @@ class Split:
 
 @dataclass(frozen=True)
 class Tested(Split):
-    """Schemes that are given how many recordings to test on."""
+    """Params of schemes with a fraction of test recordings."""
 
-    test: Annotated[float, Range(0, below=1)] = 0.15  # fraction of the recordings to test on
+    test: Annotated[float, Range(0, below=1)] = 0.15  # fraction of the recordings for testing
 
     def check(self) -> None:
-        """Refuse fractions that leave nothing to train on."""
+        """Raise an error for fractions that leave no training recordings."""
         super().check()
         if self.val + self.calibration + self.test >= 1:
             raise UsageError(
@@ -71,42 +71,42 @@ class Random(Tested):
 
     # random: roles drawn at random
     scheme: Literal["random"] = "random"
-    repeats: PositiveInt = 1  # folds, each another draw
+    repeats: PositiveInt = 1  # number of folds, each drawn separately
 
 
 @dataclass(frozen=True)
 class Kfold(Split):
-    """Each recording is tested in one of several folds."""
+    """Each recording is a test recording in one of several folds."""
 
     # kfold: each recording is tested in one of several folds
     scheme: Literal["kfold"] = "kfold"
     folds: Annotated[int, Range(2)] = 5  # number of parts
-    apart: str = ""  # attribute whose values are distributed too, each unknown in one fold; empty for none
+    apart: str = ""  # attribute whose values are also distributed, each absent from training in one fold; empty: none
 
 
 @dataclass(frozen=True)
 class Blocked(Tested):
-    """Recordings in the order of names, which is that of time for most sets: train, then calibration, val and test."""
+    """Recordings in the order of names, which is usually that of time: train, then calibration, val and test."""
 
     # blocked: in the order of names
     scheme: Literal["blocked"] = "blocked"
-    reverse: bool = False  # test the first in the order of names and train on the last
+    reverse: bool = False  # test the first recordings in the order of names and train on the last
 
 
 @dataclass(frozen=True)
 class LeaveOneOut(Split):
-    """The recordings of one value of an attribute are tested in each fold."""
+    """The recordings with one value of an attribute are tested in each fold."""
 
     # leave-one-out: all recordings of a value
     scheme: Literal["leave-one-out"] = "leave-one-out"
-    by: str = "object"  # attribute whose values are left out one by one
+    by: str = "object"  # attribute whose values are left out one at a time
 
 
 @dataclass(frozen=True)
 class Authors(Split):
-    """The roles that the authors of a published set gave."""
+    """The roles assigned by the authors of a published dataset."""
 
-    # authors: as the authors of a published set did
+    # authors: roles assigned by the authors of a published dataset
     scheme: Literal["authors"] = "authors"
 
 
@@ -115,9 +115,9 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 
 @stage(version=1)
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
-    """Give each recording its role: train, val, calibration or test.
+    """Assign each recording a role: train, val, calibration or test.
 
-    Returns one table, ``split``, with one row per recording and fold: recording, fold, role. Recordings that have a role in
+    Returns one table, ``split``, with one row per recording and fold: recording, fold, role. Recordings with a role in
     the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.
     """
     import pyarrow as pa
@@ -143,7 +143,7 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
 
 def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:
-    """Return the sentence on folds without validation recordings; ``enough`` is a fraction that would leave none so."""
+    """Return a note on folds without validation recordings; ``enough`` is a fraction with which all folds have some."""
     fold_numbers = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
     subject = f"Folds {fold_numbers} of {folds} have" if len(bare) > 1 else f"Fold {fold_numbers} of {folds} has"
     advice = f"Give --val {enough:g}" if enough else "Add recordings"

@@ -1,9 +1,9 @@
 """Bring all streams of a recording onto one clock.
 
 The output has one table for each recording, over the time that all streams cover, with masks of repeated samples and of
-gaps. Rows are at the stamps of one stream, the master, and hold the newest sample of every other stream that had arrived
-by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows are at one rate. ``--values interpolate`` is for
-offline analysis: its rows look ahead, and live sessions refuse a model that was trained on them.
+gaps. Rows are at the stamps of one stream, the master, and contain the newest sample of every other stream that had
+arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows are at a constant rate. ``--values
+interpolate`` is for offline analysis: its rows look ahead, and live sessions refuse a model that was trained on them.
 
 Example: tacpipe synchronize data/recordings -o data/synced
 """
@@ -28,29 +28,29 @@ if TYPE_CHECKING:
     from tacpipe.synchronization.streams import TimedStream
 
 
-IN_MEMORY = 1 << 25  # bytes of finished columns, beyond which they are put aside in a temporary file
-BATCH_ROWS = 1 << 15  # rows of a batch of a long table
+IN_MEMORY = 1 << 25  # maximum bytes of finished columns in memory; further columns are stored in a temporary file
+BATCH_ROWS = 1 << 15  # rows per batch of a long table
 Timeline = Literal["uniform", "logged", "fresh"]
 
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """The rows, the clock that places samples on them, and what counts as a gap."""
+    """The rows, the clock of samples, and the definition of a gap."""
 
     rate_hz: Rate | None = None  # rate of the rows; without it they are at the stamps of the master
     # hold: newest sample that had arrived; interpolate: between samples, which looks ahead, for offline analysis
     values: Literal["hold", "interpolate"] = "hold"
-    # rows without rate_hz: logged: every sample of the master; fresh: those that are not repeated samples
+    # rows without rate_hz: logged: every sample of the master; fresh: samples that are not repeated
     grid: Literal["logged", "fresh"] = "logged"
-    master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
-    # longest time between samples without a gap, marked in a mask; without it 50, below 20 Hz 2.5 periods of the stream
+    master: str = ""  # stream whose first sample starts the grid; empty: that of the rig file, or the first tactile one
+    # maximum time between samples without a gap, marked in a mask; without it 50, below 20 Hz 2.5 periods of the stream
     gap_ms: Annotated[PositiveFloat, Unit("ms")] | None = None
     # time of a sample: arrival; device: its own stamp; auto: arrival for hold, else device if there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of 16-bit tactile counts; other channels do not change
 
     def check(self) -> None:
-        """Refuse clocks of devices for held values, because their fit reads the whole recording, and two kinds of rows."""
+        """Raise an error for two grids, and for held values on device clocks, whose fit reads the whole recording."""
         if self.values == "hold" and self.clock == "device":
             raise UsageError(
                 "clock is device, whose fit reads the whole recording, and held values read no later sample; leave --clock "
@@ -63,12 +63,12 @@ class Params(StreamSelection):
 
     @property
     def timeline(self) -> Timeline:
-        """The kind of rows, as the attribute ``grid`` names it."""
+        """The kind of rows, as in the attribute ``grid``."""
         return self.grid if self.rate_hz is None else "uniform"
 
     @staticmethod
     def upgrade(stored: Values) -> Values:
-        """Return stored params of any version by the names of this one: before version 3 values were interpolated."""
+        """Return stored params of any version with current names; values were interpolated before version 3."""
         if "values" in stored:
             return dict(stored)
         current = {name: value for name, value in stored.items() if name not in ("causal", "grid", "rate_hz")}
@@ -85,9 +85,9 @@ class Params(StreamSelection):
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """Bring the streams of each recording onto one clock.
 
-    Returns one table over the time that all streams cover, with masks of repeats and gaps. Streams of images or text alone,
-    and those of a single row, have no values between their samples: they stay in the recordings. Attributes state how far
-    rows look ahead: the time from a row to the arrival of the last sample that it was made of, in ms.
+    Returns one table over the time that all streams cover, with masks of repeats and gaps. Streams of only images or
+    text, and those of a single row, cannot be resampled and stay in the recordings. Attributes contain how far rows
+    look ahead: the time in ms from a row to the arrival of the latest sample used for it.
     """
     import numpy as np
     import pyarrow as pa
@@ -162,7 +162,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 def _on_grid(
     params: Params, stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
 ) -> list[tuple[pa.Field, Any]]:
-    """Return field and values of a stream's channels on the grid, and of its masks; ground truth has none."""
+    """Return fields and values of a stream's channels on the grid, and of its masks; ground truth has no masks."""
     from tacpipe.synchronization import columns
 
     if params.values == "hold":

@@ -25,9 +25,8 @@ from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
 SHOWN = 20  # Maximum number of recordings that are listed; further ones are counted
-READ_BYTES = (
-    1 << 28
-)  # Maximum number of stored bytes to read; further streams are listed with only their number of rows
+# Maximum number of stored bytes to read; further streams are listed with only their number of rows
+READ_BYTES = 1 << 28
 _TRUTH = "gt_"  # Prefix of the simulator's ground-truth labels
 _SPLIT = ("recording", "fold", "role")  # Columns of a split
 

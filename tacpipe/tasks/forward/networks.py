@@ -209,13 +209,10 @@ def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindo
         )
 
 
-TRACED = (
-    12  # number of windows on which network and trace must agree; the first calls of a trace profile and optimize it
-)
-WALK, STEP = (
-    20.0,
-    0.002,
-)  # random steps between rows of test windows: in hundredths of a feature's training range, and in m
+# number of windows on which network and trace must agree; the first calls of a trace profile and optimize it
+TRACED = 12
+# random steps between rows of test windows: in hundredths of a feature's training range, and in m
+WALK, STEP = 20.0, 0.002
 
 
 class Network:
