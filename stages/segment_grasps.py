@@ -1,9 +1,10 @@
 """Cut out the grasped object and the tactile reading.
 
 Converts ``scene``, ``grasp`` and ``biotac_sp`` to ``cloud``, the object's points, and ``reading``, one row: the median
-of each channel after contact, stamped at its start; ``contact_ns`` is the time when both fingers first touched. Other
-streams of one row stay, such as ``grasp`` and the truth of a simulated grasp. A grasp that already has ``cloud`` and
-``grasp`` stays unchanged; a planned grasp has no ``biotac_sp``, and gets no ``reading``.
+of each channel once the pressure has settled, with the time stamp of the first settled row; ``contact_ns`` is the time
+when both fingers first touched. Other streams of one row stay, such as ``grasp`` and the truth of a simulated grasp. A
+grasp that already has ``cloud`` and ``grasp`` stays unchanged; a planned grasp has no ``biotac_sp``, and gets no
+``reading``.
 
 Example: tacpipe segment grasps data/pinched -o data/grasps
 """

@@ -78,7 +78,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 class MaterialParams:
     """Surfaces over which the simulated rig slides two different sensors, and the noise of the sensors."""
 
-    # number of recordings, which alternate between BioTac and RoboSkin and cycle through the materials
+    # number of recordings, which alternate between BioTac and RoboSkin; 40 contain each sensor and material once
     trials: PositiveInt = 200
     seed: Seed = 0  # random seed
     materials: PositiveInt = 20  # number of materials
