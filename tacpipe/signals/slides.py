@@ -81,7 +81,7 @@ def crop_rows(slide: Rows, frames: int, crop: str, offset_first: int) -> Rows:
     With ``middle``, if the rows cannot be centred, one row fewer is removed before than after them. With ``offset``, they
     start at row ``offset_first``. Raises `TacpipeError` for another crop, or if there are too few rows.
 
-    >>> kept_rows((0, 800), 400, "middle", 0), kept_rows((0, 799), 400, "middle", 0), crop_rows((3, 800), 400, "offset", 101)
+    >>> crop_rows((0, 800), 400, "middle", 0), crop_rows((0, 799), 400, "middle", 0), crop_rows((3, 800), 400, "offset", 101)
     ((200, 600), (199, 599), (101, 501))
     """
     if crop not in CROPS:

@@ -75,7 +75,7 @@ class Station:
             self._tally(self._chunks, self._bytes, due[-1][0])
         return [Chunks.from_pairs(due)] if due else []
 
-    def begin(self, tally: Tally, early: list[Chunks | StreamNote] | None) -> list[Chunks | StreamNote]:
+    def start_recording(self, tally: Tally, early: list[Chunks | StreamNote] | None) -> list[Chunks | StreamNote]:
         """Return what came since the last call, and report to ``tally`` from now on."""
         blocks = self.take()
         counted = [] if early is None else [block for block in (*early, *blocks) if isinstance(block, Chunks)]
@@ -84,13 +84,13 @@ class Station:
         self._tally = tally
         return blocks
 
-    def end(self) -> list[Chunks | StreamNote]:
+    def end_recording(self) -> list[Chunks | StreamNote]:
         """Return what came since the last call, and stop reporting."""
         blocks = self.take()
         self._tally = None
         return blocks
 
-    def drained(self, since_ns: int) -> bool:
+    def is_drained(self, since_ns: int) -> bool:
         """Return whether what waited was fetched."""
         return self.script.t_s >= self.script.drained_s
 

@@ -62,7 +62,7 @@ class Device:
         due = [chunk for chunk in self.sent if chunk[0] <= self.now_ns][:500]  # no more fits into one read
         self.sent = self.sent[len(due) :]
         if not self.sent:
-            self.station._ending.set()
+            self.station._stopping.set()
         return [(chunk[0] if self.kernel_stamped else self.now_ns, chunk[1]) for chunk in due]
 
     def write(self, data: bytes) -> None:
