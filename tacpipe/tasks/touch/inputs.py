@@ -106,7 +106,7 @@ class CloudSources:
         return self._arrays([(index, rng) for index in indices], self.inputs.rotation_deg)
 
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
-        """Return the same arrays without rotation; the sample depends only on the number of points and on ``visit``."""
+        """Return the same arrays without rotation; the sample depends only on the cloud and on ``visit``."""
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].points_m.tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)), 0.0)
 
@@ -213,7 +213,7 @@ class PatchSources:
         return self._arrays([(index, rng) for index in indices])
 
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
-        """Return the same arrays; the sample depends only on the points near the grasp and on ``visit``."""
+        """Return the same arrays; the sample depends only on the cloud, in the grasp's axes, and on ``visit``."""
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)))
 

@@ -168,9 +168,8 @@ class SlideSoFar:
         if finger_stream not in tables:
             return False
         try:
-            slide = self._stage(replace(self._params, crop="none"), RecordingSoFar(tables, self._attributes)).streams[
-                STREAM
-            ]
+            recording = RecordingSoFar(tables, self._attributes)
+            slide = self._stage(replace(self._params, crop="none"), recording).streams[STREAM]
         except TacpipeError:  # no slide has started
             return False
         newest_ns, last_ns = (table.column("t_ns")[-1].as_py() for table in (tables[finger_stream], slide))
@@ -182,12 +181,12 @@ class SlideSoFar:
         return bool(self._params.trigger != "load")
 
     def _slide_rows(self, recording: RecordingSoFar, table: pa.Table) -> tuple[Any, bool]:
-        """Return the rows of the slide, as the stage selects them or as far as available, and whether it did."""
+        """Return the slide's rows, selected by the stage or as far as available, and whether there are too few."""
         params = self._params
         first = params.offset_frames if params.crop == "offset" else 0
         if params.crop == "none" or table.num_rows - first >= params.frames:
-            cut = self._stage(params, recording)
-            return RecordingSoFar(cut.streams, {**recording.attributes, **cut.attributes}), False
+            slide = self._stage(params, recording)
+            return RecordingSoFar(slide.streams, {**recording.attributes, **slide.attributes}), False
         remaining = table.slice(min(first, table.num_rows))
         return RecordingSoFar({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
 

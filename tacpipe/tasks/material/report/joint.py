@@ -250,13 +250,13 @@ def reduction_tables(methods: Sequence[Method]) -> list[Table]:
     candidates = [method for method in methods if has_usual_settings(method.settings, "subsample_sensor", "few")]
     if not all(method.published for method in candidates):
         return []
-    described = {
+    reduced_sensors = {
         str(method.settings[name])
         for method in candidates
         if method.family == JOINT
         for name in ("subsample_sensor", "few_of")
     }
-    return [_reduction_table(candidates, sensor) for sensor in TABLE_NUMBERS if sensor in described]
+    return [_reduction_table(candidates, sensor) for sensor in TABLE_NUMBERS if sensor in reduced_sensors]
 
 
 def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:

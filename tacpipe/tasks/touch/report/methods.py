@@ -113,7 +113,7 @@ def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
     for result in results:
         by_split.setdefault((result.split, result.simulated), []).append(result)
 
-    def place(key: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
+    def sort_key(key: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
         results_of_split = by_split[key]
         targets = {target for result_of_split in results_of_split for target in result_of_split.predictions.targets}
         return (
@@ -124,7 +124,7 @@ def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
             key[0],
         )
 
-    return sorted(by_split, key=place)
+    return sorted(by_split, key=sort_key)
 
 
 def grouped_by_split(methods: Sequence[Method]) -> list[list[Method]]:
@@ -144,16 +144,16 @@ def default_method(methods: Sequence[Method]) -> Method:
 def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
     """Return one method per architecture: most runs, then one that reads colour, then the shortest name."""
 
-    def place(result_of_split: Method) -> tuple[int, bool, int, str]:
+    def sort_key(method: Method) -> tuple[int, bool, int, str]:
         return (
-            -len(result_of_split.runs),
-            not result_of_split.settings.get("colour", True),
-            len(result_of_split.name),
-            result_of_split.name,
+            -len(method.runs),
+            not method.settings.get("colour", True),
+            len(method.name),
+            method.name,
         )
 
     by_architecture: dict[str, Method] = {}
-    for candidate in sorted(methods, key=place):
+    for candidate in sorted(methods, key=sort_key):
         by_architecture.setdefault(str(candidate.settings["architecture"]), candidate)
     return sorted(by_architecture.values(), key=lambda candidate: candidate.name)
 
