@@ -82,6 +82,10 @@ class RecordingSoFar:
         """Return a stream, or some of its columns."""
         return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
 
+    def columns(self, stream: str = "") -> pa.Table:
+        """Return a stream, which is decoded already."""
+        return self.tables[stream]
+
 
 @dataclass(frozen=True)
 class Answer:
