@@ -69,7 +69,7 @@ def columns(target: str) -> list[str]:
 
 
 def value_columns(target: str) -> list[str]:
-    """Return the columns of a target in tables of predictions and ground truth.
+    """Return the names of a target's columns in tables of predicted and true values.
 
     >>> value_columns("pdc_th"), value_columns("e_mf")[:2]
     (['pdc_th'], ['e_mf_01', 'e_mf_02'])

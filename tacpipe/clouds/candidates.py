@@ -97,7 +97,7 @@ def candidates(
         if not shift:
             break  # every stretch is the same point
     if not chosen:
-        raise TacpipeError(_too_wide(cuts.widths_m, opening_m))
+        raise TacpipeError(_explain_no_grasp(cuts.widths_m, opening_m))
     return sorted(chosen, key=lambda candidate: -candidate.score)
 
 
@@ -113,7 +113,7 @@ def _require_possible(count: int, shift: float, opening_m: tuple[float, float]) 
         )
 
 
-def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
+def _explain_no_grasp(widths_m: list[float], opening_m: tuple[float, float]) -> str:
     limits = f"{opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm"
     if not widths_m:
         return (

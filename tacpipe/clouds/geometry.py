@@ -24,8 +24,8 @@ from tacpipe.arrays import AnyFloats, Floats, Indices
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp, local_points, wrist_of
 
-UNIT_M = 0.05  # length in which coefficients are given, so that they are of one order
-EPSILON = 1e-9  # added to the mean squared gradient, for points that state nothing of a coefficient
+UNIT_M = 0.05  # unit of length of the coefficients, which gives them similar magnitudes
+EPSILON = 1e-9  # added to the mean squared gradient, for points without information about a coefficient
 
 
 @dataclass(frozen=True)

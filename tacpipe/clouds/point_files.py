@@ -280,11 +280,11 @@ def parse_ply(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
         raise TacpipeError(f"{path} holds no point (element vertex 0). Copy it again or leave it out.")
     if header.form == "ascii":
         lines = cloud.filled(content[header.length :])[header.skipped :]
-        _require(path, header, len(lines), 1, "lines")
+        _require_length(path, header, len(lines), 1, "lines")
         points = cloud.parsed(path, lines[: header.points], header.vertex, (*PLY_POSITION, *COLOUR))
     else:
         body = content[header.length + header.skipped :]
-        _require(path, header, len(body), header.vertex.itemsize, "bytes")
+        _require_length(path, header, len(body), header.vertex.itemsize, "bytes")
         points = np.frombuffer(body, header.vertex, header.points)
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused or left out
         xyz = np.column_stack([points[axis] for axis in PLY_POSITION]).astype(np.float32)
@@ -366,8 +366,8 @@ def _is_count(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) <= PLY_DIGITS
 
 
-def _require(path: Path, header: _Header, available: int, width: int, unit: str) -> None:
-    """Raise `TacpipeError` if too little follows the header for its points, or too much though nothing else may."""
+def _require_length(path: Path, header: _Header, available: int, width: int, unit: str) -> None:
+    """Raise `TacpipeError` if the data after the header do not have the length that its points need."""
     needed = header.points * width
     if available < needed or (header.only_vertices and available > needed):
         raise TacpipeError(

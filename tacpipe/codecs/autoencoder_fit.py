@@ -87,11 +87,11 @@ def fit(
     components: int,
     representation: str = codecs.LEVELS,
 ) -> Autoencoder:
-    """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
+    """Fit the networks in ``tried`` and return the codec that reconstructs held-out rows best, with ``components`` latents.
 
-    Its ``measured["search"]`` holds, for each network, its lowest validation error, the epochs it took and whether it
-    is the one kept. Networks that were trained before an interruption are read from ``workspace``. Raises `TacpipeError`
-    where recordings or rows do not suffice, and for ``components`` that the channels cannot give.
+    Its ``measured["search"]`` contains each network's lowest validation error, its epochs and whether it was selected.
+    Networks trained before an interruption are read from ``workspace``. Raises `TacpipeError` if there are too few
+    recordings or rows, or if ``components`` exceeds the number of channels.
     """
     width = len(rows.channels)
     if not 1 <= components <= width:

@@ -236,7 +236,7 @@ def to_files(codec: FittedCodec) -> dict[str, bytes]:
             f"{type(codec).__name__} is of kind {codec.kind}, but the entry point of that name in {registry.CODECS} is "
             f"{type(read).__name__}."
         )
-    package = registry.brought_by(registry.CODECS, codec.kind)
+    package = registry.provider_of(registry.CODECS, codec.kind)
     if package is not None:
         content = {**model_files.tree(files, DESCRIPTION), PLUGIN: str(package)}
         files[DESCRIPTION] = description(content)

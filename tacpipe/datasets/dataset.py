@@ -271,7 +271,7 @@ class Dataset:
 
         opened = self._open(split) if isinstance(split, str | Path) else split
         roles = selection.roles_of(opened, role, fold)
-        return self.only(selection.chosen(self, names, roles, role, {**(labels or {}), **conditions}))
+        return self.only(selection.select_names(self, names, roles, role, {**(labels or {}), **conditions}))
 
     def _open(self, path: Path | str) -> Dataset:
         if self._opener is None:

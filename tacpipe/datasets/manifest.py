@@ -16,7 +16,7 @@ from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.io import files as files_of
 from tacpipe.io import regular
-from tacpipe.io.files import unread
+from tacpipe.io.files import read_error
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.plugins.stage import Attribute, StoredParams
 from tacpipe.printable import excerpt, plain
@@ -387,7 +387,7 @@ def find(path: Path | str) -> Found:
             f"{location} {problem}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
         ) from None
     except OSError as error:
-        raise unread(file, error) from error
+        raise read_error(file, error) from error
 
 
 def check(manifest: Manifest) -> None:

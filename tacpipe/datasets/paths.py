@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tacpipe.errors import StorageError, UsageError
 from tacpipe.io import regular
-from tacpipe.io.files import unread
+from tacpipe.io.files import read_error
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.printable import plain
 
@@ -127,7 +127,7 @@ def verified_copy(name: str, path: str, directories: tuple[str, ...], size: int 
         except (FileNotFoundError, NotADirectoryError, regular.IrregularError):
             continue
         except OSError as error:
-            failed = unread(file, error)
+            failed = read_error(file, error)
             continue
         except StorageError as error:
             failed = error

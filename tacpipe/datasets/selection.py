@@ -69,7 +69,7 @@ def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, st
     return roles_in_fold(table, fold, place)
 
 
-def chosen(
+def select_names(
     dataset: Dataset,
     patterns: Sequence[str],
     roles: Mapping[str, str] | None,

@@ -70,7 +70,7 @@ was given: robomimic reads them with `hdf5_filter_key`.
 class Params:
     """How the files are structured."""
 
-    structure: Literal["streams", "robomimic"] = "streams"  # one file per recording, or one with demonstrations
+    structure: Literal["streams", "robomimic"] = "streams"  # one file per recording, or one file of all demonstrations
     # streams: decode the frames of cameras into arrays too (frame, row, column, rgb), next to their packets
     images: bool = added(False)
     rate_hz: Rate | None = None  # robomimic: synchronize to this rate first

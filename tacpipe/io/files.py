@@ -143,14 +143,14 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
 def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
     """Convert file system errors in the block to a sentence, except errors about missing files.
 
-    With ``reading``, nothing is written in the block, and the sentence is that of `unread`.
+    With ``reading``, nothing is written in the block, and the sentence is that of `read_error`.
     """
     try:
         yield
     except (FileNotFoundError, FileExistsError):
         raise
     except OSError as error:
-        raise (unread(error.filename or root, error) if reading else sentence(root, error)) from error
+        raise (read_error(error.filename or root, error) if reading else sentence(root, error)) from error
 
 
 def may_not_write(error: StorageError) -> bool:
@@ -176,7 +176,7 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
     )
 
 
-def unread(path: Path | str, error: OSError) -> StorageError:
+def read_error(path: Path | str, error: OSError) -> StorageError:
     """Return an error about a file that the system fails to read, which implies nothing about its content."""
     hint = _hint(error, "check the disk and its permissions")
     return StorageError(

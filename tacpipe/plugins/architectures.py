@@ -109,7 +109,7 @@ def plugin(kind: Kind) -> str | None:
         if (task_name := task(base)) is not None:
             for name in fields_of.choices(kind, TAG):
                 if name in registry.architectures(task_name) and (
-                    package := registry.brought_by(registry.MODELS, f"{task_name}.{name}")
+                    package := registry.provider_of(registry.MODELS, f"{task_name}.{name}")
                 ):
                     return str(package)
     return None

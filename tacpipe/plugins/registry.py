@@ -87,7 +87,7 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
     return targets_by_group
 
 
-def brought_by(group: str, name: str) -> Package | None:
+def provider_of(group: str, name: str) -> Package | None:
     """Return the package that provides an entry point, from its metadata, or None for tacpipe's own.
 
     Metadata are read as text, so that a cache hit that needs them imports nothing.
@@ -111,7 +111,7 @@ def plugin_packages() -> dict[str, Path]:
         package.name: file
         for group, points in installed().items()
         for name, (_, file) in points.items()
-        if (package := brought_by(group, name)) is not None
+        if (package := provider_of(group, name)) is not None
     }
 
 
@@ -120,7 +120,7 @@ def package_of_stage(name: str) -> str | None:
     name = stage_name(name)
     for group, prefix in (*PREFIXES.items(), (STAGES, "")):
         if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
-            package = brought_by(group, name.removeprefix(prefix))
+            package = provider_of(group, name.removeprefix(prefix))
             return None if package is None else package.name
     return None
 
@@ -358,7 +358,7 @@ def load_tracker(name: str) -> Any:
 def architectures(task: str) -> list[str]:
     """Return the names of the architectures of a task: tacpipe's own first, then those of plug-ins."""
     names = [name.partition(".")[2] for name in installed()[MODELS] if name.partition(".")[0] == task]
-    return sorted(names, key=lambda name: (brought_by(MODELS, f"{task}.{name}") is not None, name))
+    return sorted(names, key=lambda name: (provider_of(MODELS, f"{task}.{name}") is not None, name))
 
 
 def load_architecture(task: str, name: str) -> Any:
@@ -400,7 +400,7 @@ def _load_plugin(group: str, noun: str, name: Any) -> Any:
     if (
         packages is not None and group != MODELS
     ):  # all architectures are loaded to collect a task's params, so their own packages are not recorded
-        packages.update(package.name for package in [brought_by(group, str(name))] if package is not None)
+        packages.update(package.name for package in [provider_of(group, str(name))] if package is not None)
     return _import(name, target)
 
 

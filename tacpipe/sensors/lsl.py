@@ -112,7 +112,7 @@ class Lsl(Sensor):
         return None
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return the samples of packets: channels, corrections, and the timestamps as sent."""
+        """Return the samples in packets: channels, clock corrections, and timestamps as sent."""
         unpacked = [(row, self._unpack(frame)) for row, frame in enumerate(frames)]
         parts = [(row, packet) for row, packet in unpacked if packet is not None]
         counts = [len(block[1]) for _, block in parts]

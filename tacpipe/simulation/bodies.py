@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats
 
 DOWN_Z = np.array([0.0, 0.0, -1.0])
-MAX_ASPECT = 2.5  # largest ratio of height to width of a standing body
+MAX_ASPECT = 2.5  # maximum ratio of height to width of an upright body
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from tacpipe.simulation.depth_camera import Placed
 
 
 def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:
-    """Return the radius in metres of the sphere whose contact with a plane equals that of a tip with a surface.
+    """Return the effective radius in metres of a spherical tip in contact with a curved surface.
 
     ``curvatures_1_m`` are the surface's principal curvatures (..., 2). Each is added to the tip's curvature; the radius
     is the geometric mean of both relative radii, equation (4.25) with R_e = (R' R'')^(1/2). For a sphere of radius R it
-    is 1 / (1/tip + 1/R). Raises `ValueError` if the surface is so concave that the tip does not fit.
+    is 1 / (1/tip + 1/R). Raises `ValueError` if the surface is too concave for the tip.
     """
     relative = 1 / tip_m + np.asarray(curvatures_1_m, np.float64)
     if (relative <= 0).any():

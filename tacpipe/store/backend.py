@@ -18,7 +18,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from tacpipe.errors import StorageError
 from tacpipe.io import regular
-from tacpipe.io.files import readable_errors, sentence, unread, write_whole
+from tacpipe.io.files import read_error, readable_errors, sentence, write_whole
 from tacpipe.store import layout
 
 MAX_CONCURRENT = 16  # maximum number of concurrent requests
@@ -137,7 +137,7 @@ class Directory:
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise unread(self.path(name), error) from error
+            raise read_error(self.path(name), error) from error
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
         """Implement `Backend.blocks`."""
@@ -146,7 +146,7 @@ class Directory:
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise unread(self.path(name), error) from error
+            raise read_error(self.path(name), error) from error
 
     def stat(self, name: str) -> Entry | None:
         """Implement `Backend.stat`."""

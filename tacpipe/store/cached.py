@@ -156,7 +156,7 @@ class CachedStore(Store):
 
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object with this digest (and size in bytes) is in the cache or the bucket."""
-        if self._lies(name, size):
+        if self._exists(name, size):
             return True
         if name not in self._bucket_sizes:
             self._look({*self._requested, name})
@@ -219,7 +219,7 @@ class CachedStore(Store):
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Implement `Store.blocks`, fetching an object that is missing here."""
-        if not self._lies(name):
+        if not self._exists(name):
             self._bring(name, size)
         yield from super().blocks(name, size)
 
@@ -241,7 +241,7 @@ class CachedStore(Store):
         """Upload the objects that the bucket lacks. Raises `MissingError` if one is not in the cache."""
         sizes = {}
         for name in names:
-            if not self._lies(name):
+            if not self._exists(name):
                 raise AbsentError(f"Object {name[:12]} is not in {self.root}.")
             sizes[name] = os.lstat(self.object_path(name)).st_size
         self._announce(sizes)
@@ -369,7 +369,7 @@ class CachedStore(Store):
         sizes_in_bucket = self.bucket.sizes(sizes)
         absent = [name for name in sizes if sizes_in_bucket.get(name) != sizes[name]]
         for name in absent:
-            if not self._lies(name):
+            if not self._exists(name):
                 raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")
             if name in sizes_in_bucket:  # the size differs, so the object is damaged
                 self.bucket.quarantine(name)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.io.files import present, unread
+from tacpipe.io.files import present, read_error
 from tacpipe.store import addresses, layout
 from tacpipe.store.layout import BESIDE_NAME
 from tacpipe.store.store import Store
@@ -139,4 +139,4 @@ def _marks(path: Path) -> bool:
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
             return False
-        raise unread(path, error) from error
+        raise read_error(path, error) from error

@@ -105,7 +105,9 @@ class RemoteRoots:
         number = root["number"] + 1
         if not self.files.create(_version(name, number), encoded(root)):
             return False
-        if number > 2:  # the previous version stays, so that a process that has read it cannot use this number
+        if (
+            number > 2
+        ):  # keeps the previous version, so that a process that read the deleted one cannot reuse its number
             self.files.delete(_version(name, number - 2))
         return True
 

@@ -161,9 +161,9 @@ class Store:
 
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object with this digest (and size in bytes) exists, without reading it."""
-        return self._lies(name, size)
+        return self._exists(name, size)
 
-    def _lies(self, name: str, size: int | None = None) -> bool:
+    def _exists(self, name: str, size: int | None = None) -> bool:
         try:
             entry = self.files.stat(layout.object_name(name))
         except regular.IrregularError:
@@ -175,7 +175,7 @@ class Store:
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
         """Return the sizes in bytes of the objects that exist."""
-        stored = (name for name in names if self._lies(name))
+        stored = (name for name in names if self._exists(name))
         return {
             name: entry.bytes for name in stored if (entry := self.files.stat(layout.object_name(name))) is not None
         }
@@ -198,7 +198,7 @@ class Store:
         with contextlib.suppress(MissingError):
             if durable:
                 self._read(name, len(content))
-            is_stored = self._lies(name, len(content))
+            is_stored = self._exists(name, len(content))
         if not is_stored:
             self.write_file(path, content, mode=0o444)
         if durable:  # also if another process stored it
@@ -216,7 +216,7 @@ class Store:
             draft.sync()
             name = draft.digest
             self.announce([name])
-            if durable or not self._lies(name, draft.bytes):  # an existing copy may be damaged
+            if durable or not self._exists(name, draft.bytes):  # an existing copy may be damaged
                 self.files.refuse_linked(self.object_path(name))
                 with readable_errors(self.root):
                     move(path, self.object_path(name))
@@ -265,7 +265,7 @@ class Store:
         """Yield the content of an object block by block. Raises the errors of `read`, for damage after the last block."""
         hashed = hashlib.sha256()
         try:
-            self._lies(name)  # puts back an object that a collection moved aside
+            self._exists(name)  # puts back an object that a collection moved aside
             for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else read_limit(size)):
                 hashed.update(block)
                 yield block
@@ -282,7 +282,7 @@ class Store:
     def _irregular(self, name: str, error: regular.IrregularError) -> MissingError:
         """Return the error for an object that is not a regular file, and move it to quarantine."""
         with contextlib.suppress(TacpipeError):
-            self._lies(name)
+            self._exists(name)
         return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {str(error).rstrip('.')}.")
 
     def _damaged(self, name: str) -> MissingError:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Bools, Floats, Int64s, Times
 
-MEDIAN_NS = 10_000_000  # half width of a median: eight readings of a 400 Hz proximity sensor, to reduce noise
-ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median: as many readings, delayed by 10 ms
+MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
+ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with as many readings, delayed by 10 ms
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
 Keep = Callable[[Any], Any]  # stores values (grid,), possibly on disk, and returns them
 BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated at once

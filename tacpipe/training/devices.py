@@ -51,9 +51,9 @@ def kind() -> str:
 
 
 def gpu_for(worker: int) -> dict[str, str]:
-    """Return the variable that shows worker process ``worker``, counted from 0, one GPU; empty with fewer than two GPUs.
+    """Return the variable that restricts worker ``worker`` (from 0) to one GPU; empty if there are fewer than two.
 
-    Workers take the visible GPUs in turn, so trainings that run at the same time do not share one while another is idle.
+    Workers take the visible GPUs in turn, so concurrent training runs do not share one while another is idle.
     """
     visible = os.environ.get(VISIBLE_GPUS)
     if visible is None:

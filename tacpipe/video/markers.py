@@ -46,7 +46,7 @@ def use_one_thread() -> None:
 
 
 def detect(grey: Bytes) -> Floats:
-    """Return the centroids of dark dots in an image (height, width) in px (marker, xy), except dots at the border."""
+    """Return the centroids in px (marker, xy) of the dark dots in an image (height, width), except at its border."""
     with extras.explain_missing(NEEDED_BY):
         import cv2
     side = max(3, grey.shape[1] // NEIGHBOURHOOD | 1)

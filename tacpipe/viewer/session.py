@@ -115,7 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Content-Security-Policy", POLICY)
         self.end_headers()
-        with suppress(OSError):  # the browser has left
+        with suppress(OSError):  # the browser may have disconnected
             self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:

@@ -42,7 +42,7 @@ class ArrayDescription:
     dtype: np.dtype[Any]
     attributes: StoredAttributes = field(default_factory=dict)
     chunk_rows: int = 0  # rows of a chunk, or 0 if the file has none
-    problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
+    problem: str = ""  # why it cannot be read, such as "is …"; empty if it can
     time_axis: int = 0  # axis of the file's array that becomes the first axis of ``shape``
 
     @property

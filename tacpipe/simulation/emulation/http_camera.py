@@ -93,7 +93,7 @@ class CameraSource:
 
 
 def gel_states(world: World, finger: int, t_ns: Int64s) -> gel.GelStates:
-    """Return the gel of finger 0 or 1 of the rig's world at ``t_ns`` (time,)."""
+    """Return the states of the gel of finger 0 or 1 of the rig's world at ``t_ns`` (time,)."""
     sigma_px = world.skins[finger].sigma_m * gel.PX_M
 
     def look(cycle: Cycle, local_ns: Int64s) -> Floats:

@@ -151,7 +151,7 @@ def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
 
 
 METHODS = ("calibrate", "loss")  # methods of a network that fits its own scales
-TRIED = 2  # number of windows for the check
+TRIED = 2  # number of windows on which a network is checked
 
 
 def shape(params: ForwardModelParams, codec: codecs.Codec) -> ForecastShape:

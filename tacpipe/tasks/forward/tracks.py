@@ -87,14 +87,14 @@ class Levels:
 def above_rest(table: pa.Table | Columns, channels: Sequence[str]) -> Levels:
     """Return the channels' levels above rest. Raises `TacpipeError` if a channel has no rest level."""
     rest_counts = tactile.rest_counts(table.schema, channels)
-    narrow = all(_is_narrow(table.schema.field(name).type) for name in channels)
+    narrow = all(_fits_float32(table.schema.field(name).type) for name in channels)
     stored = np.empty((table.num_rows, len(channels)), np.float32 if narrow else np.float64)
     for index, name in enumerate(channels):
         stored[:, index] = table.column(name).to_numpy()
     return Levels(stored, rest_counts)
 
 
-def _is_narrow(kind: pa.DataType) -> bool:
+def _fits_float32(kind: pa.DataType) -> bool:
     """Return whether float32 represents every value of a column's type."""
     import pyarrow as pa
 

@@ -81,7 +81,7 @@ class ForwardLive(LiveTask):
     declaration: ClassVar[Declaration] = DECLARATION
 
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
-        """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans where plans come."""
+        """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans if needed."""
         from tacpipe.datasets import model_files
         from tacpipe.tasks import task
         from tacpipe.tasks.forward.live import plans

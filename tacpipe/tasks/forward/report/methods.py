@@ -131,7 +131,7 @@ def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
 
 ACTIONS = ("planned", "none", "shuffled")
 _PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # latents the paper keeps
-_NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are fitted next to the model
+_NO_METHOD = ("seed", "actions", "architecture", "baselines")  # params that do not define a method
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 

@@ -364,7 +364,7 @@ def typical_slide(shards: Sequence[Recording]) -> Recording:
 
 
 def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:
-    """Return the number of a sensor's slides, and of those that followed the protocol, in words."""
+    """Return a sentence with the number of a sensor's slides, and of those outside the protocol."""
     outside = [shard for shard in shards if shard.attributes.get("outside_protocol")]
     slides_text = counted(len(shards), "slides")
     if not any("outside_protocol" in shard.attributes for shard in shards):
