@@ -2,8 +2,8 @@
 
 The output has one table for each recording, over the time that all streams cover, with masks of repeated samples and of
 gaps. Rows are at the stamps of one stream, the master, and contain the newest sample of every other stream that had
-arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows are at a constant rate. ``--values
-interpolate`` is for offline analysis: its rows look ahead, and live sessions refuse a model that was trained on them.
+arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows are at a constant rate. --values
+interpolate is for offline analysis: its rows look ahead, and live sessions refuse a model that was trained on them.
 
 Example: tacpipe synchronize data/recordings -o data/synced
 """

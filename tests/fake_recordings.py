@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,6 +71,9 @@ class FakeDataset:
     recordings: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     manifest: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.manifest = json.loads(Manifest("evaluate", 1, {}).content) | self.manifest
 
 
 def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] | None = None) -> Any:

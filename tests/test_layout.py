@@ -202,7 +202,7 @@ def test_a_store_that_is_itself_a_link_to_another_disk_works(
     made_project.store.root.unlink()
     made_project.store.root.symlink_to(disk.parent / "fresh")
     for command in (*READ, "simulate toy -o data/new"):
-        check_refusal(made_project.call(command), "which is not there", "Mount its disk")
+        check_refusal(made_project.call(command), "which does not exist", "Mount its disk")
     (disk.parent / "fresh").mkdir()
     made_project.run("simulate toy -o data/new")
     assert (disk.parent / "fresh" / "format").exists()
@@ -317,7 +317,7 @@ def test_an_emulated_port_replaces_and_removes_links_alone(tmp_path: Path) -> No
 
     for name in ("left", ".left"):
         write(tmp_path, {name: "mine"})
-        with pytest.raises(UsageError, match="no emulator made it"):
+        with pytest.raises(UsageError, match="is not from an emulator"):
             Pty(SENSOR, tmp_path / "left")
         assert (tmp_path / name).read_text() == "mine"
         (tmp_path / name).unlink()

@@ -32,7 +32,7 @@ def test_every_built_in_stage_loads_and_has_a_summary_and_help_for_each_param(na
 def test_a_third_party_s_stage_stands_beside_the_built_in_ones(lab: Lab) -> None:
     assert "scale" in lab.run("--help").out
     assert "times" not in lab.run("--help").out
-    assert "every value is multiplied by it" in lab.run("scale --help").out
+    assert "Every value is multiplied by it" in lab.run("scale --help").out
 
 
 def test_a_broken_plug_in_spoils_its_own_name_alone(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,7 @@ def test_the_parts_of_a_task_come_from_the_plug_in_that_brings_the_task(
     assert "Weights of objects" in text and "2 scales" in text
     assert registry.load("train.weighing").version == 3
     assert "Train a scale." in lab.run("train --help").out
-    assert "number of springs" in lab.run("train weighing --help").out
+    assert "Number of springs" in lab.run("train weighing --help").out
     for name in ("unfinished", "old"):
         with pytest.raises(TacpipeError, match=r"not a task .*subclass of tacpipe\.tasks\.task\.Task"):
             registry.load_task(name)

@@ -135,7 +135,7 @@ _SHOWN = 6  # number of listed quantities
 def layout_entry(stream: str) -> str:
     """Return the entry of a layout file that declares the columns of a stream.
 
-    >>> entry("skin"), layout_entry("")
+    >>> layout_entry("skin"), layout_entry("")
     ('[streams.skin] columns', '[streams.…] columns')
     """
     return f"[streams.{plain(stream) if stream else '…'}] columns"

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from tacpipe.errors import TacpipeError
 from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import with_profile
 from tacpipe.models.readout import statistics
@@ -75,8 +73,3 @@ def test_tensors_give_back_the_distance() -> None:
     frames, labels = slides((0, 5), 10, 0)
     fitted = ClassDistance.fit(frames, labels)
     assert (ClassDistance.from_tensors(fitted.to_tensors()).scores(frames) == fitted.scores(frames)).all()
-
-
-def test_tensors_of_an_earlier_version_ask_for_another_calibration() -> None:
-    with pytest.raises(TacpipeError, match="tacpipe calibrate"):
-        ClassDistance.from_tensors({"classes": np.arange(2), "means": np.zeros((2, 3))})

@@ -177,7 +177,7 @@ def test_a_slide_that_left_the_protocol_is_kept_and_says_why(shard: Recording) -
 def test_recordings_without_a_slide_are_refused_with_a_sentence(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="Recording trial: The pressure never reaches 40 counts; its maximum is 39"):
         cut(shard({"biotac": finger(np.full(800, 39))}))
-    with pytest.raises(TacpipeError, match=r"Recording trial: The slide has 399 rows from row 0 .* 400 are to be kept"):
+    with pytest.raises(TacpipeError, match=r"Recording trial: The slide has 399 rows from row 0 .* 400 are needed"):
         cut(shard({"biotac": finger(pressed(399))}))
     with pytest.raises(TacpipeError, match="crop is 'start'; it must be middle, offset or none"):
         cut(shard({"biotac": finger(pressed())}), crop="start")
