@@ -43,7 +43,7 @@ def test_the_evaluation_of_a_longer_recording_takes_hardly_more_besides_its_trac
     forecaster = Forecaster.load(trained(tmp_path))
     short, long = (peak_bytes(forecaster, rows) for rows in (ROWS, 3 * ROWS))
     grown = (long - short) / (2 * ROWS)  # bytes a row
-    assert grown < 25, grown
+    assert grown < 100, grown  # keeping the forecasts would take thousands
 
 
 def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:
