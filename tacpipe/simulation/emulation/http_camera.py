@@ -156,7 +156,7 @@ class HttpCamera(Tcp):
         super().__init__(sensor)
         self.address = Address("mjpeg", f"http://{HOST}:{self._port}{PATH}")
 
-    def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
+    def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
         """Answer a request; return an empty message for a host that gets images from now on."""
         assert isinstance(peer, Viewer)
         if peer.is_open:
