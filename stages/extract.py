@@ -24,7 +24,7 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyFloats, Bytes, Floats
+    from tacpipe.arrays import AnyFloats, Bytes
     from tacpipe.codecs.frame_autoencoder import Encode
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
@@ -232,24 +232,6 @@ def _with_channels(
     return RecordingOutput(streams)
 
 
-def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
-    """Return the mean of each cell and colour (row, column, colour) of an image (height, width, colour).
-
-    Cells differ by a pixel if the height or width is not divisible.
-
-    >>> cell_means(np.arange(12, dtype=np.uint8).reshape(2, 6, 1), 1, 2).tolist()
-    [[[4.0], [7.0]]]
-    """
-    height, width, _ = image.shape
-    tops = np.arange(rows) * height // rows
-    lefts = np.arange(columns) * width // columns
-    row_sums = np.add.reduceat(image, tops, axis=0, dtype=np.uint32)  # (row, width, colour), below 2^32
-    sums = np.add.reduceat(row_sums, lefts, axis=1, dtype=np.int64)
-    areas = np.outer(np.diff([*tops, height]), np.diff([*lefts, width]))  # (row, column)
-    means: Floats = sums / areas[:, :, None]
-    return means
-
-
 def _copied(columns: Columns) -> pa.RecordBatchReader:
     """Return an unchanged stream as batches."""
     import pyarrow as pa
@@ -281,7 +263,7 @@ def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int
 
 def _differences(columns: Columns, video_format: VideoFormat, params: Params) -> Iterator[tuple[int, AnyFloats]]:
     """Yield each frame's row number and brightness differences (cell and colour,)."""
-    from tacpipe.video.decoding import decode_frames, read_batches
+    from tacpipe.video.decoding import cell_means, decode_frames, read_batches
 
     reference_sum, reference_count = np.zeros((params.rows, params.columns, len(COLOURS))), 0
     for row, image in decode_frames(video_format, read_batches(columns)):

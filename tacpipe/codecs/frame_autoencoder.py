@@ -21,6 +21,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.printable import plain
 from tacpipe.training import devices, loop
+from tacpipe.video.decoding import cell_means
 
 ROWS, COLUMNS = 48, 64  # grid to which an image is shrunk
 CHANNELS = (3, 16, 32, 32)  # colours, and channels after each convolution
@@ -31,7 +32,7 @@ Encode = Callable[[Bytes], Float32s]  # images, uint8 (frame, height, width, rgb
 
 
 class _Network(nn.Module):
-    """Convolutions to the features, and back."""
+    """Convolutions that encode images as features, and their mirror image that decodes them."""
 
     def __init__(self, components: int) -> None:
         super().__init__()
@@ -45,7 +46,7 @@ class _Network(nn.Module):
         self.decoder = nn.Sequential(nn.Linear(components, width), nn.ELU(), nn.Unflatten(1, INNER), *outward)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return images (image, colour, row, column) as they come back."""
+        """Return the reconstructed images (image, colour, row, column)."""
         back: Tensor = self.decoder(self.encoder(images))
         return back
 
@@ -60,10 +61,7 @@ def shrink(image: Bytes) -> Bytes:
         raise TacpipeError(
             f"The image has {width} x {height} pixels. The autoencoder needs {COLUMNS} x {ROWS} or more."
         )
-    tops, lefts = np.arange(ROWS) * height // ROWS, np.arange(COLUMNS) * width // COLUMNS
-    sums = np.add.reduceat(np.add.reduceat(image, tops, axis=0, dtype=np.uint32), lefts, axis=1)
-    areas = np.outer(np.diff([*tops, height]), np.diff([*lefts, width]))
-    means: Bytes = np.rint(sums / areas[:, :, None]).astype(np.uint8)
+    means: Bytes = np.rint(cell_means(image, ROWS, COLUMNS)).astype(np.uint8)
     return means
 
 
@@ -91,7 +89,7 @@ def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path,
 def read_encoder(weights: bytes) -> Encode:
     """Return the function that encodes images with the weights that `fit` returned.
 
-    Raises `TacpipeError` for weights that are none of such an encoder.
+    Raises `TacpipeError` for other weights.
     """
     try:
         tensors = load(weights)

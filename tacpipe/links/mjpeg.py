@@ -20,14 +20,14 @@ READ_BYTES = 1 << 18
 ANSWER_S = 5.0  # limit for the head of the response
 HEAD_END = b"\r\n\r\n"
 STAMP = "x-timestamp"  # seconds, which mjpg-streamer and ustreamer send with each image
-MAX_STAMP_S = 1e10  # a later stamp is none
-Head = dict[str, str]  # fields by name in lower case; the first line stands under ""
+MAX_STAMP_S = 1e10  # later stamps are invalid
+Head = dict[str, str]  # fields by lower-case name; "" is the key of the first line
 
 
 def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
     """Return the open stream of an address such as ``http://192.168.1.20:8080/?action=stream``.
 
-    Raises `UsageError` for an address that is none, and `DeviceError` for a host that is unknown, unreachable or serves
+    Raises `UsageError` for an invalid address, and `DeviceError` for a host that is unknown, unreachable or serves
     something else.
     """
     address = urlsplit(place)
@@ -66,16 +66,16 @@ def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
 
 
 class MultipartParser:
-    """Cuts the bytes of a response into images."""
+    """Splits the bytes of a response into images."""
 
     def __init__(self) -> None:
-        self.boundary: bytes | None = None  # None until the head of the response came
-        self.fault = ""  # why the bytes are no stream of images
+        self.boundary: bytes | None = None  # None until the head of the response has arrived
+        self.fault = ""  # why the bytes are not a stream of images
         self._bytes = bytearray()
-        self._head: Head | None = None  # of the image that is coming
+        self._head: Head | None = None  # head of the image that is being received
 
     def feed(self, data: bytes) -> list[tuple[Head, bytes]]:
-        """Return the images that are complete now, each with the fields of its head."""
+        """Return the newly completed images, each with the fields of its head."""
         self._bytes += data
         if self.boundary is None and not self._begin():
             return []
@@ -98,7 +98,7 @@ class MultipartParser:
         return True
 
     def _take_head(self) -> Head | None:
-        """Take a head off the front of the bytes; None while it is not complete."""
+        """Remove and return the head at the start of the bytes, or None if it is incomplete."""
         stop = self._bytes.find(HEAD_END)
         if stop < 0:
             if len(self._bytes) > MAX_HEAD_BYTES:
@@ -110,7 +110,7 @@ class MultipartParser:
         return {"": lines[0]} | {key.strip().lower(): value.strip() for key, _, value in fields}
 
     def _next_image(self) -> tuple[Head, bytes] | None:
-        """Take the next image off the front of the bytes; None while it is not complete."""
+        """Remove and return the image at the start of the bytes, or None if it is incomplete."""
         assert self.boundary is not None
         if self._head is None:
             start = self._bytes.find(self.boundary)
@@ -136,7 +136,7 @@ class MultipartParser:
 class MjpegLink(DescriptorLink):
     """A connection to a server of images. Each entry is the settings or a frame, as `tacpipe.sensors.camera` packs them.
 
-    The stamps of the first image state whether the server sends them.
+    The first image determines whether the server sends time stamps.
     """
 
     packets = True
@@ -187,7 +187,7 @@ class MjpegLink(DescriptorLink):
 
 
 def _stamp_ns(head: Head) -> int:
-    """Return the server's stamp of an image in ns, 0 where there is none.
+    """Return the server's stamp of an image in ns, or 0 if there is none.
 
     >>> _stamp_ns({"x-timestamp": "1700000000.25"}), _stamp_ns({})
     (1700000000250000000, 0)

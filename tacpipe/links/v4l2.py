@@ -1,6 +1,6 @@
-"""Capture frames of a camera through the ioctls of Video for Linux (V4L2): the kernel's stamps, and its numbers of frames.
+"""Capture frames of a camera through the ioctls of Video for Linux (V4L2): the kernel stamps and numbers them.
 
-MJPEG is handed on as it arrives. YUYV is encoded as JPEG, with some loss. Structures are those of <linux/videodev2.h> on 64
+MJPEG is not changed. YUYV is encoded as JPEG, with some loss. Structures are those of <linux/videodev2.h> on 64
 bits.
 """
 
@@ -33,15 +33,15 @@ BUFFERS = 8  # frames that the kernel holds for us: a third of a second at 25 fr
 CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 MMAP = 1  # V4L2_MEMORY_MMAP
 CAN_CAPTURE, CAN_STREAM, IS_TOUCH, HAS_DEVICE_CAPS = 0x1, 0x4000000, 0x10000000, 0x80000000
-MONOTONIC, STAMP_KIND, DAMAGED = 0x2000, 0xE000, 0x40  # of the flags of a buffer
+MONOTONIC, STAMP_KIND, DAMAGED = 0x2000, 0xE000, 0x40  # flags of a buffer
 NEXT_CONTROL = 0x80000000
-DISABLED, WRITE_ONLY = 0x1, 0x40  # of the flags of a control
+DISABLED, WRITE_ONLY = 0x1, 0x40  # flags of a control
 NUMBER, SWITCH, MENU = 1, 2, 3  # types of controls that have a number as value
 MANUAL_EXPOSURE = 1
 FOURCC = {"mjpeg": b"MJPG", "yuyv": b"YUYV"}
 EXPOSURE_AUTO, EXPOSURE, ZOOM = 0x9A0901, 0x9A0902, 0x9A090D
 AUTO_WHITE_BALANCE, AUTO_GAIN, GAIN, WHITE_BALANCE = 0x98090C, 0x980912, 0x980913, 0x98091A
-CONTROLS = {  # option of the sensor: its control, and the automatic that must be off for it with the value for off
+CONTROLS = {  # by option: its control, the automatic control that must be off, and the value for off
     "exposure": (EXPOSURE, EXPOSURE_AUTO, MANUAL_EXPOSURE),
     "gain": (GAIN, AUTO_GAIN, 0),
     "white_balance_k": (WHITE_BALANCE, AUTO_WHITE_BALANCE, 0),
@@ -76,7 +76,7 @@ class V4l2Device:
         self.fileno = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def call(self, request: int, content: bytes) -> bytes:
-        """Return what the kernel makes of a structure."""
+        """Return a structure as the kernel filled it."""
         filled = bytearray(content)
         fcntl.ioctl(self.fileno, request, filled)
         return bytes(filled)
@@ -140,7 +140,7 @@ def cameras() -> list[Port]:
 def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
     """Return the open camera at a path such as ``/dev/video0``, or the camera with this name.
 
-    Raises `DeviceError` where it is missing, busy, or does not send what the rig file states.
+    Raises `DeviceError` if it is missing or busy, or cannot send what the rig file requests.
     """
     path = place if place.startswith("/") else _path_of(place, name)
     try:
@@ -196,7 +196,7 @@ class Capture:
     read_back: str  # controls with their values
 
     def settings(self) -> dict[str, Any]:
-        """Return what the sensor's options are to state."""
+        """Return the values for the sensor's options."""
         return {
             "rate_hz": self.rate_hz,
             "encoding": self.encoding,
@@ -206,7 +206,7 @@ class Capture:
 
 
 def _set_up(device: V4l2Device, sensor: Any, name: str) -> Capture:
-    """Set format, rate and controls as the sensor's options state. Raises `DeviceError` where the camera takes others."""
+    """Set format, rate and controls from the sensor's options. Raises `DeviceError` if the camera refuses them."""
     if not device.card[2]:
         raise OSError(errno.ENOTTY, "it does not capture video")
     encoding = getattr(sensor, "encoding", "mjpeg")
@@ -241,14 +241,14 @@ def _set_up(device: V4l2Device, sensor: Any, name: str) -> Capture:
 
 
 def _set_controls(device: V4l2Device, sensor: Any, encoding: str) -> str:
-    """Set the controls that the sensor's options state, and return all controls with the values that were read back."""
+    """Set the controls in the sensor's options, and return all controls with the values that were read back."""
     requested: dict[int, int] = {}
     for option, (control, automatic, off) in CONTROLS.items():
         value = getattr(sensor, option, None)
         if value is None:
             continue
         if automatic is not None:
-            with contextlib.suppress(OSError):  # many cameras have no automatic
+            with contextlib.suppress(OSError):  # many cameras lack the automatic control
                 device.write_control(automatic, off)
         try:
             device.write_control(control, value)
@@ -302,7 +302,7 @@ class V4l2Link(DescriptorLink):
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         entries: Arrived = []
-        for _ in range(BUFFERS):  # frames may come as fast as they are encoded
+        for _ in range(BUFFERS):  # bounded, because frames can arrive as fast as they are encoded
             try:
                 filled = BUFFER.unpack(self.device.call(DQBUF, self._buffer(0)))
             except BlockingIOError:

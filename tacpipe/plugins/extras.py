@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 NAME = "tacpipe"
 OWN = (NAME, "tacpipe_stages")
-PLUGINS = "tacpipe."  # prefix of tacpipe's groups of entry points
 PACKAGES = {  # package by module, if their names differ
     "can": "python-can",
     "cv2": "opencv-python-headless",

@@ -279,7 +279,6 @@ def stage(
 
 
 REQUIREMENT_WIDTH = 110  # characters per line
-ANY_QUANTITY = "any"
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""A camera behind a gel, or any other: each frame is a JPEG image, stored as it came.
+"""Cameras, such as those behind a gel. Each frame is a JPEG image, stored as received.
 
-The links (`tacpipe.links.v4l2`, `tacpipe.links.mjpeg`) give packets with a head. A packet of `SETTINGS` holds what the
-camera reported when it was opened, as JSON; it is part of the spool and holds no sample. A packet of `FRAME` holds one
-image. Frames that are no whole JPEG image of the stated size are losses.
+The links (`tacpipe.links.v4l2`, `tacpipe.links.mjpeg`) return packets that start with `HEAD`. A `SETTINGS` packet
+contains what the camera reported when it was opened, as JSON; it is stored in the spool and is not a sample. A `FRAME`
+packet contains one image. A frame that is not a complete JPEG image of the expected size is a loss.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ FRAME, SETTINGS = b"F", b"S"
 HEAD = struct.Struct("<4scxxxIIqq")  # magic, kind, size of the content, number, stamp in us, device's time in ns
 COUNTS = 1 << 32  # modulus of the number of a frame
 START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
-END_BYTES = 4096  # cameras pad an image by up to so many bytes behind its end
+END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
 PIXEL_FORMATS = {
     (1, 1): "yuvj444p",
     (2, 1): "yuvj422p",
     (2, 2): "yuvj420p",
     (1, 2): "yuvj440p",
 }  # by ratio of luma to chroma
-STATED = ("rate_hz", "stamps", "read_back", "encoding")  # options that a packet of settings may state
+STATED = ("rate_hz", "stamps", "read_back", "encoding")  # options that a settings packet can contain
 Stamps = Literal["", "kernel", "server", "arrival"]
 
 
 class Frame(NamedTuple):
-    """One image as a link gives it."""
+    """One image as a link returns it."""
 
-    number: int  # modulo `COUNTS`; 0 where frames are not numbered
+    number: int  # modulo `COUNTS`; 0 if frames are not numbered
     t_us: int  # on the monotonic clock of this computer
-    t_device_ns: int  # on the device's clock; 0 where it is not stated
+    t_device_ns: int  # on the device's clock; 0 if unknown
     content: bytes
 
 
 class ImageShape(NamedTuple):
-    """What the head of a JPEG image states."""
+    """Size and pixel format in the header of a JPEG image."""
 
     width_px: int
     height_px: int
@@ -90,7 +90,7 @@ def unpack_settings(packet: bytes) -> dict[str, Any] | None:
 
 
 def read_shape(image: bytes) -> ImageShape | None:
-    """Return the size and the pixel format of a JPEG image, None for bytes that are no whole JPEG image."""
+    """Return the size and the pixel format of a JPEG image, or None for bytes that are not a complete JPEG image."""
     if image[:2] != START or image.rfind(END, max(2, len(image) - END_BYTES)) < 0:
         return None
     place = 2
@@ -103,7 +103,7 @@ def read_shape(image: bytes) -> ImageShape | None:
 
 
 def _shape_of_frame(segment: bytes) -> ImageShape | None:
-    """Return what the segment of a frame states: bits, height, width, components, and the sampling of each."""
+    """Return the shape in a start-of-frame segment: bits, height, width, components, and the sampling of each."""
     if len(segment) < 6 or segment[0] != 8 or len(segment) < 6 + 3 * segment[5]:
         return None
     height, width, components = int.from_bytes(segment[1:3]), int.from_bytes(segment[3:5]), segment[5]
@@ -116,7 +116,7 @@ def _shape_of_frame(segment: bytes) -> ImageShape | None:
 
 
 def options(data: Chunks) -> list[Options]:
-    """Return the options that the packets of a camera state, as a list of one, empty until there is a frame."""
+    """Return a list with the options that a camera's packets contain; the list is empty before the first frame."""
     packets = data.packets()
     settings = next((values for packet in packets if (values := unpack_settings(packet)) is not None), None)
     frames = (frame for packet in packets if (frame := unpack_frame(packet)) is not None)
@@ -129,7 +129,7 @@ def options(data: Chunks) -> list[Options]:
 
 @dataclass(frozen=True)
 class Camera(Sensor):
-    """A camera. Size, pixel format and stamps that are left out are as the camera states when `tacpipe acquire` begins."""
+    """A camera. If size, pixel format or stamps are omitted, `tacpipe acquire` asks the camera."""
 
     summary: ClassVar[str] = "Cameras behind a gel (GelSight, DIGIT) and others: MJPEG by V4L2 or by HTTP."
     links: ClassVar[tuple[str, ...]] = ("v4l2", "mjpeg")
@@ -159,12 +159,12 @@ class Camera(Sensor):
 
     @property
     def incomplete(self) -> bool:  # type: ignore[override]
-        """True where the camera must state its format."""
+        """True if the camera must be asked for its format."""
         return not (self.width_px and self.height_px and self.pixel_format and self.stamps)
 
     @property
     def counter(self) -> int | None:  # type: ignore[override]
-        """Modulus of the kernel's number of a frame; None where nobody counts."""
+        """Modulus of the kernel's number of a frame; None if frames are not numbered."""
         return COUNTS if self.stamps == "kernel" else None
 
     def fields(self) -> list[pa.Field]:
@@ -175,11 +175,11 @@ class Camera(Sensor):
         return [packet.with_metadata({**packet.metadata, b"unit": b"1"}), *clocks]
 
     def framer(self) -> Framer:
-        """Return a framer that takes frames of the stated size, and settings."""
+        """Return a framer that accepts settings and frames of the expected size."""
         return TextFramer(self._is_right)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return one sample per frame; settings hold none."""
+        """Return one sample per frame; settings packets are skipped."""
         images = [(row, frame) for row, packet in enumerate(frames) if (frame := unpack_frame(packet)) is not None]
         packets = np.empty((len(images), 1), object)
         packets[:, 0] = [frame.content for _, frame in images]
@@ -192,7 +192,7 @@ class Camera(Sensor):
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return the packets that hold these images."""
+        """Return the packets with these images."""
         packets, clocks, _ = samples.values
         counts = np.zeros(len(samples), np.int64) if samples.seq is None else samples.seq
         device_ns = np.zeros(len(samples), np.int64) if samples.t_device_ns is None else samples.t_device_ns

@@ -38,9 +38,8 @@ NEIGHBOUR_PX = 24.0  # distance over which a displaced marker draws others along
 MARKER_PX, EDGE_PX, MARKER_DARKNESS = 5.0, 0.7, 0.6  # radius, softness of the edge, fraction of light that is lost
 PATCH_PX = 9  # half the side of the square in which a marker is drawn
 BRIGHTNESS = np.array([110.0, 120.0, 135.0], np.float32)  # red, green, blue grey levels of the untouched gel
-LIGHTS = np.array(
-    [[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]], np.float32
-)  # direction from which each colour comes (colour, xy)
+# direction from which the light of each colour comes (colour, xy)
+LIGHTS = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]], np.float32)
 DENT_N, SHADE = 1 / 8.0, 900.0  # dent in image units per newton, and grey levels per unit of slope
 NOISE = 1.5  # standard deviation of a pixel, grey levels
 NOISE_IMAGES, NOISE_STEP = 4, 256_889  # noise is drawn for so many images; distance of its parts, a prime
@@ -95,9 +94,8 @@ class GelCamera:
             (axis - centre) / states.sigma_px for axis, centre in zip((x, y), states.centre_px[row], strict=True)
         )
         bell_x, bell_y = np.exp(-(along_x**2) / 2), np.exp(-(along_y**2) / 2)
-        shade = (
-            -SHADE * DENT_N * states.force_n[row] / states.sigma_px
-        )  # the dent's slope is this, its offset and its bells
+        # slope of the dent: the product of this, the distance from its centre and the bell of each axis
+        shade = -SHADE * DENT_N * states.force_n[row] / states.sigma_px
         fall_off = 1.15 - 0.3 * x / WIDTH_PX  # the gel is brighter at the left
         rows = np.column_stack([np.ones(HEIGHT_PX), shade * bell_y, shade * along_y * bell_y])  # (height, 3)
         columns = np.stack(
@@ -168,10 +166,8 @@ def _video(
 ) -> pa.RecordBatchReader:
     """Return the frames of a camera, drawn and encoded as they are taken."""
     video_format = jpeg_format(WIDTH_PX, HEIGHT_PX, Fraction(rig.frame_rate_hz))
-
     camera = GelCamera(rng, rig.noise_scale)
     images = (camera.render(states, row, row) for row in range(len(t_ns)))
-
     pts = samples.true_ns // 1000
     clocks = (pts, pts, np.ones(len(pts), bool))
     return packet_stream(video_format, encode_images(video_format, images), clocks, t_ns, samples.seq, None)

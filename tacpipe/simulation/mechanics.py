@@ -86,15 +86,6 @@ class Contact:
         return int(self.slip.argmax()) if self.slip.any() else None
 
 
-def onset_m_s2(mass_kg: float, grip_n: float, friction: float) -> float:
-    """Return the upward acceleration at which an object starts to slip, 2 mu_s N / m - g.
-
-    >>> round(onset_m_s2(0.36, 6.0, 0.45), 2)
-    5.19
-    """
-    return 2 * friction * grip_n / mass_kg - GRAVITY_M_S2
-
-
 def carry(
     grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None = None, *, rate_hz: float = 1000.0
 ) -> Contact:

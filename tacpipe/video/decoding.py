@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.arrays import AnyArray, Bytes
+import numpy as np
+
+from tacpipe.arrays import Bytes, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.printable import plain
@@ -48,14 +50,22 @@ def decode_frames(
         yield row, image
 
 
-def decode_samples(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, AnyArray]]:
-    """Yield as `decode_frames` does, in the type of the samples: uint16 (height, width) for grey images of 16 bits."""
-    deep = video_format.pixel_format.startswith("gray16")
-    for row, frame in _decode(video_format, batches):
-        if deep:
-            yield row, frame.to_ndarray(format="gray16le")
-        else:
-            yield row, frame.to_ndarray(format=GREY if video_format.pixel_format == GREY else RGB)
+def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
+    """Return the mean of each cell and colour (row, column, colour) of an image (height, width, colour).
+
+    Cells differ by a pixel if the height or width is not divisible.
+
+    >>> cell_means(np.arange(12, dtype=np.uint8).reshape(2, 6, 1), 1, 2).tolist()
+    [[[4.0], [7.0]]]
+    """
+    height, width, _ = image.shape
+    tops = np.arange(rows) * height // rows
+    lefts = np.arange(columns) * width // columns
+    row_sums = np.add.reduceat(image, tops, axis=0, dtype=np.uint32)  # (row, width, colour), below 2^32
+    sums = np.add.reduceat(row_sums, lefts, axis=1, dtype=np.int64)
+    areas = np.outer(np.diff([*tops, height]), np.diff([*lefts, width]))  # (row, column)
+    means: Floats = sums / areas[:, :, None]
+    return means
 
 
 def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, bytes]]:

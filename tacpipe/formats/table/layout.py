@@ -17,14 +17,12 @@ from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.formats.container import KINDS, Time, describe_kind, has_ending
 from tacpipe.formats.table import pattern, stamps
-from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
 from tacpipe.plugins.stage import Values
 from tacpipe.printable import excerpt, plain
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS
 
-MAX_LAYOUT_BYTES = 1 << 20  # maximum size of a layout file
 Format = Literal[
     "csv",
     "parquet",
@@ -226,18 +224,6 @@ class Layout:
         required = [stream for stream in self.streams if not stream.optional] or list(self.streams)
         shared = set.intersection(*(set(pattern.placeholders(stream.files)) for stream in required))
         return tuple(name for name in pattern.placeholders(required[0].files) if name in shared)
-
-
-def read_layout(path: Path) -> Layout:
-    """Return the layout in a file. Raises `UsageError` with file and entry if it is invalid."""
-    content = regular.content(path, MAX_LAYOUT_BYTES)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise UsageError(
-            f"{path} is not UTF-8: byte {error.start} is {excerpt(content[error.start : error.end])}."
-        ) from error
-    return parse_layout(text, str(path))
 
 
 def parse_layout(text: str, place: str = "The layout") -> Layout:
