@@ -112,8 +112,8 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
 def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     """Compress tactile channels with principal components.
 
-    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Raises `TacpipeError` if
-    the recording's channels differ from those that the codec was fitted on.
+    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. A recording must have the
+    channels that the codec was fitted on.
 
     Example: tacpipe compress pca data/segments --split data/split -o data/latents
     """
@@ -127,8 +127,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     """Compress tactile channels with an autoencoder.
 
     The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training
-    recordings are held out for early stopping. Raises `TacpipeError` if the recording's channels differ from those that
-    the codec was fitted on.
+    recordings are held out for early stopping. A recording must have the channels that the codec was fitted on.
 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/codes
     """

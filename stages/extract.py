@@ -58,10 +58,10 @@ class Params(StreamSelection):
 def difference(params: Params, recording: Recording) -> RecordingOutput:
     """Measure how the brightness of a gel changes on a grid.
 
-    Each stream of frames becomes a stream of tactile channels with a row per frame: the mean of each cell and colour,
+    Each stream of frames becomes a stream of tactile channels with one row per frame: the mean of each cell and colour,
     in grey levels from 0 to 255, minus that of the untouched gel. The first frames of a recording show the untouched
-    gel, so start a recording before contact. Before there are as many frames as ``--reference-frames``, those so far
-    are used, so that no row looks ahead. Streams without frames stay unchanged.
+    gel, so start a recording before contact. Until ``--reference-frames`` frames exist, the frames so far are used, so
+    no row looks ahead. Streams without frames stay unchanged.
 
     Example: tacpipe extract difference data/gels -o data/difference
     """
@@ -98,8 +98,8 @@ class MarkerParams(StreamSelection):
 def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     """Track the markers of a gel as tactile channels.
 
-    Each stream of frames becomes a stream with a row per frame: the displacement of each marker along x and y since the
-    first frame, and the fraction of detected markers. The first frame shows the untouched gel, so start a recording
+    Each stream of frames becomes a stream with one row per frame: the displacement of each marker along x and y since
+    the first frame, and the fraction of detected markers. The first frame shows the untouched gel, so start a recording
     before contact. A marker that is not visible is null. No row looks ahead. A marker that moves by more than half the
     distance to its neighbours between two frames may be mistaken for one of them. Streams without frames stay
     unchanged.

@@ -1,12 +1,11 @@
 """Mark contacts in synchronized recordings.
 
-Rows in contact with any finger are numbered by contact from 0 in the column ``contact``; all others have -1. Each
-tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
-median of the first seconds (``rest``), regardless of ``tare``. A stream in counts uses the thresholds ``on_count``
-and ``off_count``, unless ``thresholds`` is noise. A stream in any other unit uses ``on_level`` and ``off_level``,
-or thresholds from its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
-``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without
-contact gets a note.
+Rows in contact with any finger are numbered by contact from 0 in the column ``contact``; all others have -1. The field
+metadata ``rest`` of each tactile channel has its level without load. Contact is detected from the median of the first
+seconds (``rest``), regardless of ``tare``. A stream in counts uses the thresholds ``on_count`` and ``off_count``,
+unless ``thresholds`` is noise. A stream in any other unit uses ``on_level`` and ``off_level``, or thresholds from its
+noise at rest. The attributes ``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` state
+them. A note lists recordings without contact.
 
 Example: tacpipe segment contacts data/synced -o data/segments
 """
@@ -53,9 +52,9 @@ class Params(StreamSelection):
     merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # maximum gap between two contacts that are merged
     min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # minimum duration of a contact
     pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that is included in it
-    # on_count for streams in other units, in their unit; None: computed from the noise at rest
+    # level at which contact starts, for streams in other units; by default from the noise at rest
     on_level: PositiveFloat | None = added(None)
-    # off_count for streams in other units; None: two thirds of the level at which contact starts
+    # level below which contact ends, for streams in other units; by default two thirds of on_level
     off_level: NonNegativeFloat | None = added(None)
     # level in `rest`: median of rest_s; first row; axis_mean: all taxels start at their axis' mean
     tare: Literal["median", "first", "axis_mean"] = "median"

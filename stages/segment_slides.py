@@ -3,8 +3,8 @@
 All slides have the same number of frames, and isolated outliers in tactile readings are replaced by a median.
 
 The slide starts when the static pressure first reaches its trigger, and lasts until the end, regardless of pressure
-changes; if the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
-``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+changes; if the arm was recorded, it lasts while the arm moves. The output has the stream ``slide`` and, with an arm,
+``profile``: speed, force and phase over the whole recording. A slide that differs from the protocol is marked
 ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
 then the slide consists of the rows in which the taxels' mean change from rest exceeds its threshold and the arm moves,
 according to its positions if there is no other source of its speed. Such a slide is not compared with a protocol.
@@ -83,7 +83,7 @@ class Params(StreamSelection):
     pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
     # signal that starts and ends the slide: static pressure; load: the taxels' mean change from rest, for any sensor
     trigger: Literal["pressure", "load"] = added("pressure")
-    # load at which the slide starts, in the unit of the taxels; None: computed from their noise at rest
+    # load at which the slide starts, in the unit of the taxels; by default from their noise at rest
     load_trigger: PositiveFloat | None = added(None)
     # time whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)

@@ -30,7 +30,7 @@ Row = dict[str, float]
 
 def add(program: typer.Typer, summary: str) -> None:
     """Add the command ``candidates`` to ``program``."""
-    about = "\n\nOn a terminal a table is printed, elsewhere CSV; lengths are metres there, touch is in device counts."
+    about = "\n\nPrints a table on a terminal, and CSV otherwise, with lengths in metres and touch in device counts."
     program.command("candidates", help=summary + about + EXAMPLE)(candidates)
 
 

@@ -25,7 +25,7 @@ SUMMARIES = {
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show the content of a dataset, split, model or result.",
     "compare": "Compare results: the best first, columns for what differs.",
-    "track": "Give models and results to trackers of experiments.",
+    "track": "Send models and results to trackers of experiments.",
     "view": "Show recordings on one time axis, in Rerun's viewer.",
     "run": "Run the stages of a dvc.yaml that are not up to date.",
     "explain": "Show the origin of a dataset and what changed.",
@@ -42,8 +42,8 @@ def _label(program: typer.Typer) -> None:
     @program.command(
         "label",
         help=SUMMARIES["label"]
-        + "\n\nLabels are set on the recordings that are named, or on each by a table with --from: "
-        "CSV, TSV, Parquet, JSON or YAML with one row per recording. An empty cell changes nothing.\n\n"
+        + "\n\nSets labels on the named recordings, or those of a table with one row per recording (--from, as CSV, TSV, "
+        "Parquet, JSON or YAML). An empty cell changes nothing.\n\n"
         "Example: tacpipe label data/recordings trial-003 --label material=foam",
     )
     def label(
@@ -55,17 +55,17 @@ def _label(program: typer.Typer) -> None:
             list[str] | None, typer.Option("--label", help="Label as name=value; null removes it.")
         ] = None,
         exclude: Annotated[
-            str | None, typer.Option("--exclude", help="Leave out of all stages, for this reason.")
+            str | None, typer.Option("--exclude", help="Exclude from all stages, for this reason.")
         ] = None,
         include: Annotated[bool, typer.Option("--include", help="Undo --exclude.")] = False,
         from_: Annotated[
-            Path | None, typer.Option("--from", help="Table with one row per recording and a column a label.")
+            Path | None, typer.Option("--from", help="Table with one row per recording and one column per label.")
         ] = None,
         key: Annotated[
-            str, typer.Option("--key", help="Column of --from that names recordings; found where it is left out.")
+            str, typer.Option("--key", help="Column of --from with the names of recordings; detected if omitted.")
         ] = "",
         dry_run: Annotated[
-            bool, typer.Option("--dry-run", help="Print which labels --from would change, and stop.")
+            bool, typer.Option("--dry-run", help="Print the labels that --from would change, and stop.")
         ] = False,
         as_json: AsJson = False,
     ) -> None:
@@ -125,12 +125,14 @@ def _compare(program: typer.Typer) -> None:
     @program.command(
         "compare",
         help=SUMMARIES["compare"]
-        + "\n\nErrors, and the gain over the best baseline with its interval. Runs that differ in seed or fold alone are "
-        "pooled.\n\nExample: tacpipe compare results/forward results/forward-gru",
+        + "\n\nPrints errors, and the gain over the best baseline with its interval. Runs that differ only in seed or fold "
+        "are pooled.\n\nExample: tacpipe compare results/forward results/forward-gru",
     )
     def compare(
         results: Annotated[list[Path], typer.Argument(help="Results of `tacpipe evaluate`.")],
-        unpooled: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
+        unpooled: Annotated[
+            bool, typer.Option("--each", help="Print one row per result, without pooling folds and seeds.")
+        ] = False,
         as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
         as_json: AsJson = False,
     ) -> None:
@@ -154,8 +156,8 @@ def _track(program: typer.Typer) -> None:
     @program.command(
         "track",
         help=SUMMARIES["track"]
-        + "\n\nParams, the epochs of the history and the figures of each; a model that was trained with --track is the "
-        "same run again.\n\nExample: tacpipe track models/forward results/forward --to tensorboard",
+        + "\n\nSends the params, epochs and metrics of each. A model that was trained with --track updates its "
+        "run.\n\nExample: tacpipe track models/forward results/forward --to tensorboard",
     )
     def track(
         datasets: Annotated[list[Path], typer.Argument(help="Models and results.")],

@@ -40,7 +40,13 @@ COMMON = (
 OLD_NAMES = {"--duration": "--duration-s", "--set": "--label", "--store": "--remote"}
 EXAMPLE = "Example: "  # Start of a paragraph with a command line, which is printed without line breaks.
 BRIEF_LINES = 40  # Maximum number of lines that ``-h`` prints.
-TYPES = {"integer": "INTEGER", "int": "INTEGER", "float": "NUMBER", "path": "PATH", "file": "PATH"}
+TYPES = {
+    "integer": "INTEGER",
+    "int": "INTEGER",
+    "float": "NUMBER",
+    "path": "PATH",
+    "file": "PATH",
+}
 SECTIONS = {  # Commands in the order of ``tacpipe --help``. Stages from other packages come last.
     "Record": ("acquire", "live", "sensors"),
     "Import and export": ("ingest", "simulate", "export"),
@@ -194,6 +200,9 @@ def _metavar(param: Any, ctx: Any) -> str:
     if param.metavar:
         return str(param.metavar)
     placeholder = param.get_help_record(ctx)[0].split(" ", maxsplit=2 if len(param.opts) > 1 else 1)[-1]
+    if param.nargs > 1:
+        return " ".join(["NUMBER"] * param.nargs)
+    placeholder = placeholder.replace(" range>", ">")
     kind = re.sub(r"<(?:list\[)?([\w ]+)\]?>", r"\1", placeholder)
     return TYPES.get(kind.lower(), "TEXT") if kind != placeholder or kind.isupper() else kind
 
@@ -211,7 +220,8 @@ def _record(param: Any, ctx: Any) -> tuple[str, str]:
         text += " Can be repeated."
     default = param.default
     if takes_value and param.show_default and default not in (None, "", ()) and not callable(default):
-        text += f" [default: {getattr(default, 'value', default)}]"
+        value = " ".join(map(str, default)) if isinstance(default, tuple) else getattr(default, "value", default)
+        text += f" [default: {value}]"
     return f"{names} {_metavar(param, ctx)}" if takes_value else names, text
 
 

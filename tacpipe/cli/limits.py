@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from tacpipe.tasks.touch.limits import Limits
 
 ABOUT = (
-    "\n\nPairs of grasps: how alike the readings of two grasps of one object are, by the distance of the grasps, and the "
-    "skill of a predictor that errs by as much. Near pairs differ in pose too, so at least that skill can be reached. "
-    "Learning curve: skill on known objects by the number of training grasps of each. Other finger: skill if the reading "
-    "of the other finger were given. Skill is 1 - RMSE / RMSE of the constant. Takes minutes."
+    "\n\nPairs of grasps: the similarity of the readings of two grasps of one object, by the distance of the grasps, and "
+    "the skill of a predictor with the same error. Near pairs also differ in pose, so this skill is a lower bound. "
+    "Learning curve: the skill on known objects, by the number of training grasps per object. Other finger: the skill if "
+    "the model also reads the other finger. Skill is 1 - RMSE / RMSE of the constant. The command takes minutes."
 )
 EXAMPLE = "\n\nExample: tacpipe limits data/grasps -o results/limits.json"
 HEADER = '{"schema_version": 1, "limits"'  # Start of the file
@@ -37,12 +37,12 @@ def add(program: typer.Typer, summary: str) -> None:
 def limits(
     grasps: Annotated[Path, typer.Argument(help="Dataset of grasps with readings.")],
     sizes: Annotated[
-        str, typer.Option("--sizes", help="Training grasps of each object, with commas between.")
+        str, typer.Option("--sizes", help="Training grasps per object, a comma-separated list.")
     ] = "2,4,8,16,32",
-    draws: Annotated[int, typer.Option("--draws", min=1, help="Draws of folds and training grasps.")] = 2,
-    trees: Annotated[int, typer.Option("--trees", min=1, help="Trees of each forest.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of draws and trees.")] = 0,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write JSON to this file too.")] = None,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="Number of draws of folds and training grasps.")] = 2,
+    trees: Annotated[int, typer.Option("--trees", min=1, help="Number of trees per forest.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of the draws and the trees.")] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Also write JSON to this file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print what limits the prediction of touch on grasps."""

@@ -25,19 +25,19 @@ SCHEMA_VERSION = 1
 REPEATED = ("publish",)  # Settings whose option may be repeated, once per item
 HELP = """
 
-What the table [live] of the rig file states need not be given; options of the command win.
+The table [live] of the rig file can contain the settings. Options of the command override it.
 
-The streams of the rig go through the model's own stages, with no look-ahead, and the model's answers are published. With -o
-the rig is recorded as by `tacpipe acquire`, and answers, alarms and latencies are streams of the recording. The recording
-has priority: where the computer does not keep up, answers are left out and counted.
+The streams of the rig pass through the stages of the model without look-ahead, and the predictions are published. With -o,
+the rig is recorded as by `tacpipe acquire`, and the recording also contains predictions, alarms and latencies. The recording
+has priority: if the computer is too slow, predictions are skipped and counted.
 
 Example: tacpipe live rig.toml --model models/forward -o data/live --publish ws:127.0.0.1:8765
 
 Example: tacpipe live finger.toml --model models/surface -o data/live --publish udp:127.0.0.1:9000
 
-Example: tacpipe live rig.toml --model models/calibrated --quantiles 10,90   # as `tacpipe calibrate` gave it
+Example: tacpipe live rig.toml --model models/calibrated --quantiles 10,90   # from `tacpipe calibrate`
 
-Example: tacpipe live rig.toml --model models/forward --realtime   # on a computer that does other work too
+Example: tacpipe live rig.toml --model models/forward --realtime   # on a busy computer
 
 Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alarms-on data/segments --split data/split"""
 
@@ -46,7 +46,7 @@ def add(program: typer.Typer, summary: str) -> None:
     """Add the command to ``program``, with an option for each setting of every task whose models can run live."""
 
     def live(
-        rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
+        rig: Annotated[Path, typer.Argument(help="Rig file, as for `tacpipe acquire`.")],
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
         duration: Annotated[
             float | None, typer.Option("--duration-s", help="Duration of the session, s; without it until Ctrl-C.")

@@ -51,23 +51,23 @@ def add(program: typer.Typer, summary: str) -> None:
 
     @program.command(
         "run",
-        help=f"{summary}\n\nStages run in the order of their deps and outs, from the folder of the file. A stage whose "
-        "results are there is passed over; one that fails keeps back only what depends on it. Commands of other programs "
-        "are run by the shell, each time.\n\nWith --jobs stages that do not depend on each other run at the same time, "
-        "each with its part of the cores, and what a command prints is printed when it ends.\n\n"
+        help=f"{summary}\n\nStages run in the order of their deps and outs, in the folder of the file. A stage whose "
+        "results exist is skipped. A failed stage stops only the stages that depend on it. Commands of other programs run "
+        "in the shell, each time.\n\nWith --jobs, stages that do not depend on each other run at the same time and share "
+        "the cores. The output of a command is printed when the command ends.\n\n"
         "Example: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\n"
         "Example: tacpipe run dvc.yaml forward --jobs 2",
     )
     def run(
-        file: Annotated[Path, typer.Argument(help="A file with stages, as DVC's dvc.yaml.")],
+        file: Annotated[Path, typer.Argument(help="A file with stages, such as dvc.yaml of DVC.")],
         names: Annotated[
             list[str] | None,
-            typer.Argument(metavar="STAGES", help="Stages to run, with all that they depend on; by default all."),
+            typer.Argument(metavar="STAGES", help="Stages to run, with their dependencies; by default all."),
         ] = None,
         jobs: Annotated[
-            int, typer.Option("--jobs", min=0, help="Stages at the same time, each in its process; 0: one per core.")
+            int, typer.Option("--jobs", min=0, help="Number of stages at a time, each in a process; 0: one per core.")
         ] = 1,
-        quiet: Annotated[bool, typer.Option("--quiet", help="No names of stages, no summary.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="Print neither names of stages nor a summary.")] = False,
     ) -> None:
         chain = chains.load(file, names or ())
         with contextlib.chdir(file.absolute().parent):

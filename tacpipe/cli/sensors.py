@@ -38,7 +38,7 @@ def add(program: typer.Typer, summary: str) -> None:
 def list_(as_json: AsJson = False) -> None:
     """List the sensors that a rig file can name.
 
-    Each with its links, its rate and a description.
+    Prints the links, the rate and a description of each.
 
     Example: tacpipe sensors list
     """

@@ -33,7 +33,7 @@ OtherStore = Annotated[
 AtRemote = Annotated[
     str | None, typer.Option("--remote", metavar="STORE", help="Other store to work on, a directory or an address.")
 ]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace the content of the directory.")]
 Ancestors = Annotated[bool, typer.Option("--ancestors", help="Include the shards of all ancestors.")]
 
 
@@ -46,7 +46,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
 
 def init() -> None:
-    """Make this folder a project with a store of its own.
+    """Make this folder a project with its own store.
 
     Datasets in the folders below use this store, unless a project among these
     folders is marked by pyproject.toml, dvc.yaml, params.yaml or .git.
@@ -83,7 +83,7 @@ def status(as_json: AsJson = False) -> None:
 def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
     """List the datasets in the store, including replaced ones.
 
-    Each with stage, time, number of recordings and labels, and last path.
+    Prints the stage, time, number of recordings and labels, and last path of each.
 
     Example: tacpipe store list
     """
@@ -179,12 +179,10 @@ def gc(
     grace_days: Annotated[
         float, typer.Option("--grace-days", help="Days for which a dataset at an unreachable path is kept.")
     ] = garbage.GRACE_DAYS,
-    forget: Annotated[
-        list[str] | None, typer.Option("--forget", help="Dataset, pushed or deleted, to keep no longer.")
-    ] = None,
+    forget: Annotated[list[str] | None, typer.Option("--forget", help="Pushed or deleted dataset to forget.")] = None,
     remote: AtRemote = None,
     cache: Annotated[
-        bool, typer.Option("--cache", help="Remove local copies of what the bucket of TACPIPE_STORE has.")
+        bool, typer.Option("--cache", help="Remove local copies of objects in the bucket of TACPIPE_STORE.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -265,11 +263,11 @@ def push(
     datasets: Paths,
     ancestors: Ancestors = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Check the content of what is there already, not only its size.")
+        bool, typer.Option("--verify", help="Compare the content of existing objects, not only their size.")
     ] = False,
     replace: Annotated[
         bool,
-        typer.Option("--replace", help="Push over what another computer pushed there; that stays in the history."),
+        typer.Option("--replace", help="Push over a dataset of another computer; it stays in the history."),
     ] = False,
     project: Annotated[
         str, typer.Option("--project", metavar="NAME", help="Push as this project of the other store, now and later.")

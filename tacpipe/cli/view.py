@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from tacpipe.viewer.contents import DrawnContents
 
 EXAMPLE = (
-    "\n\nTaxels at the cursor, streams, contacts, labels, gaps, the arm, clouds and cameras on one time axis. Several "
-    "recordings are in the viewer's own list. Nothing is sent over the network."
+    "\n\nShows taxels at the cursor, streams, contacts, labels, gaps, the arm, clouds and cameras. The viewer lists "
+    "several recordings. Nothing is sent over the network."
     "\n\nExample: tacpipe view data/recordings trial-003 --predictions data/predictions"
 )
 MAGIC, ENDING = b"RRF", ".rrd"  # First bytes and suffix of a Rerun file
@@ -46,11 +46,14 @@ def view(
     ] = None,
     fold: Annotated[int, typer.Option("--fold", help="Fold of the split.")] = 0,
     predictions: Annotated[
-        Path | None, typer.Option("--predictions", help="What `tacpipe predict` or `tacpipe evaluate` wrote of them.")
+        Path | None, typer.Option("--predictions", help="Output of `tacpipe predict` or `tacpipe evaluate`.")
     ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, help="Maximum number of recordings, by name.")] = LIMIT,
     all_rows: Annotated[
-        bool, typer.Option("--all-rows", help="All rows of streams over 30,000 rows, not their envelope; slower.")
+        bool,
+        typer.Option(
+            "--all-rows", help="Draw every row of streams over 30,000 rows instead of their envelope; slower."
+        ),
     ] = False,
     save: Annotated[
         Path | None,

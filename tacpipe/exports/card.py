@@ -196,7 +196,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write a dataset card: Parquet, README.md, Croissant.
 
-    Rows have native rates and types and a column with the recording's name; the folder can be uploaded as it is.
+    Rows have native rates and types, and a column with the name of the recording. The folder can be uploaded unchanged.
 
     Example: tacpipe export card data/recordings -o exports/card --license cc-by-4.0
     """

@@ -63,8 +63,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as CSV files that can be read back.
 
-    One file per stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives values, stamps, types, units and
-    labels back.
+    One file per stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` restores values, stamps, types, units
+    and labels.
 
     Example: tacpipe export csv data/recordings -o exports/csv
     """

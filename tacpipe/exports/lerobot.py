@@ -109,7 +109,7 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     """Write recordings as a LeRobot dataset (v3.0).
 
     Frames at one rate: synchronized recordings, or any with ``--rate-hz``. The robot's streams are observation.state,
-    tactile ones observation.tactile.STREAM; the shards as they were given are under tacpipe/.
+    tactile ones observation.tactile.STREAM; the original shards are under tacpipe/.
 
     Example: tacpipe export lerobot data/recordings -o exports/lerobot --rate-hz 50 --actions robot
     """

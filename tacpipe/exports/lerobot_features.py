@@ -29,12 +29,12 @@ class Params:
     rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
     master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
     state: Names = ""  # streams of observation.state; without it those with joints or a pose
-    tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read nothing else
+    tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read only it
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
     common: bool = False  # leave out columns that not all recordings have
     task: str = "touch"  # text of the task, with labels in braces
     robot_type: str = ""  # name of the robot in info.json
-    originals: bool = True  # put the shards as they were given under tacpipe/
+    originals: bool = True  # store the original shards under tacpipe/
 
 
 @dataclass(frozen=True)

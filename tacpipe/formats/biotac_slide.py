@@ -79,7 +79,7 @@ def recording_name(material: int, trial: int) -> str:
 def biotac_slide(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of a BioTac over materials.
 
-    Returns the stream biotac and the recorded streams of the arm. NaN in angular velocity is kept.
+    Each recording has the stream biotac and the recorded streams of the arm. NaN in angular velocity is kept.
     """
     from tacpipe.formats import published, xela
 

@@ -42,8 +42,8 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     """Read published videos of two GelSight Mini, with slip.
 
-    Returns the streams gel0 and gel2, a row per frame, and the labels object and slip. A trial with a slip ends at the
-    slip, so the length of a recording reveals the label.
+    Each recording has the streams gel0 and gel2, with one row per frame, and the labels object and slip. A trial with a
+    slip ends at the slip, so the length of a recording reveals the label.
     """
     from tacpipe.video.files import read_stream, scan
 

@@ -27,7 +27,7 @@ PREFIX = "data_sample_"
 class Params(StreamSelection):
     """How trials are read."""
 
-    # part of the authors' split that this folder is; empty: none
+    # part of the authors' split in this folder; empty: none
     authors_role: Literal["", "train", "val", "test"] = ""
 
 

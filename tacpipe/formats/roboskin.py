@@ -53,8 +53,8 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # numeric dtype with its size in bytes
 class Params(StreamSelection):
     """How slides are read."""
 
-    rate_hz: Rate = 50.0  # frames per second of the stamps; nominal, the set does not state
-    # time: frames in order of time; authors: in the order in which they were published, to compare with
+    rate_hz: Rate = 50.0  # frames per second of the time stamps; nominal, because the set does not state it
+    # time: frames in order of time; authors: in the published order, for comparisons
     layout: Literal["time", "authors"] = "time"
 
 
@@ -92,8 +92,8 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def roboskin(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of an iCub RoboSkin.
 
-    Returns the stream roboskin: 60 columns, triangle by triangle, one row per frame; timestamps follow from the mean
-    rate.
+    Each recording has the stream roboskin: 60 columns, triangle by triangle, and one row per frame. Time stamps follow
+    from the mean rate.
     """
     import numpy as np
 

@@ -63,7 +63,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     """Read published grasps with a point cloud and BioTac SPs.
 
-    Returns the streams cloud, grasp and reading; grasps with the reading of an earlier grasp are marked.
+    Each recording has the streams cloud, grasp and reading; grasps with the reading of an earlier grasp are marked.
     """
     import numpy as np
 

@@ -35,7 +35,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def xela_flat(params: Params, files: Files) -> RecordingOutput:
     """Read published trials of two XELA uSkin, flat folder.
 
-    Returns the streams xela1, xela2, robot, marker1 and marker2; an unseen marker is NaN.
+    Each recording has the streams xela1, xela2, robot, marker1 and marker2; a marker that was not visible is NaN.
     """
     import numpy as np
 

@@ -33,7 +33,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 def xela_psc(params: Params, files: Files) -> RecordingOutput:
     """Read published trials of two XELA uSkin, with slip.
 
-    Returns the streams xela1, xela2, robot, marker and slip; an unseen marker is NaN.
+    Each recording has the streams xela1, xela2, robot, marker and slip; a marker that was not visible is NaN.
     """
     import numpy as np
     import pyarrow as pa

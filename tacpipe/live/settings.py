@@ -53,10 +53,10 @@ class TaskSettings:
 class Settings:
     """Settings common to sessions of all tasks, and those of the task. Names are those of options, with ``_`` for ``-``."""
 
-    model: str = ""  # Trained model, as of `tacpipe train`
+    model: str = ""  # Model that tacpipe train wrote
     publish: tuple[str, ...] = ()  # Address to publish to: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE
-    settle_ms: Annotated[float, Range(0, 1000)] = 2.0  # Time after a row in which its samples are awaited, ms [2]
-    realtime: bool = False  # Real-time scheduling of the session, where the system allows it
+    settle_ms: Annotated[float, Range(0, 1000)] = 2.0  # Waiting time for the samples of a row, ms [2]
+    realtime: bool = False  # Real-time scheduling of the session, if the system allows it
     allow_look_ahead: bool = False  # Accept a model that was trained on rows that look ahead
     task: TaskSettings = field(default_factory=TaskSettings)  # settings of the model's task
     places: Mapping[str, str] = field(default_factory=dict, compare=False)  # file and table of each key set in a file

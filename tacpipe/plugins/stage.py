@@ -288,7 +288,7 @@ class Channels:
     quantity: str
     units: tuple[str, ...]  # accepted units; empty for any single unit
     description: str  # number of columns, and their components or streams
-    without: str = ""  # consequence if they are missing; empty if they are required
+    without: str = ""  # sentence on the consequence if they are missing; empty if they are required
     stream: str = ""  # stream with the columns, if the task looks for it by name
 
 
@@ -322,8 +322,8 @@ class Requirements:
         chain = ", then ".join(f"tacpipe {stage}" for stage in self.stages)
         lines = [f"tacpipe train {self.task} reads the output of", f"  {chain}"]
         lines += [f"  (optional: {stage})" for stage in self.optional_stages]
-        lines += ["", "roles of the split", *_wrapped(self.roles, "  "), ""]
-        lines += ["channels: found by the quantity and unit of a column, in any stream unless one is named"]
+        lines += ["", "roles in the split", *_wrapped(self.roles, "  "), ""]
+        lines += ["channels, selected by the quantity and unit of a column, in any stream unless a stream is named"]
         for channel in self.channels:
             place = f", stream {channel.stream}" if channel.stream else ""
             head = f"  {channel.quantity} [{' or '.join(channel.units) or 'any unit'}]{place}: "
@@ -337,14 +337,14 @@ class Requirements:
             ]
         lines += [
             "",
-            "A layout file sets them: quantity, unit, component and {taxel} in [streams.NAME] columns, labels in [[labels]]",
-            "or [attributes]. `tacpipe label DATASET --from TABLE` sets labels afterwards.",
+            "Set quantity, unit, component and {taxel} in the [streams.NAME] columns of a layout file, and labels in its",
+            "[[labels]] or [attributes]. tacpipe label DATASET --from TABLE sets labels later.",
         ]
         return "\n".join(lines)
 
 
 def _need(without: str) -> str:
-    return f"Optional: {without}." if without else "Needed."
+    return f"Optional. {without}" if without else "Required."
 
 
 def _wrapped(text: str, head: str) -> list[str]:

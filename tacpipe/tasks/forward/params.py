@@ -47,7 +47,7 @@ class ForwardModelParams(ABC):
     seed: Seed = 0  # random seed of initial weights and of the order of windows
     context: PositiveInt = 10  # past rows that the model reads
     horizon: PositiveInt = 10  # future rows that it predicts
-    baselines: bool = True  # also fit the linear baselines, for comparison by evaluate
+    baselines: bool = True  # also fit the linear baselines, with which evaluate compares the model
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
     # networks with different random weights whose forecasts are averaged
@@ -264,34 +264,45 @@ class ForwardConfig(ModelConfig):
 REQUIREMENTS = Requirements(
     "forward",
     stages=("synchronize", "segment contacts"),
-    optional_stages=("compress pca or compress autoencoder: a model of latents",),
-    roles="one recording or more with the role train, and one or more with val",
+    optional_stages=("compress pca or compress autoencoder, for a model of latents",),
+    roles="one or more recordings with the role train, and one or more with val",
     channels=(
         Channels(
             "tactile",
             (),
-            "1 or more columns of one or more streams, any number of taxels and axes; {taxel} and {axis} in the rule of a "
-            "column state where it lies, and then the model reads taxel by taxel",
+            "1 or more columns of one or more streams, with any number of taxels and axes. If the rules of the columns "
+            "contain {taxel} and {axis}, the model reads each taxel separately",
         ),
         Channels(
             arm.POSITION,
             tuple(arm.METRES),
-            "x, y and z of the hand, in one stream (--arm names it where several have a position)",
-            "train with --actions none",
+            "x, y and z of the hand, in one stream; --arm selects it if several have a position",
+            "Without it, train with --actions none.",
         ),
         Channels(
             arm.ORIENTATION,
             ("1",),
             "the quaternion x, y, z, w of the hand, in the stream of the position",
-            "the hand is taken to keep its orientation",
+            "Without it, the orientation is assumed to be constant.",
         ),
         Channels(
             "joint_position",
             ("rad",),
-            "7 angles in the stream of the position, with as many of joint_velocity [rad/s]",
-            "velocities are differences of the pose, as with any arm but a Franka",
+            "7 angles in the stream of the position, with 7 columns of joint_velocity [rad/s]",
+            "Without them, velocities are differences between poses, as for any arm other than a Franka.",
         ),
-        Channels(arm.WIDTH, tuple(arm.METRES), "the width between the fingers, 1 column", "it counts as constant"),
+        Channels(
+            arm.WIDTH,
+            tuple(arm.METRES),
+            "the distance between the fingers, 1 column",
+            "Without it, the distance is assumed to be constant.",
+        ),
     ),
-    labels=(Label("object", "what is held, any value", "known and novel objects are not reported apart"),),
+    labels=(
+        Label(
+            "object",
+            "the grasped object, any value",
+            "Without it, known and novel objects are not reported separately.",
+        ),
+    ),
 )

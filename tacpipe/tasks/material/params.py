@@ -60,15 +60,16 @@ class MaterialModelParams(ABC):
     ALIGNS_SENSORS: ClassVar[bool] = False  # True if networks can be aligned to the frozen one of the --init model
     IS_READOUT: ClassVar[bool] = False  # True for one linear readout per sensor, fitted in closed form
     architecture: str = "minirocket"
-    sensors: Names = ""  # sensors to learn for; empty for all
-    # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)
+    sensors: Names = ""  # sensors to train on; empty: all
+    # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings per frame)
     quantities: Names = ""
     # label of this run in a report, next to others of the same method, as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
     seed: Seed = 0  # random seed of kernels, initial weights, the order of slides and pairs
-    # label of the recordings that names the classes: whole numbers or any text
+    # label that contains the class of a recording, a whole number or any text
     label: str = added(KEY)
-    baselines: bool = True  # fit the mean-level and shuffled-label baselines too, for evaluate to compare with
+    # also fit the mean-level and shuffled-label baselines, with which evaluate compares the model
+    baselines: bool = True
     # labels to learn; permuted: those of the training slides in random order, a negative control
     labels: Literal["true", "permuted"] = "true"
     PANELS: ClassVar[Panels] = {
@@ -125,7 +126,7 @@ class Minirocket(MaterialModelParams):
     IS_READOUT: ClassVar[bool] = True
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     features: Annotated[int, Range(84)] = 10_000  # features of each sensor
-    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
     PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
@@ -153,7 +154,7 @@ class Statistics(MaterialModelParams):
     architecture: Literal["statistics"] = "statistics"
     IS_READOUT: ClassVar[bool] = True
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
-    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of statistics and a readout for each sensor."""
@@ -180,7 +181,7 @@ class Spectra(MaterialModelParams):
     # spectra: power over spatial frequency
     architecture: Literal["spectra"] = "spectra"
     TITLE: ClassVar[str] = "spatial spectra"
-    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # metres a second of slides whose recordings have no speed
     speeds: Annotated[str, Assignments(PositiveFloat)] = "biotac=0.025,roboskin=0.05"
@@ -198,7 +199,7 @@ class Spectra(MaterialModelParams):
 class Estimator(MaterialModelParams, ABC):
     """A scikit-learn estimator per sensor on features of a slide; base class for architectures."""
 
-    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
     # types, such as sklearn.tree._tree.Tree, that a stored estimator may contain although skops does not validate them
     TRUSTED: ClassVar[Sequence[str]] = ()
 

@@ -46,37 +46,41 @@ REQUIREMENTS = Requirements(
     "material",
     stages=("segment slides",),
     optional_stages=(),
-    roles="two classes or more with the role train; networks need recordings of each sensor with val too",
+    roles="two or more classes with the role train; networks also need recordings of each sensor with the role val",
     channels=(
         Channels(
             "tactile",
             (),
-            "1 or more columns of one stream, any number of taxels and axes, the same in all recordings of a sensor",
+            "1 or more columns of one stream, with any number of taxels and axes, equal in all recordings of a sensor",
         ),
         Channels(
             "vibration",
             (),
-            "any number of columns of the same stream, which minirocket and statistics read too",
-            "tactile channels alone are read",
+            "any number of columns of the same stream, for minirocket and statistics",
+            "Without them, only tactile channels are read.",
         ),
         Channels(
             "static_pressure",
             ("count",),
-            "1 column, by which segment slides finds where a slide begins",
-            "give segment slides --trigger load, for any sensor, or recordings that are cut alike already",
+            "1 column, whose rise starts a slide in segment slides",
+            "Without it, use segment slides --trigger load, or recordings that contain only the slide.",
         ),
         Channels(
             "position",
             ("m", "cm", "mm"),
-            "x, y and z of the finger, or velocity [m/s], by which segment slides finds where the finger moves",
-            "a slide is all of the contact",
+            "x, y and z of the finger, or velocity [m/s], from which segment slides detects motion of the finger",
+            "Without it, a slide is the complete contact.",
         ),
     ),
     labels=(
-        Label(KEY, "the class: a whole number from 0 or any text; --label names another label"),
-        Label("sensor", "the product, any text: recordings of one sensor are learned together"),
-        Label("rate_hz", "rows a second", "the median step of the time stamps gives it"),
-        Label("session", "the day or mounting, any text", "the report cannot distinguish materials from sessions"),
+        Label(KEY, "the class, a whole number from 0 or any text; --label selects another label"),
+        Label("sensor", "the product, any text; recordings of one sensor are learned together"),
+        Label("rate_hz", "rows per second", "Without it, the rate follows from the median time step."),
+        Label(
+            "session",
+            "the day or mounting, any text",
+            "Without it, the report cannot distinguish materials from sessions.",
+        ),
     ),
 )
 
@@ -93,8 +97,8 @@ class MaterialTask(Task):
     ) -> Result:
         """Train a classifier of materials on slides.
 
-        It learns each sensor separately, or several sensors jointly. ``--init`` gives a model whose network for
-        ``--frozen-sensor`` does not change, while the latents of the other sensors are aligned to it.
+        Sensors are trained separately or jointly. With ``--init``, the network of that model for ``--frozen-sensor``
+        does not change, and the latents of the other sensors are aligned to it.
 
         Example: tacpipe train material data/slides --split data/slides-split -o models/material
         """

@@ -44,11 +44,11 @@ class TouchModelParams(ABC):
     ARCHITECTURES: ClassVar[str] = "touch"  # name of the task in entry points
     architecture: str = "tree-ensemble"
     targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
-    # label of this run in a report, next to others of the same method, as blocked
+    # name of this run in a report, to distinguish runs of the same method, such as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
     seed: Seed = 0  # random seed of initial weights, the order of grasps, drawn points and cuts
-    baselines: bool = True  # keep the training readings, for evaluate to compare with constant, object mean and nearest
-    use_validation: bool = True  # learn from validation grasps too where nothing is chosen by them
+    baselines: bool = True  # store the training readings, from which evaluate computes the baselines
+    use_validation: bool = True  # also train on validation grasps if nothing is chosen by them
     PANELS: ClassVar[Panels] = {
         "Model": (
             *(
@@ -93,11 +93,12 @@ class Trees(TouchModelParams):
     architecture: Annotated[
         Literal["tree-ensemble", "trees"], StoredAs("architecture", {"tree-ensemble": "strong"})
     ] = "tree-ensemble"
-    inputs: Literal["rgb", "xyz"] = "rgb"  # columns of a cloud: places and colours, or only places
-    place: bool = False  # also read the position of the grasp relative to the camera
-    trees: PositiveInt = 300  # trees of each target's forest
-    leaf: NonNegativeInt = 0  # fewest training grasps of a leaf; 0: chosen of 2, 4 and 8 by out-of-bag error
-    # shrink predictions for novel objects towards the constant, by the fraction with the least error on omitted objects
+    # xyz: positions of points; rgb: positions and colours; pointnet: cont adds contact points, pose the wrist
+    inputs: Literal["rgb", "xyz"] = "rgb"
+    place: bool = False  # also read the position of the grasp in the camera frame
+    trees: PositiveInt = 300  # number of trees per forest
+    leaf: NonNegativeInt = 0  # minimum number of training grasps per leaf; 0: 2, 4 or 8, by out-of-bag error
+    # shrink predictions for novel objects towards the constant, by the fraction with the smallest error on left-out objects
     shrink_novel: bool = added(False)
     PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
 
@@ -173,14 +174,15 @@ class PointNetwork(TouchModelParams, ABC):
 class Patches(PointNetwork):
     """Networks on points near both contacts, in the axes of the grasp."""
 
-    # patches: networks that read points about both contacts
+    # patches: networks that read points near both contacts
     architecture: Literal["patches"] = "patches"
-    inputs: Literal["rgb", "xyz"] = "rgb"  # columns of a point: place and colour, or only place
-    place: bool = False  # read where the grasp is before the camera too, not its shape alone
-    backbone: Literal["points", "edges"] = "points"  # points: each alone; edges: each with its nearest ones
-    radius_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0  # radius of the patch about a contact
-    hidden: Annotated[int, Range(2)] = 256  # units of the first layer behind the points
-    dropout: Dropout = 0.3  # fraction of these left out of each training step
+    # xyz: positions of points; rgb: positions and colours; pointnet: cont adds contact points, pose the wrist
+    inputs: Literal["rgb", "xyz"] = "rgb"
+    place: bool = False  # also read the position of the grasp in the camera frame
+    backbone: Literal["points", "edges"] = "points"  # points: each point separately; edges: with its neighbours
+    radius_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0  # radius of the patch around a contact
+    hidden: Annotated[int, Range(2)] = 256  # units of the first layer after the points
+    dropout: Dropout = 0.3  # fraction of these units dropped in each training step
     PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
 
     @property
@@ -215,9 +217,9 @@ class Pointnet(PointNetwork):
     # pointnet: the paper's network
     architecture: Literal["pointnet"] = "pointnet"
     TITLE: ClassVar[str] = "PointNet"
-    # inputs: place (xyz) or place and colour (rgb) of points, with contact points (cont) and wrist (pose)
+    # xyz: positions of points; rgb: positions and colours; pointnet: cont adds contact points, pose the wrist
     inputs: Literal["xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose"] = "rgbcont"
-    # normalisation of a cloud; minmax of each axis; wrist's axes
+    # normalisation of a cloud; minmax: of each axis; wrist: axes of the wrist
     normalisation: Literal["none", "sphere", "minmax", "wrist"] = "none"
     # largest random rotation about each axis in training
     rotation_deg: Annotated[float, Range(0, 180), Unit("degrees")] = 0.0

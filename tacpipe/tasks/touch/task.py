@@ -46,39 +46,45 @@ def demo(output: Path) -> Demo:
 REQUIREMENTS = Requirements(
     "touch",
     stages=("segment grasps",),
-    optional_stages=("ingest vision2tactile, whose recordings are grasps already",),
-    roles="one grasp or more with the role train; val where a network is chosen by it (--select best)",
+    optional_stages=("ingest vision2tactile, whose recordings are already grasps",),
+    roles="one or more grasps with the role train; also with the role val if networks are chosen by it (--select best)",
     channels=(
         Channels(
             "position",
             ("m",),
-            "x_m, y_m, z_m of each point of the object's visible side, 3 points or more, in the camera's frame",
+            "x_m, y_m, z_m of each point on the visible side of the object, 3 or more points, in the frame of the camera",
             stream="cloud",
         ),
-        Channels("colour", ("count",), "red, green, blue of each point", "--inputs xyz reads none", stream="cloud"),
+        Channels(
+            "colour", ("count",), "red, green, blue of each point", "Without them, use --inputs xyz.", stream="cloud"
+        ),
         Channels(
             "grasp",
             ("m",),
-            "one row with g1_x_m … g2_z_m, where both fingers are to close, in the frame of the cloud",
+            "one row with g1_x_m … g2_z_m, the points where the fingers close, in the frame of the cloud",
             stream="grasp",
         ),
         Channels(
             "wrist",
             ("1",),
             "wrist_x_x … wrist_z_z, the axes of the wrist in the frame of the cloud",
-            "the line of sight represents it, or --wrist estimated",
+            "Without them, the line of sight replaces them, or --wrist estimated.",
             stream="grasp",
         ),
         Channels(
             "tactile",
             ("count",),
-            "one row with mf_electrode01 … th_electrode24 and the fluid's pressure mf_pdc, th_pdc, of two BioTac SP",
+            "one row with mf_electrode01 … th_electrode24 and the fluid pressures mf_pdc, th_pdc of two BioTac SP",
             stream="reading",
         ),
     ),
     labels=(
-        Label("object", "what is grasped, any text", "the mean of an object is not a baseline, and no object is novel"),
-        Label("session", "the day, any text", "days cannot be left out by split"),
+        Label(
+            "object",
+            "the grasped object, any text",
+            "Without it, the mean of an object is not a baseline, and no object is novel.",
+        ),
+        Label("session", "the day, any text", "Without it, tacpipe split cannot leave out days."),
     ),
 )
 

@@ -36,11 +36,11 @@ class ForwardSettings(TaskSettings):
     plan: str = MEASURED
     plan_from: str = ""  # IP address whose plans are accepted, for --plan udp:HOST:PORT
     steps: tuple[PositiveInt, ...] = ()  # Steps ahead that are published; all by default
-    quantiles: tuple[PositiveInt, ...] = ()  # Quantiles published next to forecasts, percent, as 10,90; none by default
-    # False alarms per hour that each alarm may give; 0: no alarms (default)
+    quantiles: tuple[PositiveInt, ...] = ()  # Quantiles to publish, percent, such as 10,90; none by default
+    # Accepted false alarms per hour and kind of alarm; 0: no alarms (default)
     alarms_per_hour: Annotated[float, Range(0, below=1e6)] = 0.0
-    alarms_on: str = ""  # Recordings that the levels of alarms are set on
-    split: str = ""  # Split whose validation recordings --alarms-on means
+    alarms_on: str = ""  # Recordings for setting the thresholds of alarms
+    split: str = ""  # Split whose validation recordings of --alarms-on are used
 
     @classmethod
     def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:

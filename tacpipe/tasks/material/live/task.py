@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 class MaterialSettings(TaskSettings):
     """Settings of a session with a material model."""
 
-    sensor: str = ""  # Sensor of the rig, of those that the model knows; by default its only one
+    sensor: str = ""  # Sensor of the rig; by default the only sensor of the model
     every_ms: Annotated[float, Range(10, 10_000)] = 100.0  # Time between two answers, ms [100]
-    # Fraction of a slide before which its material is unknown [0.25]
+    # Fraction of a slide that must arrive before its material is named [0.25]
     least: Annotated[float, Range(above=0, maximum=1)] = MIN_SEEN
-    # Pause after which a slide is over and another may begin, s; 0: a recording is one slide [0]
+    # Pause that ends a slide, s; 0: one slide per recording [0]
     pause_s: Annotated[float, Range(0, 60)] = 0.0
 
 
