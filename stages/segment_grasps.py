@@ -92,8 +92,8 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
     attributes: dict[str, int] = {}
     try:
         if "scene" in streams:
-            scene = Cloud.of(streams.pop("scene"))
-            rows = object_rows(scene, Grasp.of(streams["grasp"]), limits, params.seed)
+            scene = Cloud.from_table(streams.pop("scene"))
+            rows = object_rows(scene, Grasp.from_table(streams["grasp"]), limits, params.seed)
             colours = None if scene.colours is None else scene.colours[rows]
             streams["cloud"] = Cloud(scene.points_m[rows], colours).table()
         if "biotac_sp" in streams:

@@ -115,7 +115,7 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
             f"Recording {name} of {path} has no cloud; it {describe_streams(shards[name].streams)}. Give what "
             f"`tacpipe ingest` or `tacpipe segment grasps` made of grasps."
         )
-    return Cloud.of(shards[name].table("cloud"))
+    return Cloud.from_table(shards[name].table("cloud"))
 
 
 def _name_excerpt(names: list[str]) -> str:

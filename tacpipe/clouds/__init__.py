@@ -1,1 +1,1 @@
-"""Clouds of points and the grasps made on them: reading, segmenting, sampling, normalising; open3d is used here alone."""
+"""Read, segment, sample and normalise point clouds and the grasps on them. Only this package imports open3d."""

@@ -1,10 +1,10 @@
-"""Grasps that two fingers could make on an object seen by one camera, best first.
+"""Propose grasps of two fingers on an object seen by one camera, best first.
 
-The way of GeoGrasp (Zapata-Impata, Gil, Pomares, Torres: "Fast geometry-based computation of grasping points on
-three-dimensional point clouds", 2019): a plane at right angles to the object's first principal axis cuts the cloud, and the
-fingers close on the two edges of the cut that lie farthest apart across the view. As in the letter (RA-L 2020, data
-collection) the plane is shifted along the axis at random. Among the points of both edges that pair is taken whose line
-meets both surfaces most squarely, runs across the axis and the view, and stays near the plane.
+The method is GeoGrasp (Zapata-Impata, Gil, Pomares, Torres: "Fast geometry-based computation of grasping points on
+three-dimensional point clouds", 2019): a plane perpendicular to the object's first principal axis cuts the cloud, and
+the fingers close on the two edges of the cut that are farthest apart across the view. As in the letter (RA-L 2020, data
+collection), the plane is shifted along the axis at random. Among the pairs of points of both edges, the best pair has a
+line that is normal to both surfaces, perpendicular to the axis and the view, and close to the plane.
 """
 
 from __future__ import annotations
@@ -29,35 +29,39 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COUNT = 10
-SHIFT = 0.4  # fraction of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
-OPENING_M = (0.020, 0.130)  # least and largest opening; the published grasps have 0.026 to 0.121
-MIN_POINTS = 50  # points of a cloud that states a shape; published ones have 814 and more
-MAX_POINTS = 20_000  # points that are looked at: more add time and no shape
-MIN_CUT_POINTS = 6  # points of a cut
-FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published one has 0.026
+SHIFT = 0.4  # fraction of the object's length; 90 % of the published grasps are within 0.33 of its middle
+OPENING_M = (0.020, 0.130)  # minimum and maximum opening; the published grasps have 0.026 to 0.121
+MIN_POINTS = 50  # minimum for estimating a shape; published clouds have 814 or more
+MAX_POINTS = 20_000  # larger clouds are subsampled: more points cost time and do not change the shape
+MIN_CUT_POINTS = 6  # minimum number of points in a cut
+FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published cloud has 0.026
 HALF_CUT_M = 0.007  # half the thickness of a cut, as in GeoGrasp
-TRIM = 0.02  # fraction of a cut's points at either end that may be stray
-EDGE = 0.2  # fraction of a cut's width that is an edge
-TRIES = 3  # cuts for each candidate, of which the best stays
-UPRIGHT = 0.9  # cosine to the view above which the object stands towards the camera and its axis is of no use
-OFF_PLANE = 0.4  # weight of the mean distance to the plane, against 1 for each cosine; chosen on the published grasps
-OFF_CENTRE = 0.5  # weight of the distance to the centroid: what is held far from it turns in the hand
-FIRST = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # g1 to g2 points right and down in the picture in all published grasps
+TRIM_FRACTION = 0.02  # fraction of a cut's points at either end that is ignored as stray
+EDGE_FRACTION = 0.2  # fraction of a cut's width that counts as an edge
+TRIES = 3  # cuts tried for each candidate; the best one is used
+MAX_VIEW_COSINE = 0.9  # cosine to the view above which the object points at the camera, so its axis is not used
+OFF_PLANE_WEIGHT = 0.4  # weight of the mean distance to the plane (each cosine has 1); chosen on the published grasps
+OFF_CENTRE_WEIGHT = (
+    0.5  # weight of the distance to the centroid: an object that is gripped far from it rotates in the hand
+)
+G1_TO_G2 = np.array([1.0, 1.0, 0.0]) / np.sqrt(
+    2
+)  # g1 to g2 points right and down in the picture in all published grasps
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A grasp that could be made, and what speaks for it."""
+    """A possible grasp and its score."""
 
     grasp: Grasp
-    score: float  # 1 at best; less for each thing that is off
-    off_deg: float  # angle between the closing axis and the surface's normal, at the finger where it is larger
+    score: float  # at most 1; each deviation from the ideal lowers it
+    off_deg: float  # angle between the closing axis and the surface normal, at the finger where it is larger
     shift_m: float  # along the first axis from the centroid to the cut
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """A cloud's own directions: along the object, across it as the camera sees it, and the way the camera looks."""
+    """A cloud's axes: along the object, across it as the camera sees it, and the viewing direction."""
 
     centre_m: Floats  # (xyz)
     along: Floats
@@ -74,16 +78,16 @@ def candidates(
     opening_m: tuple[float, float] = OPENING_M,
     camera_m: Sequence[float] = CAMERA_M,
 ) -> list[Candidate]:
-    """Return up to ``count`` grasps spread along the object, best first; the same arguments give the same ones.
+    """Return up to ``count`` grasps spread along the object, best first. The result is deterministic.
 
-    The cuts lie up to ``shift`` of the object's length from its centroid on either side, one in each of ``count`` equal
-    stretches; a stretch where no pair is ``opening_m`` apart has none. Grasp points are points of the cloud. The wrist's
-    axes are approach (the line of sight to the middle of the pair, less its share along the closing axis), closing axis
-    and their cross product. Raises `TacpipeError` for a cloud too small or flat, for a camera within it, and where no cut
-    is as wide as the fingers open; `UsageError` for arguments that cannot be.
+    The cuts are within ``shift`` of the object's length from its centroid, one in each of ``count`` equal intervals. An
+    interval without a pair that is ``opening_m`` apart has no candidate. Grasp points are points of the cloud. The
+    wrist's axes are the approach (the line of sight to the middle of the pair, made perpendicular to the closing axis),
+    the closing axis, and their cross product. Raises `TacpipeError` if the cloud is too small or flat, the camera is
+    inside it, or no cut fits between the fingers; `UsageError` if an argument is out of range.
     """
-    _require_possible(count, shift, opening_m)
-    cloud = _thinned(cloud, seed)
+    _validate_arguments(count, shift, opening_m)
+    cloud = _subsample(cloud, seed)
     frame = _frame(cloud, camera_m)
     cuts = _Cuts(cloud, frame, camera_m, opening_m)
     bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
@@ -95,20 +99,20 @@ def candidates(
         if feasible:
             chosen.append(max(feasible, key=lambda candidate: candidate.score))
         if not shift:
-            break  # every stretch is the same point
+            break  # all intervals are the same point
     if not chosen:
         raise TacpipeError(_explain_no_grasp(cuts.widths_m, opening_m))
     return sorted(chosen, key=lambda candidate: -candidate.score)
 
 
-def _require_possible(count: int, shift: float, opening_m: tuple[float, float]) -> None:
+def _validate_arguments(count: int, shift: float, opening_m: tuple[float, float]) -> None:
     if count < 1:
         raise UsageError(f"{count} candidates are requested; the number must be 1 or more.")
     if not 0 <= shift <= 0.5:
-        raise UsageError(f"The shift is {shift:g} of the object's length; it must lie between 0 and 0.5, its end.")
+        raise UsageError(f"The shift is {shift:g} of the object's length; it must be between 0 and 0.5, its end.")
     if not 0 < opening_m[0] < opening_m[1]:
         raise UsageError(
-            f"The fingers open {opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm; the first must be above 0 and below "
+            f"The opening is {opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm; the first must be above 0 and below "
             f"the second."
         )
 
@@ -126,10 +130,10 @@ def _explain_no_grasp(widths_m: list[float], opening_m: tuple[float, float]) -> 
     )
 
 
-def _thinned(cloud: Cloud, seed: int) -> Cloud:
+def _subsample(cloud: Cloud, seed: int) -> Cloud:
     if len(cloud) < MIN_POINTS:
         raise TacpipeError(
-            f"The cloud has {len(cloud)} points; to find its shape, it needs {MIN_POINTS} or more. Is it the object's cloud?"
+            f"The cloud has {len(cloud)} points; {MIN_POINTS} or more are needed. Is it the object's cloud?"
         )
     if len(cloud) <= MAX_POINTS:
         return cloud
@@ -146,29 +150,29 @@ def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
     if extents.min() < FLAT_M:
         raise TacpipeError(
             f"The cloud is {extents[0] * 1e3:.0f} by {extents[1] * 1e3:.0f} mm and {extents[2] * 1e3:.1f} mm thick: it is "
-            f"flat, and has no sides to close on. A camera must see an object's sides; is this the table?"
+            f"flat, so it has no sides to grasp. The camera must see the object's sides; is this the table?"
         )
     view = centre - np.asarray(camera_m, np.float64)
     if np.linalg.norm(view) < extents.max() / 2:
         raise TacpipeError(
-            f"The camera, at {', '.join(f'{value:g}' for value in camera_m)} m, lies within the cloud, whose middle is "
-            f"{np.linalg.norm(view) * 1e3:.0f} mm away. Give where the camera was in the cloud's frame."
+            f"The camera, at {', '.join(f'{value:g}' for value in camera_m)} m, is inside the cloud, whose centroid is "
+            f"{np.linalg.norm(view) * 1e3:.0f} mm away. Give the camera's position in the cloud's frame."
         )
     view /= np.linalg.norm(view)
     along = axes[0]
-    if abs(along @ view) > UPRIGHT:
+    if abs(along @ view) > MAX_VIEW_COSINE:
         across_view = inner - np.outer(inner @ view, view)
         along = np.linalg.eigh(across_view.T @ across_view)[1][:, -1]
     positions = inner @ along
-    along = along * np.sign((positions**3).sum() or 1.0)  # the cloud's own skew gives it a sign
+    along = along * np.sign((positions**3).sum() or 1.0)  # the skew of the cloud determines the sign of the axis
     across = np.cross(view, along)
-    across *= np.sign(across @ FIRST or 1.0) / np.linalg.norm(across)
+    across *= np.sign(across @ G1_TO_G2 or 1.0) / np.linalg.norm(across)
     length_m = float(np.ptp(np.quantile(positions, [0.01, 0.99])))
     return _Frame(centre, along, across, view, length_m)
 
 
 class _Cuts:
-    """The cuts through one cloud, and how wide those were that had points."""
+    """The cuts through one cloud, and the widths of those that had enough points."""
 
     def __init__(self, cloud: Cloud, frame: _Frame, camera_m: Sequence[float], opening_m: tuple[float, float]) -> None:
         self._points = cloud.points_m.astype(np.float64)
@@ -184,58 +188,58 @@ class _Cuts:
         cut = np.flatnonzero(np.abs(self._along_m - shift_m) < HALF_CUT_M)
         if len(cut) < MIN_CUT_POINTS:
             return None
-        low, high = np.quantile(self._across_m[cut], [TRIM, 1 - TRIM])
+        low, high = np.quantile(self._across_m[cut], [TRIM_FRACTION, 1 - TRIM_FRACTION])
         width = high - low
         self.widths_m.append(float(width))
         if width > self._opening_m[1]:
-            return None  # narrower pairs lie on its top, where the hand cannot reach around
+            return None  # narrower pairs are on top of the object, where the hand cannot reach around it
         position = self._across_m[cut]
-        lefts = cut[(position >= low) & (position <= low + EDGE * width)]
-        rights = cut[(position >= high - EDGE * width) & (position <= high)]
+        lefts = cut[(position >= low) & (position <= low + EDGE_FRACTION * width)]
+        rights = cut[(position >= high - EDGE_FRACTION * width) & (position <= high)]
         if not len(lefts) or not len(rights):
             return None
-        scores, cosines = self._scored(lefts, rights, shift_m)
+        scores, cosines = self._score_pairs(lefts, rights, shift_m)
         left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
         if not np.isfinite(scores[left, right]):
             return None
         grasp = _grasp(self._points[lefts[left]], self._points[rights[right]], self._camera_m)
         off_deg = float(np.degrees(np.arccos(np.clip(cosines[left, right], -1, 1))))
-        score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
+        score = float(scores[left, right] - OFF_CENTRE_WEIGHT * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
 
-    def _scored(self, lefts: Indices, rights: Indices, shift_m: float) -> tuple[Floats, Floats]:
-        """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
+    def _score_pairs(self, lefts: Indices, rights: Indices, shift_m: float) -> tuple[Floats, Floats]:
+        """Return the scores of all pairs, and the smaller cosine between closing axis and normals, both (left, right)."""
         offsets = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
         opening = np.linalg.norm(offsets, axis=2)
         closing = offsets / np.maximum(opening, 1e-9)[..., None]
         on_left = -(closing * self._normals[lefts][:, None]).sum(axis=2)
         on_right = (closing * self._normals[rights][None]).sum(axis=2)
         cosines = np.minimum(on_left, on_right)
-        off = np.abs(self._along_m - shift_m) / HALF_CUT_M  # (point,), 1 at the cut's rim
+        off = np.abs(self._along_m - shift_m) / HALF_CUT_M  # (point,), 1 at the edge of the cut
         off_plane = (off[lefts][:, None] + off[rights][None]) / 2
         askew = np.abs(closing @ self._frame.along) + np.abs(closing @ self._frame.view)
         fits = (opening >= self._opening_m[0]) & (opening <= self._opening_m[1])
-        return np.where(fits, cosines - askew - OFF_PLANE * off_plane, -np.inf), cosines
+        return np.where(fits, cosines - askew - OFF_PLANE_WEIGHT * off_plane, -np.inf), cosines
 
 
 def _grasp(left: Floats, right: Floats, camera_m: Floats) -> Grasp:
-    """Return the grasp of two points whose wrist comes along the line of sight, as `frame.estimated_wrist` has it."""
+    """Return the grasp at two points with the wrist along the line of sight, as in `estimate_wrist`."""
     sight = (left + right) / 2 - camera_m
     return Grasp(left, right, axes(sight / np.linalg.norm(sight), (right - left) / np.linalg.norm(right - left)))
 
 
-G1, G2 = "#d55e00", "#0072b2"  # distinguished by eyes that do not distinguish red from green
-GREY, GROUND = (
+G1, G2 = "#d55e00", "#0072b2"  # distinguishable with red-green colour blindness
+GREY, BACKGROUND = (
     "#707070",
     "#ececec",
-)  # colour of points without colours, and of the ground behind all points, which shows white ones
+)  # points without colours, and the background, on which white points are visible
 
 
 def draw(cloud: Cloud, grasp_candidates: Sequence[Candidate], path: Path) -> None:
-    """Write a picture to ``path``: the cloud in its colours from two sides, each grasp a line, its rank next to g1.
+    """Draw the coloured cloud from two sides, with each grasp as a line and its rank next to g1, and write it to ``path``.
 
-    The ending states the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
-    cannot be written.
+    The suffix determines the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the
+    file cannot be written.
     """
     with extras.explain_missing("A picture"):
         import matplotlib
@@ -246,33 +250,39 @@ def draw(cloud: Cloud, grasp_candidates: Sequence[Candidate], path: Path) -> Non
         above, side = figure.subplots(1, 2)
         _panel(above, cloud, grasp_candidates, (0, 1), ranks=True)
         above.set_title("as the camera sees it", loc="left")
-        _panel(side, cloud, grasp_candidates, (_width(grasp_candidates), 2), ranks=False)
+        _panel(side, cloud, grasp_candidates, (_closing_axis(grasp_candidates), 2), ranks=False)
         side.set_title("from the side", loc="left")
         figure.legend(*_legend(), loc="outside lower center", ncols=2, frameon=False)
         content, kind = io.BytesIO(), path.suffix.lower()[1:]
-        bare = {"png": ("Software",), "svg": ("Date", "Creator"), "pdf": ("CreationDate", "Creator", "Producer")}[kind]
-        figure.savefig(content, format=kind, metadata=dict.fromkeys(bare))  # the same grasps give the same bytes
+        omitted_metadata = {
+            "png": ("Software",),
+            "svg": ("Date", "Creator"),
+            "pdf": ("CreationDate", "Creator", "Producer"),
+        }[kind]
+        figure.savefig(
+            content, format=kind, metadata=dict.fromkeys(omitted_metadata)
+        )  # the same grasps give the same bytes
     with readable_errors(path.parent):
         write_whole(str(path), content.getvalue(), f"{path}.draft")
 
 
-def _width(grasp_candidates: Sequence[Candidate]) -> int:
-    """Return along which of x and y the best grasp closes more: seen along the other one, it shows its depth."""
+def _closing_axis(grasp_candidates: Sequence[Candidate]) -> int:
+    """Return the axis (0: x, 1: y) along which the best grasp closes more; the view along the other axis shows its depth."""
     return int(np.argmax(np.abs(grasp_candidates[0].grasp.closing[:2]))) if grasp_candidates else 0
 
 
 def _panel(
     axes: Axes, cloud: Cloud, grasp_candidates: Sequence[Candidate], plotted_axes: tuple[int, int], *, ranks: bool
 ) -> None:
-    """Draw a cloud and its grasps on two of the axes x, y, z, in millimetres, the second downwards as in a picture."""
+    """Draw a cloud and its grasps on two of the axes x, y, z, in millimetres; the second axis points down as in an image."""
     right, down = plotted_axes
-    depth_axis = 3 - right - down  # the axis that is looked along
+    depth_axis = 3 - right - down  # the viewing axis
     order = np.argsort(-cloud.points_m[:, depth_axis], kind="stable")  # near points are drawn last
-    axes.set_facecolor(GROUND)
+    axes.set_facecolor(BACKGROUND)
     points_mm = cloud.points_m[order] * 1e3
     colours = GREY if cloud.colours is None else cloud.colours[order] / 255
     axes.scatter(points_mm[:, right], points_mm[:, down], c=colours, s=3, linewidths=0, rasterized=True)
-    for rank, candidate in reversed(list(enumerate(grasp_candidates, 1))):  # the best lies on top
+    for rank, candidate in reversed(list(enumerate(grasp_candidates, 1))):  # the best is drawn on top
         ends_mm = np.stack([candidate.grasp.g1_m, candidate.grasp.g2_m]) * 1e3  # (finger, xyz)
         _line(axes, ends_mm[:, [right, down]], rank, with_legend=ranks)
     axes.set_aspect("equal")
@@ -282,9 +292,9 @@ def _panel(
 
 
 def _line(axes: Axes, ends_mm: Floats, rank: int, *, with_legend: bool) -> None:
-    faint = 1.0 if rank == 1 else 0.75
-    axes.plot(*ends_mm.T, color="white", linewidth=3.5 if rank == 1 else 2.5, alpha=faint)  # a rim, seen on any colour
-    axes.plot(*ends_mm.T, color="black", linewidth=2 if rank == 1 else 1, alpha=faint)
+    alpha = 1.0 if rank == 1 else 0.75
+    axes.plot(*ends_mm.T, color="white", linewidth=3.5 if rank == 1 else 2.5, alpha=alpha)  # an outline
+    axes.plot(*ends_mm.T, color="black", linewidth=2 if rank == 1 else 1, alpha=alpha)
     for end, colour in zip(ends_mm, (G1, G2), strict=True):
         axes.plot(*end, "o", color=colour, markeredgecolor="white", markersize=8 if rank == 1 else 6)
     if not with_legend:

@@ -1,4 +1,4 @@
-"""Define clouds of points, their tables and texts, the images of depth cameras, and surface normals."""
+"""Define point clouds, their tables and text lines, depth images, and surface normals."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ COLOUR = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points in the camera's frame; raises `TacpipeError` if one is not finite."""
+    """Points in the camera's frame. Raises `TacpipeError` if the shapes are wrong or a point is not finite."""
 
     points_m: Float32s  # (point, xyz), metres
     colours: Bytes | None = None  # (point, rgb), 0 to 255
 
     def __post_init__(self) -> None:
-        """Refuse what is not a cloud."""
+        """Validate the arrays."""
         if self.points_m.ndim != 2 or self.points_m.shape[1] != 3:
-            raise TacpipeError(f"Points have the shape {self.points_m.shape}; a cloud's are (point, xyz).")
+            raise TacpipeError(f"Points have the shape {self.points_m.shape}; they must be (point, xyz).")
         if self.colours is not None and self.colours.shape != self.points_m.shape:
             raise TacpipeError(
-                f"There are colours of the shape {self.colours.shape} and points of {self.points_m.shape}; each point has "
+                f"Colours have the shape {self.colours.shape} and points {self.points_m.shape}; each point has "
                 f"one colour (red, green, blue)."
             )
         finite = np.asarray(np.isfinite(self.points_m).all(axis=1))
@@ -48,12 +48,12 @@ class Cloud:
             )
 
     def __len__(self) -> int:
-        """Return how many points there are."""
+        """Return the number of points."""
         return len(self.points_m)
 
     @classmethod
-    def of(cls, table: pa.Table) -> Cloud:
-        """Return the cloud that a table holds, one row a point, with colours if it has all three columns.
+    def from_table(cls, table: pa.Table) -> Cloud:
+        """Return the cloud in a table with one row per point, with colours if all three columns exist.
 
         Raises `TacpipeError` if a coordinate's column is missing.
         """
@@ -64,7 +64,7 @@ class Cloud:
         return cls(points, np.column_stack([table.column(name).to_numpy() for name in COLOUR]))
 
     def table(self) -> pa.Table:
-        """Return one row a point: ``x_m``, ``y_m``, ``z_m`` float32 and, with colours, ``red`` … ``blue`` uint8."""
+        """Return one row per point: ``x_m``, ``y_m``, ``z_m`` float32 and, with colours, ``red`` … ``blue`` uint8."""
         import pyarrow as pa
 
         position = {"unit": "m", "quantity": "position"}
@@ -81,25 +81,25 @@ class Cloud:
 
 
 def require_columns(table: pa.Table, names: Sequence[str]) -> None:
-    """Raise `TacpipeError` naming the first of ``names`` that is not a column of the table."""
+    """Raise `TacpipeError` with the first of ``names`` that is not a column of the table."""
     columns = set(table.column_names)  # the table builds this list at each access
     missing = [name for name in names if name not in columns]
     if missing:
         raise TacpipeError(f"The column {missing[0]} is missing. Ingest or segment the recording again.")
 
 
-def filled(body: bytes) -> list[str]:
+def nonblank_lines(body: bytes) -> list[str]:
     """Return the lines that are not blank."""
     return [line.decode("latin-1") for line in body.splitlines() if not line.isspace() and line]
 
 
-def parsed(
+def parse_points(
     path: Path, lines: Sequence[str], point: np.dtype[np.void], field_names: Collection[str]
 ) -> NDArray[np.void]:
-    """Return the points (point,) of lines, one or more, each the numbers of one ``point``; other fields are 0.
+    """Parse lines of numbers, one point per line, and return the points (point,); fields not in ``field_names`` are 0.
 
-    Raises `TacpipeError`, naming the file, where a line holds other than that many numbers, or a number that its field
-    cannot have.
+    Raises `TacpipeError` with the path if a line has another number of values than ``point``, or a value is out of the
+    field's range.
     """
     names = point.names or ()
     edges = np.cumsum([0, *(int(np.prod(point[name].shape)) for name in names)])
@@ -115,14 +115,14 @@ def parsed(
             f"{path} has lines of {numbers.shape[1]} numbers; each point has {edges[-1]}. Copy the file again."
         )
     points = np.zeros(len(numbers), point)
-    for name, place in zip(names, edges, strict=False):
+    for name, start in zip(names, edges, strict=False):
         if name in field_names:
-            points[name] = _cast(path, name, numbers[:, place], point[name])
+            points[name] = _cast(path, name, numbers[:, start], point[name])
     return points
 
 
 def _cast(path: Path, name: str, column: Floats, kind: np.dtype[Any]) -> AnyArray:
-    """Return a column (point,) in the type of its field; what a float cannot hold becomes infinite."""
+    """Return a column (point,) in the type of its field; values beyond a float's range become infinite."""
     if kind.kind in "iu":
         limits = np.iinfo(kind)
         wrong = ~((column >= limits.min) & (column <= limits.max) & (column == np.rint(column)))
@@ -138,50 +138,50 @@ def _cast(path: Path, name: str, column: Floats, kind: np.dtype[Any]) -> AnyArra
 
 @contextmanager
 def open3d() -> Iterator[Any]:
-    """Yield the module open3d; within, it prints nothing but errors. Raises `MissingModuleError` without it."""
+    """Yield the module open3d, which prints only errors meanwhile. Raises `MissingModuleError` if it is not installed."""
     with extras.explain_missing("A cloud of points"):
         import open3d as module
     with module.utility.VerbosityContextManager(module.utility.VerbosityLevel.Error):
         yield module
 
 
-RADIUS_M = 0.015  # the radius from 10 to 30 mm at which the published grasps close most squarely on the surface
-CAMERA_M = (0.0, 0.0, 0.0)  # a cloud in the camera's frame is seen from its origin
+RADIUS_M = 0.015  # of 10 to 30 mm, the radius at which the published grasps are closest to the surface normals
+CAMERA_M = (0.0, 0.0, 0.0)  # the camera is at the origin of its own frame
 
 
 def normals(cloud: Cloud, radius_m: float = RADIUS_M, camera_m: Sequence[float] = CAMERA_M) -> Floats:
-    """Return the unit normals (point, xyz) of the surface that a cloud was seen on, each turned towards the camera.
+    """Return the unit normals (point, xyz) of a cloud's surface, pointing towards the camera.
 
-    A normal is the direction in which the neighbours within ``radius_m`` spread least; where there are fewer than two, it
-    states nothing. Raises `TacpipeError` if open3d is not installed.
+    A normal is the direction in which the neighbours within ``radius_m`` spread least; with fewer than two neighbours
+    it has no meaning. Raises `TacpipeError` if open3d is not installed.
     """
     camera = np.asarray(camera_m, np.float64)
     with open3d() as library:
         open3d_cloud = library.geometry.PointCloud(library.utility.Vector3dVector(cloud.points_m.astype(np.float64)))
-        around = library.geometry.KDTreeSearchParamRadius(radius_m)
-        open3d_cloud.estimate_normals(around, fast_normal_computation=False)
+        search = library.geometry.KDTreeSearchParamRadius(radius_m)
+        open3d_cloud.estimate_normals(search, fast_normal_computation=False)
         directions: Floats = np.array(open3d_cloud.normals)
     towards = camera - cloud.points_m  # (point, xyz)
     return np.where((directions * towards).sum(axis=1, keepdims=True) < 0, -directions, directions)
 
 
 MAGIC = b"TPDF"
-NEAREST, FARTHEST = 1e-3, 1e7  # least and largest focal length, and largest image centre, in pixels
+MIN_PIXELS, MAX_PIXELS = 1e-3, 1e7  # range of the focal length, and maximum offset of the image centre, in pixels
 HEADER = struct.Struct("<4sHHBxxx5f")  # magic, width, height, whether colours follow; focal lengths, centre, unit
 
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """A depth image without distortion, and where its pixels look."""
+    """An undistorted depth image with the camera's optics."""
 
-    depth: Counts  # (row, column), along the optical axis in units of ``unit_m``; 0: nothing was measured
+    depth: Counts  # (row, column), along the optical axis in units of ``unit_m``; 0: no measurement
     focal: tuple[float, float]  # focal lengths in pixels, along a row and along a column
     centre: tuple[float, float]  # the optical axis in the image: column, row
-    unit_m: float  # metres a count of depth
+    unit_m: float  # metres per count of depth
     colours: Bytes | None = None  # (row, column, rgb)
 
     def points(self) -> tuple[Float32s, Bytes | None]:
-        """Return the points that were measured (point, xyz), metres, and their colours (point, rgb).
+        """Return the measured points (point, xyz), in metres, and their colours (point, rgb) or None.
 
         In the camera's frame: x to the right of the image, y down, z along the optical axis.
         """
@@ -193,7 +193,7 @@ class DepthFrame:
         return np.column_stack([x, y, z]).astype(np.float32), colours
 
     def to_bytes(self) -> bytes:
-        """Return the frame as a link hands it on: a header, depth as u16 little-endian, colours as bytes."""
+        """Return the frame as bytes: a header, depth as u16 little-endian, then colours."""
         height, width = self.depth.shape
         coloured = self.colours is not None
         head = HEADER.pack(MAGIC, width, height, coloured, *self.focal, *self.centre, self.unit_m)
@@ -201,21 +201,22 @@ class DepthFrame:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> DepthFrame:
-        """Return the frame that `to_bytes` gave. Raises `TacpipeError` if it is none or was cut off."""
+        """Return the frame that `to_bytes` encoded. Raises `TacpipeError` if it is not a frame or was cut off."""
         if len(content) < HEADER.size or not content.startswith(MAGIC):
             raise TacpipeError(f"{len(content)} bytes are not a depth frame; it must begin with {MAGIC.decode()}.")
         _, width, height, coloured, *optics = HEADER.unpack_from(content)
         pixels = width * height
         if len(content) != HEADER.size + pixels * (5 if coloured else 2):
             raise TacpipeError(
-                f"A depth frame of {width} x {height} pixels came with {len(content)} bytes, so it is incomplete."
+                f"A depth frame of {width} x {height} pixels has {len(content)} bytes, so it is incomplete."
             )
-        if not (all(NEAREST <= length <= FARTHEST for length in optics[:2]) and max(map(abs, optics[2:4])) <= FARTHEST):
-            raise TacpipeError(f"A depth frame has the optics {optics[:4]}, pixels; no camera has.")
+        if not (
+            all(MIN_PIXELS <= length <= MAX_PIXELS for length in optics[:2])
+            and max(map(abs, optics[2:4])) <= MAX_PIXELS
+        ):
+            raise TacpipeError(f"A depth frame has the optics {optics[:4]}, in pixels, which no camera has.")
         if not 0 < optics[4] <= 1:
-            raise TacpipeError(
-                f"A depth frame counts in units of {optics[4]:g} m; the unit must be above 0 and at most 1."
-            )
+            raise TacpipeError(f"A depth frame has the unit {optics[4]:g} m; it must be above 0 and at most 1.")
         depth = np.frombuffer(content, "<u2", pixels, HEADER.size).reshape(height, width).astype(np.uint16)
         start = HEADER.size + 2 * pixels
         colours = np.frombuffer(content, np.uint8, 3 * pixels, start).reshape(height, width, 3) if coloured else None

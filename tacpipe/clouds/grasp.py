@@ -1,4 +1,4 @@
-"""A grasp by two fingers: where each touches the object, and how the wrist is turned."""
+"""Define a grasp by two fingers: the contact points on the object and the rotation of the wrist."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{axis}_{component}" for axis in "xyz" for component in "xyz")
-ORTHONORMAL = 1e-3  # largest error of a wrist's rotation matrix: the precision of files with five digits
+MAX_ROTATION_ERROR = 1e-3  # maximum error of a wrist's rotation matrix: the precision of files with five digits
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """Two contact points in the frame of their cloud and, where it is known, the wrist's rotation.
+    """Two contact points in the frame of their cloud and, if recorded, the wrist's rotation.
 
-    Raises `TacpipeError` for values that are not finite, two points that are one, and a wrist that is not a rotation.
+    Raises `TacpipeError` if a value is not finite, both points are equal, or the wrist is not a rotation.
     """
 
     g1_m: Floats  # (xyz), metres
@@ -32,7 +32,7 @@ class Grasp:
     wrist: Floats | None = None  # (component, axis): columns are approach, closing and third axis in the cloud's frame
 
     def __post_init__(self) -> None:
-        """Refuse what no hand can do."""
+        """Validate the points and the wrist."""
         if not (np.isfinite(self.g1_m).all() and np.isfinite(self.g2_m).all()):
             raise TacpipeError(f"The grasp points are {self.g1_m} and {self.g2_m}; both must be finite, in metres.")
         if self.opening_m == 0:
@@ -40,16 +40,16 @@ class Grasp:
         if self.wrist is not None:
             if self.wrist.shape != (3, 3) or not np.isfinite(self.wrist).all():
                 raise TacpipeError("The wrist's rotation must be nine finite numbers.")
-            off = np.abs(self.wrist.T @ self.wrist - np.eye(3)).max()
-            if off > ORTHONORMAL or np.linalg.det(self.wrist) < 0:
+            error = np.abs(self.wrist.T @ self.wrist - np.eye(3)).max()
+            if error > MAX_ROTATION_ERROR or np.linalg.det(self.wrist) < 0:
                 raise TacpipeError(
-                    f"The wrist's axes miss being a rotation by {off:.3g}, with determinant "
+                    f"The wrist's axes deviate from a rotation by {error:.3g}, with determinant "
                     f"{np.linalg.det(self.wrist):.3g}; they must be three right-handed unit vectors at right angles."
                 )
 
     @property
     def opening_m(self) -> float:
-        """How far the fingers are apart, metres."""
+        """The distance between the fingers, in metres."""
         return float(np.linalg.norm(self.g2_m - self.g1_m))
 
     @property
@@ -64,20 +64,20 @@ class Grasp:
 
     @property
     def swapped(self) -> Grasp:
-        """The same grasp with the fingers' roles exchanged: half a turn about the wrist's approach axis."""
+        """The same grasp with the fingers exchanged: half a turn about the wrist's approach axis."""
         wrist = None if self.wrist is None else self.wrist * (1.0, -1.0, -1.0)
         return Grasp(self.g2_m, self.g1_m, wrist)
 
     def moved(self, rotation: Floats, shift_m: Floats) -> Grasp:
-        """Return the grasp turned by ``rotation`` (3, 3) and then shifted, as its cloud would be."""
+        """Return the grasp rotated by ``rotation`` (3, 3) and then shifted, as its cloud would be."""
         wrist = None if self.wrist is None else rotation @ self.wrist
         return Grasp(rotation @ self.g1_m + shift_m, rotation @ self.g2_m + shift_m, wrist)
 
     @classmethod
-    def of(cls, table: pa.Table) -> Grasp:
-        """Return the grasp that a table of one row holds.
+    def from_table(cls, table: pa.Table) -> Grasp:
+        """Return the grasp in a table of one row.
 
-        Raises `TacpipeError` if it has no or several rows, or lacks a column of the points.
+        Raises `TacpipeError` if the table does not have one row, or a column of the points is missing.
         """
         require_columns(table, POINTS)
         if table.num_rows != 1:
@@ -89,7 +89,7 @@ class Grasp:
         return cls(points[:3], points[3:], wrist)
 
     def table(self, t_ns: int) -> pa.Table:
-        """Return a table of one row: ``t_ns``, ``g1_x_m`` … ``g2_z_m``, and ``wrist_x_x`` … if the wrist is known.
+        """Return a table of one row: ``t_ns``, ``g1_x_m`` … ``g2_z_m``, and ``wrist_x_x`` … if there is a wrist.
 
         ``wrist_x_y`` is the component along y of the wrist's first axis.
         """
@@ -107,50 +107,50 @@ class Grasp:
         return pa.Table.from_arrays(arrays, schema=schema)
 
 
-STEEPEST = 0.999  # cosine between closing axis and line of sight beyond which another direction is taken
+MAX_ALIGNMENT = 0.999  # cosine between closing axis and line of sight above which another approach is used
 
 
-def estimated_wrist(grasp: Grasp) -> Floats:
-    """Return axes for a wrist that is not stated (component, axis): approach along the line of sight, closing, and third.
+def estimate_wrist(grasp: Grasp) -> Floats:
+    """Return axes (component, axis) for a grasp without a wrist: approach along the line of sight, closing, and third.
 
-    The camera, at the origin, looks down on the object as the hand comes down on it; the approach axis is the line of sight
-    to the middle of the grasp less its share along the closing axis. Where nothing is left, because the fingers close
-    along the line of sight or about the camera itself, the frame's axis that is most square to closing represents it.
+    The camera, at the origin, looks down on the object as the hand approaches it. The approach axis is the line of
+    sight to the middle of the grasp, made perpendicular to the closing axis. If that is zero, because the fingers close
+    along the line of sight or around the camera, the frame's axis that is most perpendicular to closing is used.
     """
     sight = grasp.middle_m / max(float(np.linalg.norm(grasp.middle_m)), 1e-12)
-    if not sight.any() or abs(sight @ grasp.closing) > STEEPEST:
+    if not sight.any() or abs(sight @ grasp.closing) > MAX_ALIGNMENT:
         sight = np.eye(3)[np.argmin(np.abs(grasp.closing))]
     return axes(sight, grasp.closing)
 
 
 def axes(approach: Floats, closing: Floats) -> Floats:
-    """Return right-handed axes (component, axis): ``approach`` made square to ``closing``, that, their product.
+    """Return right-handed axes (component, axis): ``approach`` made perpendicular, ``closing``, and their product.
 
-    ``closing`` must be a unit vector, and ``approach`` not along it.
+    ``closing`` must be a unit vector, and ``approach`` not parallel to it.
     """
-    square = approach - (approach @ closing) * closing
-    square = square / np.linalg.norm(square)
-    return np.column_stack([square, closing, np.cross(square, closing)])
+    perpendicular = approach - (approach @ closing) * closing
+    perpendicular = perpendicular / np.linalg.norm(perpendicular)
+    return np.column_stack([perpendicular, closing, np.cross(perpendicular, closing)])
 
 
-def wrist_of(grasp: Grasp) -> Floats:
-    """Return the axes of a grasp (component, axis): approach, closing, third; the approach is the wrist's where it is given.
+def wrist_axes(grasp: Grasp) -> Floats:
+    """Return the axes of a grasp (component, axis): approach, closing, third. The approach is the wrist's if it has one.
 
-    The closing axis is that from g1 to g2, whatever a wrist's second axis is; a wrist that approaches along it gives its
-    second axis for the first, so that the axes still turn with it.
+    The closing axis is that from g1 to g2, whatever the wrist's second axis is. If the wrist's first axis is parallel
+    to it, its second axis is used as the approach, so that the axes still rotate with the wrist.
     """
     if grasp.wrist is None:
-        return estimated_wrist(grasp)
+        return estimate_wrist(grasp)
     approach = grasp.wrist[:, 0]
-    if abs(approach @ grasp.closing) > STEEPEST:
+    if abs(approach @ grasp.closing) > MAX_ALIGNMENT:
         approach = grasp.wrist[:, 1]
     return axes(approach, grasp.closing)
 
 
 def local_points(points_m: AnyFloats, grasp: Grasp) -> Floats:
-    """Return points (point, axis) in the axes of the grasp, about the middle between the fingers, metres.
+    """Return points (point, axis) in the axes of the grasp, relative to the middle between the fingers, in metres.
 
     g1 is at (0, -opening / 2, 0), g2 at (0, opening / 2, 0).
     """
-    local_m: Floats = (points_m - grasp.middle_m) @ wrist_of(grasp)
+    local_m: Floats = (points_m - grasp.middle_m) @ wrist_axes(grasp)
     return local_m

@@ -1,11 +1,11 @@
-"""Read clouds of points strictly: PCD files of the Point Cloud Library, version 0.7, and PLY files.
+"""Parse point clouds strictly: PCD files of the Point Cloud Library, version 0.7, and PLY files.
 
-A header of lines names the fields of a point; behind its last line, ``DATA``, the points follow as lines of numbers or as
-they lay in memory. Colour is one of the fields, ``rgb``: the bytes of 0x00RRGGBB, most often declared a float. Source: "The
-PCD (Point Cloud Data) file format", documentation of the Point Cloud Library.
+The lines of a PCD header describe the fields of a point. After its last line, ``DATA``, the points follow as lines of
+numbers or as a memory dump. Colour is one of the fields, ``rgb``: the bytes of 0x00RRGGBB, usually declared as a float.
+Source: "The PCD (Point Cloud Data) file format", documentation of the Point Cloud Library.
 
-PLY is binary of either order of bytes, or text. The vertices must have x, y and z; red, green and blue are colours, other
-properties are skipped. Source: Greg Turk, "The PLY Polygon File Format" (1994).
+PLY is text, or binary in either byte order. The vertices must have x, y and z; red, green and blue are colours, and
+other properties are skipped. Source: Greg Turk, "The PLY Polygon File Format" (1994).
 """
 
 from __future__ import annotations
@@ -26,71 +26,75 @@ from tacpipe.printable import excerpt, listed, plain
 
 KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 VERSIONS = ("0.7", ".7")
-KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}  # letter: numpy's, sizes in bytes
+KINDS = {
+    "F": ("f", (4, 8)),
+    "I": ("i", (1, 2, 4, 8)),
+    "U": ("u", (1, 2, 4, 8)),
+}  # numpy's letter, sizes in bytes
 POSITION = ("x", "y", "z")
-COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
-MAX_HEADER_BYTES = 65_536  # bytes; a file without the line DATA in so many is none
-DIGITS = 18  # largest number of digits of a number in a header
-MAX_POINT_BYTES = 65_536  # bytes, fields that are skipped included
-LZF_MOST = 88  # largest factor of compression: three bytes unpack to 264
+COLOURS = ("rgb", "rgba")  # either name is valid; the alpha of rgba is ignored
+MAX_HEADER_BYTES = 65_536  # a file without a DATA line in these is not PCD
+DIGITS = 18  # maximum number of digits of a number in a header
+MAX_POINT_BYTES = 65_536  # including skipped fields
+LZF_MAX_RATIO = 88  # maximum compression ratio: three bytes unpack to 264
 
 
 @dataclass(frozen=True)
 class Header:
-    """The points that a file declares."""
+    """The header of a PCD file."""
 
     point: np.dtype[np.void]  # the fields of a point, packed
     points: int
     data: str  # ascii, binary or binary_compressed
-    length: int  # bytes of the header, its last line end included
+    length: int  # bytes of the header, including its last line end
 
     @property
     def colour(self) -> str | None:
-        """The name of the field that holds the colour, or None."""
+        """The name of the colour field, or None."""
         return next((name for name in COLOURS if name in (self.point.names or ())), None)
 
 
 def read(path: Path) -> Cloud:
-    """Return the cloud of a PCD file, its points in the unit of the file, metres by convention; further fields are skipped.
+    """Return the cloud of a PCD file, in the unit of the file (metres by convention). Other fields are skipped.
 
-    Raises `TacpipeError`, naming the file, where it is no PCD 0.7, has no x, y and z of floats or no points, is shorter
-    than its header states or longer by more than padding, is compressed, or holds points that are not finite.
+    Raises `TacpipeError` with the path if the file is not PCD 0.7, has no points or no float x, y and z, is shorter
+    than its header declares or longer by more than padding, is compressed, or contains points that are not finite.
     """
     xyz, colours = parse_pcd(path, regular.source(path))
     finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
     if not finite.all():
         raise TacpipeError(
-            f"{path} holds {np.count_nonzero(~finite)} of {len(finite)} points that are not finite (NaN), the first "
-            f"being point {int(np.argmin(finite))}; each must have been seen. Remove such points and save it again."
+            f"{path} contains {np.count_nonzero(~finite)} of {len(finite)} points that are not finite (NaN), the first "
+            f"being point {int(np.argmin(finite))}; remove such points and save it again."
         )
     return Cloud(xyz, colours)
 
 
 def parse_pcd(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
-    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+    """Return the points (point, xyz), including those that are not finite, and the colours (point, rgb) or None.
 
-    Raises `TacpipeError`, naming the file, as `read` does but for points that are not finite.
+    Raises `TacpipeError` as `read` does, except for points that are not finite.
     """
     header = read_header(path, content)
     if header.data == "binary_compressed":
         raise TacpipeError(
-            f"{path} holds compressed points (DATA binary_compressed); save it as DATA binary: "
+            f"{path} contains compressed points (DATA binary_compressed); save it as DATA binary: "
             f"`pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1` does."
         )
     if header.points == 0:
-        raise TacpipeError(f"{path} holds no point (POINTS 0). Copy the file again or leave its recording out.")
-    points = _of_bytes(path, content, header) if header.data == "binary" else _of_text(path, content, header)
-    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused or left out
+        raise TacpipeError(f"{path} contains no point (POINTS 0). Copy the file again or exclude its recording.")
+    points = _parse_binary(path, content, header) if header.data == "binary" else _parse_text(path, content, header)
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are rejected or dropped
         xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
     if header.colour is None:
         return xyz, None
-    return xyz, unpacked(np.ascontiguousarray(points[header.colour]).view("<u4"))
+    return xyz, unpack_colours(np.ascontiguousarray(points[header.colour]).view("<u4"))
 
 
 def read_header(path: Path, content: bytes | None = None) -> Header:
-    """Return the header of a PCD file, ``content`` being the file's if it was read already.
+    """Return the header of a PCD file; ``content`` is its bytes, if they were already read.
 
-    Raises `TacpipeError`, naming the file and what its header lacks or states wrongly.
+    Raises `TacpipeError` with the path if the header is incomplete or inconsistent.
     """
     lines, length = _header_lines(path, regular.source(path) if content is None else content)
     missing = [keyword for keyword in ("VERSION", "FIELDS", "SIZE", "TYPE", "POINTS") if keyword not in lines]
@@ -100,81 +104,81 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
         )
     if lines["VERSION"] not in [[version] for version in VERSIONS]:
         raise TacpipeError(
-            f"{path} is a PCD file of version {plain(' '.join(lines['VERSION']))}; 0.7 can be read. Save it again as that."
+            f"{path} is a PCD file of version {plain(' '.join(lines['VERSION']))}; only 0.7 can be read. Save it as 0.7."
         )
     points = _whole_number(path, "POINTS", lines["POINTS"])
     if "WIDTH" in lines and "HEIGHT" in lines:
         width, height = (_whole_number(path, keyword, lines[keyword]) for keyword in ("WIDTH", "HEIGHT"))
         if width * height != points:
             raise TacpipeError(
-                f"{path} states WIDTH {width}, HEIGHT {height} and POINTS {points}; points must be width times height. "
+                f"{path} has WIDTH {width}, HEIGHT {height} and POINTS {points}; POINTS must be WIDTH times HEIGHT. "
                 f"Copy the file again."
             )
     data = " ".join(lines["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):
-        raise TacpipeError(f"{path} states DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
-    return Header(_point(path, lines), points, data, length)
+        raise TacpipeError(f"{path} has DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
+    return Header(_point_dtype(path, lines), points, data, length)
 
 
-def require_compressed(path: Path, content: bytes, header: Header) -> None:
-    """Raise `TacpipeError` if compressed points are not as many as their header states, or more than they can be.
+def require_compressed_size(path: Path, content: bytes, header: Header) -> None:
+    """Raise `TacpipeError` if the size of compressed points does not match the header or exceeds the possible ratio.
 
-    In front of them stand their size and that of the points once unpacked, four bytes each.
+    Two 4-byte numbers come first: the compressed and the uncompressed size.
     """
     needed, available = header.points * header.point.itemsize, len(content) - header.length - 8
     size, declared = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
-    if available < size or declared != needed or needed > size * LZF_MOST:
+    if available < size or declared != needed or needed > size * LZF_MAX_RATIO:
         raise TacpipeError(
             f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(available, 0)} bytes "
-            f"follow that declare {size}, and {declared} once unpacked: it was cut off or its header is wrong. Copy the "
-            "file again."
+            f"follow that declare {size} compressed and {declared} uncompressed bytes: it was cut off "
+            "or its header is wrong. Copy the file again."
         )
 
 
-def unpacked(packed: NDArray[np.uint32]) -> Bytes:
-    """Return colours (point, rgb), 0 to 255, of numbers 0x00RRGGBB (point,).
+def unpack_colours(packed: NDArray[np.uint32]) -> Bytes:
+    """Return the colours (point, rgb), 0 to 255, of numbers 0x00RRGGBB (point,).
 
-    >>> unpacked(np.array([0x00FF8001], np.uint32)).tolist()
+    >>> unpack_colours(np.array([0x00FF8001], np.uint32)).tolist()
     [[255, 128, 1]]
     """
     return np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
 
 
 def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the words behind each keyword of the header, and how many bytes it has."""
+    """Return the words after each keyword of the header, and the header's size in bytes."""
     lines: dict[str, list[str]] = {}
-    place = 0
+    position = 0
     while "DATA" not in lines:
-        end = content.find(b"\n", place, MAX_HEADER_BYTES)
+        end = content.find(b"\n", position, MAX_HEADER_BYTES)
         if end < 0:
             raise TacpipeError(
                 f"{path} is not a PCD file or was cut off: its header ends without a line DATA. Give a PCD file of version "
                 f"0.7, or copy it again."
             )
-        words = content[place:end].decode("latin-1").split()
-        place = end + 1
+        words = content[position:end].decode("latin-1").split()
+        position = end + 1
         if not words or words[0].startswith("#"):
             continue
         if words[0] not in KEYWORDS or words[0] in lines:
             raise TacpipeError(
-                f"{path} is not a PCD file: its header has the line {' '.join(words)[:60]!r}, where one of "
-                f"{', '.join(KEYWORDS)} must begin each line, once. Give a PCD file of version 0.7."
+                f"{path} is not a PCD file: its header has the line {' '.join(words)[:60]!r}; each line must "
+                f"start with one of {', '.join(KEYWORDS)}, each once. Give a PCD file of version 0.7."
             )
         lines[words[0]] = words[1:]
-    return lines, place
+    return lines, position
 
 
 def _whole_number(path: Path, keyword: str, words: list[str]) -> int:
     if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
         raise TacpipeError(
-            f"{path} states {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
+            f"{path} has {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
             f"Copy the file again."
         )
     return int(words[0])
 
 
-def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
-    """Return the fields of a point. Raises `TacpipeError` if they are not named, or position and colour are no such."""
+def _point_dtype(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
+    """Return the dtype of a point. Raises `TacpipeError` if the fields are incomplete, or position or colour is invalid."""
     names = lines["FIELDS"]
     counts = lines.get("COUNT", ["1"] * len(names))
     for keyword, words in (("SIZE", lines["SIZE"]), ("TYPE", lines["TYPE"]), ("COUNT", counts)):
@@ -185,19 +189,19 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
             )
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     total = 0
-    for place, (name, kind, size, count_text) in enumerate(
+    for index, (name, kind, size, count_text) in enumerate(
         zip(names, lines["TYPE"], lines["SIZE"], counts, strict=True)
     ):
         letter, sizes = KINDS.get(kind, ("", ()))
         width, count = _whole_number(path, "SIZE", [size]), _whole_number(path, "COUNT", [count_text])
         if width not in sizes:
             declared = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
-            raise TacpipeError(f"{path} has {declared}; there is no such number.")
-        wrong_place = name in POSITION and (letter != "f" or count != 1)
-        if wrong_place or (name in COLOURS and (width != 4 or count != 1)):
-            right = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
+            raise TacpipeError(f"{path} has {declared}, which do not fit together.")
+        wrong_position = name in POSITION and (letter != "f" or count != 1)
+        if wrong_position or (name in COLOURS and (width != 4 or count != 1)):
+            expected = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
             raise TacpipeError(
-                f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count_text}; it must be {right}."
+                f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count_text}; it must be {expected}."
             )
         total += width * count
         if not count > 0 or total > MAX_POINT_BYTES:
@@ -205,18 +209,18 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
                 f"{path} has the field {plain(name)} of COUNT {count_text}; a point has at most {MAX_POINT_BYTES} bytes and "
                 f"each field at least one number. Copy the file again."
             )
-        field_name = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
+        field_name = name if name in (*POSITION, *COLOURS) else f"skipped{index}"  # PCL names all its padding "_"
         fields.append((field_name, f"<{letter}{width}", () if count == 1 else (count,)))
     missing = [axis for axis in POSITION if names.count(axis) != 1]
     if missing or any(names.count(name) > 1 for name in COLOURS):
         raise TacpipeError(
-            f"{path} has the FIELDS {plain(' '.join(names))}; x, y, z must be there once, and rgb at most once."
+            f"{path} has the FIELDS {plain(' '.join(names))}; x, y and z must each occur once, and rgb at most once."
         )
     return np.dtype(fields)
 
 
-def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
-    """Return the points (point,) that follow a header; the library pads files with zeros to whole pages of memory."""
+def _parse_binary(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
+    """Return the points (point,) after a binary header; the library pads files with zeros to whole memory pages."""
     size = header.point.itemsize
     available, needed = len(content) - header.length, header.points * size
     if available < needed:
@@ -226,21 +230,21 @@ def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
         )
     if any(content[header.length + needed :]):
         raise TacpipeError(
-            f"{path} declares {header.points} points of {size} bytes, and behind them {available - needed} bytes follow "
+            f"{path} declares {header.points} points of {size} bytes, and {available - needed} more bytes follow "
             "that are not padding with zeros. Copy the file again."
         )
     return np.frombuffer(content, header.point, header.points, header.length)
 
 
-def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
-    """Return the points (point,) of the lines behind a header, a line a point."""
-    lines = cloud.filled(content[header.length :])
+def _parse_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
+    """Return the points (point,) of the lines after a text header, one point per line."""
+    lines = cloud.nonblank_lines(content[header.length :])
     if len(lines) != header.points:
         raise TacpipeError(
             f"{path} was cut off or its header is wrong: it declares {header.points} points, and {len(lines)} lines follow. "
             f"Copy the file again."
         )
-    return cloud.parsed(path, lines, header.point, (*POSITION, *COLOURS))
+    return cloud.parse_points(path, lines, header.point, (*POSITION, *COLOURS))
 
 
 LETTERS = {
@@ -255,8 +259,8 @@ LETTERS = {
 }
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_POSITION = ("x", "y", "z")
-PLY_LONGEST_HEADER = 65_536  # bytes
-PLY_DIGITS = 18  # largest number of digits of a number in a header
+PLY_MAX_HEADER_BYTES = 65_536  # bytes
+PLY_MAX_DIGITS = 18  # maximum number of digits of a number in a header
 
 
 @dataclass(frozen=True)
@@ -264,29 +268,29 @@ class _Header:
     form: str
     vertex: np.dtype[np.void]
     points: int
-    length: int  # bytes, the line end behind end_header included
+    length: int  # bytes, including the line end after end_header
     only_vertices: bool  # no other element follows
     skipped: int  # size of other elements before the vertices: bytes, or lines of a text file
 
 
 def parse_ply(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
-    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+    """Return the points (point, xyz), including those that are not finite, and the colours (point, rgb) or None.
 
-    Raises `TacpipeError`, naming the file, where it is no PLY file, its vertices are not its first element or have no x, y
-    and z, colours are no bytes, or points are missing.
+    Raises `TacpipeError` with the path if the file is not PLY, its vertices have no x, y and z, colours are not bytes,
+    or points are missing.
     """
     header = _ply_header(path, content)
     if not header.points:
-        raise TacpipeError(f"{path} holds no point (element vertex 0). Copy it again or leave it out.")
+        raise TacpipeError(f"{path} contains no point (element vertex 0). Copy it again or exclude it.")
     if header.form == "ascii":
-        lines = cloud.filled(content[header.length :])[header.skipped :]
+        lines = cloud.nonblank_lines(content[header.length :])[header.skipped :]
         _require_length(path, header, len(lines), 1, "lines")
-        points = cloud.parsed(path, lines[: header.points], header.vertex, (*PLY_POSITION, *COLOUR))
+        points = cloud.parse_points(path, lines[: header.points], header.vertex, (*PLY_POSITION, *COLOUR))
     else:
         body = content[header.length + header.skipped :]
         _require_length(path, header, len(body), header.vertex.itemsize, "bytes")
         points = np.frombuffer(body, header.vertex, header.points)
-    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused or left out
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are rejected or dropped
         xyz = np.column_stack([points[axis] for axis in PLY_POSITION]).astype(np.float32)
     if not set(COLOUR) <= set(header.vertex.names or ()):
         return xyz, None
@@ -294,7 +298,7 @@ def parse_ply(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
 
 
 def pack_ply(points_m: Float32s, colours: Bytes | None) -> bytes:
-    """Return the binary PLY file of points (point, xyz) and colours (point, rgb)."""
+    """Encode points (point, xyz) and colours (point, rgb) as a binary PLY file."""
     vertex = np.dtype(
         [(axis, "<f4") for axis in PLY_POSITION] + [(name, "u1") for name in COLOUR if colours is not None]
     )
@@ -309,30 +313,30 @@ def pack_ply(points_m: Float32s, colours: Bytes | None) -> bytes:
 
 
 def _ply_header(path: Path, content: bytes) -> _Header:
-    end = content.find(b"end_header", 0, PLY_LONGEST_HEADER)
+    end = content.find(b"end_header", 0, PLY_MAX_HEADER_BYTES)
     stop = content.find(b"\n", end) + 1
     lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
     if end < 0 or not stop or lines[:1] != [["ply"]]:
-        raise TacpipeError(f"{path} is not a PLY file or was cut off: it must begin with ply and end its header.")
+        raise TacpipeError(f"{path} is not a PLY file or was cut off: it must start with ply and have a full header.")
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
     starts = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
     elements = [lines[start:end] for start, end in itertools.pairwise([*starts, len(lines)])]
-    place = next((number for number, (first, *_) in enumerate(elements) if first[1:2] == ["vertex"]), 0)
-    first = elements[place][0] if elements else []
-    before = [_size(element, form) for element in elements[:place]]
+    vertex_index = next((number for number, (first, *_) in enumerate(elements) if first[1:2] == ["vertex"]), 0)
+    first = elements[vertex_index][0] if elements else []
+    before = [_element_size(element, form) for element in elements[:vertex_index]]
     if form not in ORDERS or first[1:2] != ["vertex"] or len(first) != 3 or not _is_count(first[2]) or None in before:
         declared = elements[0][0][1:] if elements else []
         raise TacpipeError(
-            f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(declared))}; a cloud is of "
-            f"the format {', '.join(ORDERS)}, and its vertices come first."
+            f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(declared))}; a cloud must have "
+            f"one of the formats {', '.join(ORDERS)}, and its vertices come first."
         )
-    rows = [row for row in elements[place] if row[:1] == ["property"]]
+    rows = [row for row in elements[vertex_index] if row[:1] == ["property"]]
     skipped = sum(size for size in before if size is not None)
-    return _Header(form, _vertex(path, rows, form), int(first[2]), stop, len(elements) == 1, skipped)
+    return _Header(form, _vertex_dtype(path, rows, form), int(first[2]), stop, len(elements) == 1, skipped)
 
 
-def _size(element: list[list[str]], form: str) -> int | None:
-    """Return how many bytes an element has, or lines where it is text, or None if the header does not give it (lists)."""
+def _element_size(element: list[list[str]], form: str) -> int | None:
+    """Return an element's size in bytes, or in lines for text; None if the header does not determine it (lists)."""
     (_, *declared), *rows = element
     kinds = [words[1:] for words in rows if words[:1] == ["property"]]
     if len(declared) != 2 or not _is_count(declared[1]):
@@ -344,32 +348,31 @@ def _size(element: list[list[str]], form: str) -> int | None:
     return int(declared[1]) * sum(int(LETTERS[kind[0]][1]) for kind in kinds)
 
 
-def _vertex(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:
+def _vertex_dtype(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:
     kinds: dict[str, str] = {}
     for words in rows:
         if len(words) != 3 or words[1] not in LETTERS or words[2] in kinds:
             raise TacpipeError(
-                f"{path} has the vertices' {excerpt(' '.join(words))}; it must be a type, one number, and a name."
+                f"{path} has the vertices' {excerpt(' '.join(words))}; it must be a scalar type and a name."
             )
         kinds[words[2]] = LETTERS[words[1]]
     floats = all(kinds.get(axis, "")[:1] == "f" for axis in PLY_POSITION)
     coloured = all(kinds.get(name, "u1") == "u1" for name in COLOUR)
     if not floats or not coloured:
         raise TacpipeError(
-            f"{path} has vertices of {listed(kinds)}; they must have x, y and z of floats, and colours, "
-            f"where there are any, of uchar."
+            f"{path} has vertices of {listed(kinds)}; x, y and z must be floats, and colours, if any, uchar."
         )
     return np.dtype([(name, ORDERS[form] + letters) for name, letters in kinds.items()])
 
 
 def _is_count(word: str) -> bool:
-    return word.isascii() and word.isdigit() and len(word) <= PLY_DIGITS
+    return word.isascii() and word.isdigit() and len(word) <= PLY_MAX_DIGITS
 
 
 def _require_length(path: Path, header: _Header, available: int, width: int, unit: str) -> None:
-    """Raise `TacpipeError` if the data after the header do not have the length that its points need."""
+    """Raise `TacpipeError` if the data after the header is too short for its points or longer than allowed."""
     needed = header.points * width
     if available < needed or (header.only_vertices and available > needed):
         raise TacpipeError(
-            f"{path} declares {header.points} points, which are {needed} {unit}, and {available} follow. Copy it again."
+            f"{path} declares {header.points} points, or {needed} {unit}, but {available} follow. Copy it again."
         )

@@ -1,8 +1,8 @@
-"""Forecasts of change: sequence networks, and one network for all taxels. Both begin at persistence.
+"""Forecast changes of touch with sequence networks and a taxelwise network. An untrained network equals persistence.
 
-The head begins at zero, so an untrained model is persistence and training can only depart from it for a reason.
-Residual outputs are one of the repairs of Martinez, Black and Romero, On human motion prediction using recurrent neural
-networks (2017), where persistence beat published networks; all steps at once is what Zeng et al., Are transformers
+The head starts at zero, so training departs from persistence only if that lowers the loss. Residual outputs are one of
+the remedies of Martinez, Black and Romero, On human motion prediction using recurrent neural networks (2017), in which
+persistence outperformed published networks. All steps are predicted at once, which Zeng et al., Are transformers
 effective for time series forecasting? (2023), call direct multi-step.
 """
 
@@ -19,13 +19,15 @@ from tacpipe.models import lstm
 from tacpipe.models.windows import MOTION, UP, ForecastShape, ForecastWindows, motion, repeats
 
 CELLS = ("gru", "lstm", "tcn")
-CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a sensor must not dominate a window
+CLIP_DEVIATIONS = (
+    8.0  # standard deviations to which inputs are clipped, so that a jump of a sensor does not dominate a window
+)
 
 
 class ChangeForecast(nn.Module):
-    """Share scales fitted on training windows, the loss, and the step from change to touch.
+    """Base of forecasters of change: scales fitted on training windows, the loss, and conversion from change to touch.
 
-    ``increments`` means that features are changes from row to row already; then the change itself is predicted.
+    ``increments`` means that features are already changes from row to row; then the change itself is predicted.
     """
 
     change_only = True
@@ -38,7 +40,7 @@ class ChangeForecast(nn.Module):
     def __init__(
         self, features: int, *, dropout: float, loss: str, context: int, horizon: int, increments: bool = False
     ) -> None:
-        """Make scales of 1; sizes are numbers of features and of rows."""
+        """Initialise all scales to 1. Sizes are numbers of features and of rows."""
         super().__init__()
         self.features, self.context, self.horizon = features, context, horizon
         self.kind, self.increments = loss, increments
@@ -55,12 +57,12 @@ class ChangeForecast(nn.Module):
         self.change_scale.copy_(_scale(moved.square().mean().sqrt()))
         self.touch_mean.copy_(windows.touch.flatten(0, 1).mean(0))
         self.touch_scale.copy_(_scale(spread(windows.touch.flatten(0, 1))))
-        steps = driven(windows)[0].flatten(0, 1)
+        steps = motion_with_acceleration(windows)[0].flatten(0, 1)
         self.motion_mean.copy_(steps.mean(0))
         self.motion_scale.copy_(_scale(spread(steps)))
 
     def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
-        """Return the mean error in units of the usual change: absolute, squared, or Huber's."""
+        """Return the mean error relative to the RMS change: absolute, squared, or Huber's."""
         predicted, truth = self(windows) / self.change_scale, ahead / self.change_scale
         if self.kind == "squared":
             return nn.functional.mse_loss(predicted, truth)
@@ -69,9 +71,9 @@ class ChangeForecast(nn.Module):
         return nn.functional.l1_loss(predicted, truth)
 
     def arm(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-        """Return the scaled motion (row, window, 15) and up (window, 3), both as the hand sees them."""
-        steps, up = driven(windows)
-        return ((steps - self.motion_mean) / self.motion_scale).clamp(-CLIPPED, CLIPPED), up
+        """Return the scaled motion (row, window, 15) and the up direction (window, 3), both in the frame of the hand."""
+        steps, up = motion_with_acceleration(windows)
+        return ((steps - self.motion_mean) / self.motion_scale).clamp(-CLIP_DEVIATIONS, CLIP_DEVIATIONS), up
 
     def inputs(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
         """Return past (context, window, `ForecastShape.past`) and plan (horizon, window, `ForecastShape.plan`), scaled."""
@@ -79,45 +81,45 @@ class ChangeForecast(nn.Module):
         arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
         past, plan = arm[: windows.context], arm[windows.context :]
         change = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
-        level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIPPED, CLIPPED)
+        level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIP_DEVIATIONS, CLIP_DEVIATIONS)
         return torch.cat(
-            [change, level, repeats(windows.touch)[..., None], closing(windows)[..., None], past], -1
+            [change, level, repeats(windows.touch)[..., None], relative_width(windows)[..., None], past], -1
         ), plan
 
-    def touched(self, change: Tensor, windows: ForecastWindows) -> Tensor:
-        """Return touch (horizon, window, feature) from scaled change."""
+    def to_touch(self, change: Tensor, windows: ForecastWindows) -> Tensor:
+        """Convert scaled change to touch (horizon, window, feature)."""
         return change * self.change_scale + (0.0 if self.increments else windows.touch[-1])
 
 
 class PlainForecast(ChangeForecast):
-    """A network of past and plan between scales: it returns scaled change or, with ``change_only = False``, levels."""
+    """Wrap a network of past and plan with scales. It returns scaled change or, with ``change_only = False``, levels."""
 
     def __init__(self, network: nn.Module, shape: ForecastShape, *, loss: str) -> None:
-        """Take the network, and what it reads and predicts."""
+        """Wrap ``network``, whose inputs and outputs have the sizes of ``shape``."""
         sizes = {"context": shape.context, "horizon": shape.horizon}
         super().__init__(shape.features, dropout=0.0, loss=loss, increments=shape.increments, **sizes)
         self.network = network
         self.change_only = bool(getattr(network, "change_only", True))
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the features to come (horizon, window, feature), in their own unit."""
+        """Return the predicted features (horizon, window, feature), in their own unit."""
         past, plan = self.inputs(windows)
         scaled: Tensor = self.network(past, plan)
         if self.change_only:
-            return self.touched(scaled, windows)
+            return self.to_touch(scaled, windows)
         return scaled * self.touch_scale + self.touch_mean
 
 
 class SequenceForecast(ChangeForecast):
     """A recurrent or convolutional network over past and plan.
 
-    ``gru`` and ``lstm``: one reads the past, another continues over the plan from its state. ``tcn``: causal dilated
-    convolutions over both (Bai, Kolter and Koltun, 2018), touch being zero where it is to come. Each step's prediction
-    rests on the plan up to that step.
+    ``gru`` and ``lstm``: an encoder reads the past, and a decoder continues over the plan from its state. ``tcn``:
+    causal dilated convolutions over both (Bai, Kolter and Koltun, 2018), with zeros for the touch of future rows. The
+    prediction of each step uses the plan up to that step.
     """
 
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
-        """Make a model of random weights that begins at persistence."""
+        """Create a network with random weights and a zero head."""
         super().__init__(features, **shared)  # type: ignore[arg-type]
         shape = ForecastShape(features, self.context, self.horizon)
         past, arm = shape.past, shape.plan
@@ -133,16 +135,16 @@ class SequenceForecast(ChangeForecast):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the features to come (horizon, window, feature), in their own unit."""
+        """Return the predicted features (horizon, window, feature), in their own unit."""
         read, plan = self.inputs(windows)
         if self.cell == "tcn":
-            states = self._convolved(read, plan)
+            states = self._convolve(read, plan)
         else:
-            states, _ = lstm.through(self.decoder, plan, lstm.through(self.encoder, read)[1])
-        return self.touched(self.head(self.drop(states)), windows)
+            states, _ = lstm.run_layer(self.decoder, plan, lstm.run_layer(self.encoder, read)[1])
+        return self.to_touch(self.head(self.drop(states)), windows)
 
-    def _convolved(self, read: Tensor, plan: Tensor) -> Tensor:
-        """Return the states of the steps to come, (horizon, window, hidden)."""
+    def _convolve(self, read: Tensor, plan: Tensor) -> Tensor:
+        """Return the states of the predicted steps, (horizon, window, hidden)."""
         missing = plan.new_zeros(*plan.shape[:2], read.shape[-1] - plan.shape[-1])
         rows = torch.cat([read, torch.cat([missing, plan], -1)])
         is_past = torch.cat([rows.new_ones(len(read)), rows.new_zeros(len(plan))])
@@ -155,7 +157,7 @@ class SequenceForecast(ChangeForecast):
 
 
 class _Block(nn.Module):
-    """A causal dilated convolution with a way around it."""
+    """A causal dilated convolution with a residual connection."""
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
@@ -168,55 +170,60 @@ class _Block(nn.Module):
 
 
 def spread(rows: Tensor) -> Tensor:
-    """Return the standard deviation of ``rows`` (row, column) over rows, (column,), or 0 if there is one row."""
+    """Return the standard deviation of ``rows`` (row, column) over rows, (column,); 0 if there is one row."""
     return rows.std(0) if len(rows) > 1 else torch.zeros_like(rows[0])
 
 
 def _scale(spread: Tensor) -> Tensor:
-    """Return ``spread``, and 1 where nothing moves."""
+    """Return ``spread``, or 1 where it is 0."""
     return torch.where(spread > 0, spread, 1.0)
 
 
-def closing(windows: ForecastWindows) -> Tensor:
-    """Return the width between the fingers against now, (context, window), in thirds of a centimetre."""
-    return 300.0 * (windows.finger - windows.finger[-1])  # 3 mm between rows is a fast gripper
+def relative_width(windows: ForecastWindows) -> Tensor:
+    """Return the width between the fingers relative to the last row, (context, window), in units of 1/3 cm."""
+    return 300.0 * (windows.finger - windows.finger[-1])  # 3 mm per row is fast for a gripper
 
 
-def driven(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-    """Return `motion` with what accelerates the hand added (context + horizon, window, 15), and up (window, 3).
+def motion_with_acceleration(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
+    """Return `motion` with the hand's acceleration added (context + horizon, window, 15), and up (window, 3).
 
-    The last three columns are by how much the velocity differs from that of the row before, m/s; 0 in the first row,
-    which has none before. The load on the fingers is mass times this and weight: a network that must find the small
-    difference of two large velocities by itself hardly does.
+    The last three columns are the change of velocity since the previous row, m/s; 0 in the first row. The load on the
+    fingers is mass times acceleration plus weight, and a network hardly learns the small difference of two large
+    velocities.
     """
     steps, up = motion(windows)
     linear = steps[..., 6:9]
     return torch.cat([steps, torch.cat([torch.zeros_like(linear[:1]), linear.diff(dim=0)])], -1), up
 
 
-TRAITS = 16  # numbers that identify a place on the sensors
+TRAITS = 16  # size of the learned embedding of a taxel's position
 RANK = 32
-LAGS = (9, 7, 5, 3, 1)  # rows before now whose touch is compared with now; frames are held, so neighbours repeat
+LAGS = (
+    9,
+    7,
+    5,
+    3,
+    1,
+)  # past rows that are compared with the last row; samples repeat, so adjacent rows are often equal
 
 
 class TaxelwiseForecast(ChangeForecast):
-    """Reads raw channels; begins at persistence.
+    """Predict raw channels with one network that all taxels share; it starts at persistence.
 
-    One network for all taxels: what a taxel does next, as factors of the taxel times factors of the motion.
-
-    The taxels of one kind of sensor are alike, so one small network reads each of them: its own history and level, what
-    its sensors measure on the whole, and a learned trait of its place. It gives factors φ (axis, rank). A recurrent
-    network goes over the plan and gives factors ψ (rank) a step. The change is Σ_rank φ ψ, so the taxels are read once
-    for all steps, each step uses the plan up to it, and a step before a new frame is due can be closed for all taxels at
-    once (`gate`): skins are logged faster than they are read, and until the next frame comes nothing changes.
+    The change of a taxel is the product of factors of the taxel and factors of the motion. A small network shared by
+    all taxels reads each taxel's history and level, a summary of its sensors, and a learned embedding of its position,
+    and returns factors φ (axis, rank). A recurrent network reads the plan and returns factors ψ (rank) for each step.
+    The change is Σ_rank φ ψ, so taxels are read only once for all steps, and each step uses the plan up to it. `gate`
+    can suppress steps before a new frame is due for all taxels at once: a skin is logged faster than it is read, and
+    nothing changes in between.
     """
 
     axis_scale: Tensor
-    told_mean: Tensor  # mean of the inputs of the shared network; stored models have this name
+    told_mean: Tensor  # mean of the inputs of the shared network; the name is stored in models
     told_scale: Tensor
 
     def __init__(self, layout: Sequence[Mapping[str, str]], *, hidden: int, **shared: Any) -> None:
-        """Make a model of random weights for channels that lie as ``layout`` states, taxel by taxel."""
+        """Create a network with random weights for the channels of ``layout``, ordered taxel by taxel."""
         super().__init__(len(layout), **shared)
         self.sensors, self.taxels, self.axes = grid(layout)
         self.lags = [lag for lag in LAGS if lag < self.context]
@@ -248,17 +255,19 @@ class TaxelwiseForecast(ChangeForecast):
     def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scales on training windows; ``ahead`` is (horizon, window, feature)."""
         super().calibrate(windows, ahead)
-        by_axis = self._by_taxel(windows.touch).std(dim=(0, 1, 2))
-        self.axis_scale.copy_(torch.where(by_axis > 0, by_axis, 1.0))
+        axis_spread = self._by_taxel(windows.touch).std(dim=(0, 1, 2))
+        self.axis_scale.copy_(torch.where(axis_spread > 0, axis_spread, 1.0))
         for name, values in zip(("own", "told"), self._read(windows), strict=True):
             flat = values.flatten(0, -2)
             getattr(self, f"{name}_mean").copy_(flat.mean(0))
             getattr(self, f"{name}_scale").copy_(spread(flat) + 1e-3)
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the future touch (horizon, window, channel), in counts above rest."""
+        """Return the predicted touch (horizon, window, channel), in counts above rest."""
         own, whole_inputs = (
-            ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(-CLIPPED, CLIPPED)
+            ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(
+                -CLIP_DEVIATIONS, CLIP_DEVIATIONS
+            )
             for name, values in zip(("own", "told"), self._read(windows), strict=True)
         )
         whole = self.drop(self.whole(whole_inputs))  # (window, hidden)
@@ -266,16 +275,16 @@ class TaxelwiseForecast(ChangeForecast):
         hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._dropout_mask(hidden)))
         hidden = hidden * self._dropout_mask(hidden)
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
-        new = self._new(windows)
+        new = self._novelty(windows)
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
-        told = torch.cat([plan, new.expand(len(plan), -1, -1)], -1)
-        states, _ = lstm.through(self.plan, told, self.start(whole)[None])
+        inputs = torch.cat([plan, new.expand(len(plan), -1, -1)], -1)
+        states, _ = lstm.run_layer(self.plan, inputs, self.start(whole)[None])
         steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(new)).T[..., None]
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
-        return self.touched(change.flatten(2), windows)
+        return self.to_touch(change.flatten(2), windows)
 
-    def _new(self, windows: ForecastWindows) -> Tensor:
-        """Return which rows are new (window, context): new frames are rare, so they weigh more."""
+    def _novelty(self, windows: ForecastWindows) -> Tensor:
+        """Return 3 for new rows and -1 for repeated ones, (window, context): new frames are rare, so they weigh more."""
         return 3 - 4 * repeats(windows.touch).T
 
     def _by_taxel(self, touch: Tensor) -> Tensor:
@@ -283,18 +292,18 @@ class TaxelwiseForecast(ChangeForecast):
         return touch.reshape(*touch.shape[:-1], self.sensors * self.taxels, self.axes)
 
     def _dropout_mask(self, hidden: Tensor) -> Tensor:
-        """Return what dropout keeps (window, 1, hidden): the same units for all taxels, which costs little to draw."""
+        """Draw a dropout mask (window, 1, hidden) that all taxels share, which is cheap to draw."""
         mask: Tensor = self.drop(hidden.new_ones(len(hidden), 1, hidden.shape[-1]))
         return mask
 
     def _read(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-        """Return the inputs of each taxel (window, taxel, …) and of the whole (window, …)."""
+        """Return the inputs of each taxel (window, taxel, …) and of the shared network (window, …)."""
         touch = windows.touch
         lags = torch.tensor([windows.context - 1 - lag for lag in self.lags], dtype=torch.long)
         change = self._by_taxel(touch[-1] - touch[lags])  # (lag, window, taxel, axis)
         level = self._by_taxel(touch[-1:])
         plain = torch.cat([change, level]) / self.axis_scale
-        # a change of a few counts and one of thousands both matter; the logarithm of either is an ordinary number
+        # changes of a few counts and of thousands both matter, so their logarithms are used
         fine = torch.cat([torch.asinh(8 * change / self.change_scale), torch.asinh(2 * level / self.change_scale)])
         own = torch.cat([fine, plain]).permute(1, 2, 0, 3).flatten(2)  # (window, taxel, lag and axis)
         sensors = plain.view(
@@ -303,27 +312,27 @@ class TaxelwiseForecast(ChangeForecast):
         load = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
         steps, up = self.arm(windows)
         past = steps[: windows.context].transpose(0, 1).flatten(1)
-        return own, torch.cat([load, up, past, closing(windows).T, 1 - repeats(touch).T], -1)
+        return own, torch.cat([load, up, past, relative_width(windows).T, 1 - repeats(touch).T], -1)
 
 
 def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
-    """Return how many sensors, taxels a sensor and axes a taxel there are.
+    """Return the numbers of sensors, of taxels per sensor and of axes per taxel.
 
-    Raises `TacpipeError` if channels do not lie sensor by sensor and taxel by taxel, or sensors differ in size.
+    Raises `TacpipeError` if channels are not ordered by sensor and taxel, or sensors differ in size.
     """
     streams = list(dict.fromkeys(channel.get("stream", "") for channel in layout))
     axes = list(dict.fromkeys(channel.get("axis", "") for channel in layout))
     taxels = len(layout) // max(len(streams) * len(axes), 1)
-    places = [(channel.get("stream", ""), channel.get("taxel"), channel.get("axis", "")) for channel in layout]
-    names = list(dict.fromkeys(taxel for _, taxel, _ in places))
+    positions = [(channel.get("stream", ""), channel.get("taxel"), channel.get("axis", "")) for channel in layout]
+    names = list(dict.fromkeys(taxel for _, taxel, _ in positions))
     expected = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
-    if None in names or places != expected or taxels < 2:
-        reason = f"these {len(layout)} do not" if layout else "the recordings hold latents"
+    if None in names or positions != expected or taxels < 2:
+        reason = f"these {len(layout)} channels are not" if layout else "the recordings contain latents"
         declared = (
-            "Write {taxel}, and {axis} where there are several, in match of [streams.…] columns of the layout file. "
+            "Write {taxel}, and {axis} if there are several, in match of [streams.…] columns of the layout file. "
         )
         raise TacpipeError(
-            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel, as many of each; "
+            f"The taxelwise model reads raw channels, sensor by sensor and taxel by taxel, and sensors of equal size; "
             f"{reason}. {declared if layout and None in names else ''}"
             f"Train it on segments without a codec, or choose --architecture gru, lstm, tcn or recurrent."
         )

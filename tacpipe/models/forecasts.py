@@ -1,4 +1,4 @@
-"""The forecasters by name, each reading the same windows and giving touch in the unit that it was given."""
+"""Create forecasters by name. Each reads the same windows and predicts touch in the unit of its input."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast, Taxel
 from tacpipe.models.lstm import lstm
 from tacpipe.models.windows import POSE, ForecastWindows
 
-TRIED = torch.linspace(0, 1, 21)  # weights of which the best is taken at each step
-DOUBT = 0.05  # fraction of persistence's error that one more recording is imagined to lose by the full forecast
+CANDIDATE_WEIGHTS = torch.linspace(0, 1, 21)  # candidate weights; the best is chosen for each step
+PRIOR_LOSS = (
+    0.05  # prior: a virtual recording on which the full forecast is worse by this fraction of persistence's error
+)
 
 
 class Ensemble(nn.Module):
-    """The mean of networks, each with weights of its own.
+    """The mean of several networks with independent weights.
 
-    The mean of networks errs less than one of them does on average (Krogh and Vedelsby, Neural network ensembles, cross
+    The mean has a smaller error than its members have on average (Krogh and Vedelsby, Neural network ensembles, cross
     validation, and active learning, 1995).
     """
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
-        """Take networks that scale themselves."""
+        """Combine networks that scale their inputs and outputs themselves."""
         super().__init__()
         self.members = nn.ModuleList(members)
         self.change_only = members[0].change_only
@@ -41,7 +43,7 @@ class Ensemble(nn.Module):
         return torch.stack(losses).mean()
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the features to come (horizon, window, feature)."""
+        """Return the predicted features (horizon, window, feature)."""
         return torch.stack([member(windows) for member in self.members]).mean(0)
 
 
@@ -51,7 +53,7 @@ class Shrunk(nn.Module):
     weight: Tensor  # (horizon,)
 
     def __init__(self, network: nn.Module, weight: Tensor) -> None:
-        """Take a network of change and the weights. Raises `ValueError` for weights below 0 or above 1."""
+        """Wrap a network of change. Raises `ValueError` if a weight is below 0 or above 1."""
         super().__init__()
         if not ((weight >= 0) & (weight <= 1)).all():
             raise ValueError("a weight of the forecast is not between 0 and 1")
@@ -59,7 +61,7 @@ class Shrunk(nn.Module):
         self.register_buffer("weight", weight)
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the features to come (horizon, window, feature)."""
+        """Return the predicted features (horizon, window, feature)."""
         now = windows.touch[-1]
         ahead: Tensor = now + self.weight[:, None, None] * (self.network(windows) - now)
         return ahead
@@ -68,35 +70,35 @@ class Shrunk(nn.Module):
 def persistence_weights(changes: Tensor, measured: Tensor, recording: Tensor) -> Tensor:
     """Return the weight (horizon,) of predicted ``changes`` (horizon, window, feature), from 0 to 1.
 
-    ``recording`` (window,) is the number of each window's recording. The weight has the least mean over recordings of the
-    mean absolute error of the ``measured`` changes divided by that of persistence, next to one more recording on which the
-    forecast is `DOUBT` worse: the fewer recordings there are, the closer it is to persistence. As the error is convex in
-    the weight, that mean is at most 1 at every step.
+    ``recording`` (window,) is the number of each window's recording. The weight minimises the mean over recordings of the
+    mean absolute error of the ``measured`` changes divided by that of persistence, plus a virtual recording on which the
+    forecast is `PRIOR_LOSS` worse. So with few recordings, the weight is close to persistence. The error is convex in the
+    weight, so this mean is at most 1 at every step.
 
     >>> changes, measured = torch.full((1, 1, 2), 2.0), torch.ones(1, 1, 2)
     >>> persistence_weights(changes, measured, torch.zeros(1, dtype=torch.int64))
     tensor([0.5000])
     """
-    total = DOUBT * TRIED[:, None].double().expand(-1, len(changes)).clone()  # (weight, horizon)
+    total = PRIOR_LOSS * CANDIDATE_WEIGHTS[:, None].double().expand(-1, len(changes)).clone()  # (weight, horizon)
     for number in torch.unique(recording):
         windows = recording == number
         predicted, truth = changes[:, windows].double(), measured[:, windows].double()
-        errors = torch.stack([(truth - weight * predicted).abs().mean((1, 2)) for weight in TRIED])
+        errors = torch.stack([(truth - weight * predicted).abs().mean((1, 2)) for weight in CANDIDATE_WEIGHTS])
         total += errors / errors[0].clamp_min(torch.finfo(torch.float64).tiny)
-    return TRIED[total.argmin(0)]
+    return CANDIDATE_WEIGHTS[total.argmin(0)]
 
 
 class RecurrentForward(nn.Module):
-    """Encoder and decoder LSTM of one layer each and a linear head; always free running, in training too.
+    """An LSTM encoder and decoder of one layer each with a linear head; the decoder is free-running, also in training.
 
     After Nazari, Mandil, Hanheide and Ghalamzan Esfahani, Tactile Dynamic Behaviour Prediction Based on Robot Action
-    (TAROS 2021): the encoder reads [tactile features ; robot state] step by step, and its (h, c) start the decoder,
-    whose input at each step is [tactile features it predicted last ; planned robot state]. The paper gives no layer
-    sizes: one layer of 200 is what its authors' later models have, and the linear head is our choice.
+    (TAROS 2021): the encoder reads [tactile features ; robot state] step by step, and its (h, c) initialise the
+    decoder, whose input at each step is [last predicted tactile features ; planned robot state]. The paper states no
+    layer sizes: one layer of 200 units follows its authors' later models, and the linear head is our choice.
     """
 
     def __init__(self, latents: int, states: int, hidden: int = 200) -> None:
-        """Make a model of random weights; sizes are numbers of features and of recurrent units."""
+        """Create a network with random weights; sizes are numbers of features and of recurrent units."""
         super().__init__()
         self.latents, self.states, self.hidden = latents, states, hidden
         self.encoder = nn.LSTM(latents + states, hidden)
@@ -125,14 +127,14 @@ class RecurrentForward(nn.Module):
 
 
 AUTO, TAXELWISE = "auto", "taxelwise"
-ELSE = "gru"  # the meaning of auto where the taxelwise model cannot read the channels
+FALLBACK = "gru"  # the meaning of auto if the taxelwise model cannot read the channels
 Layout = Sequence[Mapping[str, str]]
 Loss = Literal["absolute", "huber", "squared"]
 AnyLoss = Literal["auto", "absolute", "huber", "squared"]
 
 
 class RecurrentForecast(nn.Module):
-    """The paper's model between its scalings: features and poses to [-1, 1] and back; it predicts levels, not changes."""
+    """The paper's model with its scaling of features and poses to [-1, 1] and back. It predicts levels, not changes."""
 
     change_only = False
     touch_centre: Tensor
@@ -141,7 +143,7 @@ class RecurrentForecast(nn.Module):
     pose_half: Tensor
 
     def __init__(self, features: int, hidden: int) -> None:
-        """Make a model of random weights whose scalings are those of data within [-1, 1]."""
+        """Create a network with random weights and scaling for data in [-1, 1]."""
         super().__init__()
         self.network = RecurrentForward(features, POSE, hidden)
         for name, width in (("touch", features), ("pose", POSE)):
@@ -149,7 +151,7 @@ class RecurrentForecast(nn.Module):
             self.register_buffer(f"{name}_half", torch.ones(width))
 
     def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
-        """Fit the scalings on training windows: the lowest and highest value of each feature and coordinate."""
+        """Fit the scaling on training windows: the minimum and maximum of each feature and coordinate."""
         for name, values in (("touch", torch.cat([windows.touch, ahead])), ("pose", windows.arm[..., :POSE])):
             low, high = values.flatten(0, 1).amin(0), values.flatten(0, 1).amax(0)
             half = (high - low) / 2
@@ -157,12 +159,12 @@ class RecurrentForecast(nn.Module):
             getattr(self, f"{name}_half").copy_(torch.where(half > 0, half, 1.0))
 
     def forward(self, windows: ForecastWindows) -> Tensor:
-        """Return the features to come (horizon, window, feature), in their own unit."""
+        """Return the predicted features (horizon, window, feature), in their own unit."""
         restored: Tensor = self._scaled(windows) * self.touch_half + self.touch_centre
         return restored
 
     def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
-        """Return the mean squared error in scaled features, the paper's measure; ``ahead`` (horizon, window, feature)."""
+        """Return the mean squared error of scaled features, the paper's loss; ``ahead`` is (horizon, window, feature)."""
         return nn.functional.mse_loss(self._scaled(windows), (ahead - self.touch_centre) / self.touch_half)
 
     def _scaled(self, windows: ForecastWindows) -> Tensor:
@@ -185,10 +187,10 @@ def build(
     loss: str,
     changes: bool = False,
 ) -> ChangeForecast:
-    """Return a model of change of random weights for ``features`` latents or channels.
+    """Return a model of change with random weights for ``features`` latents or channels.
 
-    ``layout`` describes where each channel lies; ``changes``: features are increments already. Raises `TacpipeError` for
-    an architecture that is unknown and for a representation that it cannot read.
+    ``layout`` describes the position of each channel; ``changes``: features are already increments. Raises
+    `TacpipeError` if the architecture is unknown or cannot read this representation.
     """
     if architecture in CELLS:
         return SequenceForecast(
@@ -206,13 +208,13 @@ def build(
     raise TacpipeError(f"There is no architecture {architecture!r}; there are {', '.join((TAXELWISE, *CELLS))}.")
 
 
-def resolved_loss(loss: AnyLoss, *, changes: bool) -> Loss:
-    """Return the loss that ``auto`` is; ``changes``: features are increments already.
+def resolve_loss(loss: AnyLoss, *, changes: bool) -> Loss:
+    """Return ``loss``, or the default loss if it is ``auto``. ``changes``: features are already increments.
 
-    Where a sensor repeats samples most increments are 0, and so is their median, which is all that the absolute error
-    teaches.
+    If a sensor repeats samples, most increments are 0, and so is their median, which is all that the absolute error
+    would teach.
 
-    >>> resolved_loss("auto", changes=True), resolved_loss("auto", changes=False), resolved_loss("squared", changes=True)
+    >>> resolve_loss("auto", changes=True), resolve_loss("auto", changes=False), resolve_loss("squared", changes=True)
     ('huber', 'absolute', 'squared')
     """
     if loss != "auto":
@@ -220,12 +222,12 @@ def resolved_loss(loss: AnyLoss, *, changes: bool) -> Loss:
     return "huber" if changes else "absolute"
 
 
-def resolved(architecture: str, layout: Layout) -> str:
-    """Return the architecture that ``auto`` is for channels that lie like ``layout``, empty for latents; others as they are.
+def resolve_architecture(architecture: str, layout: Layout) -> str:
+    """Return ``architecture``, or if it is ``auto`` the default for channels with this ``layout`` (empty for latents).
 
-    Raises `TacpipeError` for one that cannot read them.
+    Raises `TacpipeError` if the taxelwise architecture is requested and cannot read the channels.
 
-    >>> resolved("auto", ()), resolved("tcn", ())
+    >>> resolve_architecture("auto", ()), resolve_architecture("tcn", ())
     ('gru', 'tcn')
     """
     if architecture not in (AUTO, TAXELWISE):
@@ -234,9 +236,9 @@ def resolved(architecture: str, layout: Layout) -> str:
         grid(layout)
     except TacpipeError:
         if architecture == AUTO:
-            return ELSE
+            return FALLBACK
         raise
     return TAXELWISE
 
 
-__all__ = ["AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved", "resolved_loss"]
+__all__ = ["AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolve_architecture", "resolve_loss"]

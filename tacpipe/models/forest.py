@@ -1,7 +1,7 @@
-"""Extremely randomised trees (Geurts et al., Extremely randomized trees, 2006), fitted by scikit-learn and kept as arrays.
+"""Fit extremely randomised trees (Geurts et al., Extremely randomized trees, 2006) with scikit-learn, stored as arrays.
 
-What scikit-learn keeps of a forest is a pickle, which may run code when an untrusted one is opened. Kept here are the
-cuts and the means of the leaves, from which the same values follow, to the seven digits of a float32.
+scikit-learn stores a forest as a pickle, which may run code when an untrusted one is opened. The arrays of thresholds
+and leaf means give the same values, to the seven digits of a float32.
 """
 
 from __future__ import annotations
@@ -15,25 +15,28 @@ from torch import Tensor
 
 from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s
 
-FEATURES = 0.4  # fraction of all features that is tried at a cut
+FEATURES = 0.4  # fraction of all features that is tried at a split
 LEAF = -1  # the child of a node without children
 
 
 @dataclass(frozen=True)
 class Forest:
-    """Trees side by side in arrays of all nodes, each tree beginning at one of ``roots``."""
+    """All nodes of all trees in shared arrays; each tree starts at one of ``roots``."""
 
     roots: Int32s  # (tree,)
     children: Int32s  # (node, left or right); LEAF at a leaf
     features: Int32s  # (node,)
-    cuts: Floats  # (node,); a row goes left where its feature is at most that
+    cuts: Floats  # (node,); a row goes left if its feature is at most this
     values: Float32s  # (node, value)
 
     @classmethod
-    def fitted(
+    def fit(
         cls, rows: Floats, values: Floats, *, trees: int, leaf: int, seed: int, features: float = FEATURES
     ) -> Forest:
-        """Return a forest that predicts ``values`` (row, value) of ``rows`` (row, feature); a leaf has ``leaf`` or more."""
+        """Fit a forest that predicts ``values`` (row, value) from ``rows`` (row, feature).
+
+        Each leaf has at least ``leaf`` rows.
+        """
         from sklearn.ensemble import ExtraTreesRegressor
 
         forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
@@ -56,9 +59,10 @@ class Forest:
     def out_of_bag_error(
         rows: Floats, values: Floats, *, leaf: int, seed: int, trees: int = 100, features: float = FEATURES
     ) -> float:
-        """Return the mean squared error on rows that a tree was not grown on, each tree having a draw of the rows.
+        """Return the out-of-bag mean squared error of a forest whose trees are fitted on bootstrap samples.
 
-        It is over all rows and values at once, in the unit of the values squared (Breiman, Out-of-bag estimation, 1996).
+        It is the mean over all rows and values, in the squared unit of the values (Breiman, Out-of-bag estimation,
+        1996).
         """
         from sklearn.ensemble import ExtraTreesRegressor
 
@@ -69,7 +73,7 @@ class Forest:
         return float(np.mean((forest.oob_prediction_.reshape(values.shape) - values) ** 2))
 
     def predict(self, rows: Floats) -> Floats:
-        """Return the mean over trees of the leaf that each row (row, feature) falls into, (row, value); of 1 row or more."""
+        """Return the mean over trees of the leaf of each row, (row, value), for one or more rows (row, feature)."""
         features = rows.astype(np.float32)
         node = np.broadcast_to(self.roots, (len(features), len(self.roots))).copy()  # (row, tree)
         row = np.arange(len(features))[:, None]
@@ -81,25 +85,26 @@ class Forest:
             node = np.where(child == LEAF, node, child)
         return np.stack([self.values[at].mean(axis=0, dtype=np.float64) for at in node])
 
-    def times(self, unit: Floats) -> Forest:
-        """Return the forest that predicts the same values (value,) in another unit: each multiplied by its ``unit``."""
+    def scaled(self, unit: Floats) -> Forest:
+        """Return a forest whose predictions are multiplied by ``unit`` (value,), for example to convert their unit."""
         return replace(self, values=(self.values * unit).astype(np.float32))
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return what `from_tensors` reads."""
+    def to_tensors(self) -> dict[str, Tensor]:
+        """Return the arrays that `from_tensors` reads."""
         arrays: dict[str, AnyArray] = {"roots": self.roots, "children": self.children, "features": self.features}
         arrays |= {"cuts": self.cuts, "values": self.values}
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
-    def check(self, features: int, values: int) -> None:
-        """Raise `ValueError` unless trees of so many ``features`` predict so many ``values``, and each way down them ends.
+    def validate(self, features: int, values: int) -> None:
+        """Raise `ValueError` unless the trees read ``features`` features, predict ``values`` values, and have no cycles.
 
-        As they are grown a child stands behind its parent: nodes that lead back to one another would be gone round for ever.
+        Children of a grown tree come after their parent. Nodes that lead back to each other would cause an endless
+        loop.
         """
         nodes = len(self.values)
         numbers = np.arange(nodes)[:, None]
         down = (self.children > numbers) & (self.children < nodes) | (self.children == LEAF)
-        shapes = {
+        checks = {
             "roots": self.roots.ndim == 1 and len(self.roots) > 0,
             "children": self.children.shape == (nodes, 2) and bool(down.all()),
             "features": self.features.shape == (nodes,)
@@ -108,12 +113,14 @@ class Forest:
             "values": self.values.shape == (nodes, values),
         }
         are_integers = all(array.dtype.kind == "i" for array in (self.roots, self.children, self.features))
-        wrong = next((name for name, fine in shapes.items() if not fine), "" if are_integers else "numbers of nodes")
-        if wrong or not ((self.roots >= 0) & (self.roots < nodes)).all():
-            raise ValueError(f"the {wrong or 'roots'} of a forest of {nodes} nodes are out of range")
+        invalid = next(
+            (name for name, is_valid in checks.items() if not is_valid), "" if are_integers else "numbers of nodes"
+        )
+        if invalid or not ((self.roots >= 0) & (self.roots < nodes)).all():
+            raise ValueError(f"the {invalid or 'roots'} of a forest of {nodes} nodes are out of range")
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Forest:
-        """Return the forest that `tensors` wrote."""
+        """Return the forest that `to_tensors` stored."""
         names: Sequence[str] = ("roots", "children", "features", "cuts", "values")
         return cls(*(tensors[name].numpy() for name in names))

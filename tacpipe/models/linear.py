@@ -1,24 +1,25 @@
-"""The linear forecasts that every forecaster is compared with: a mean, a damped trend and three least-squares maps.
+"""Fit the linear baselines of every forecaster: a mean, a damped trend and three least-squares maps.
 
-Windows come as three arrays: ``past`` (window, context, channel), counts above rest, newest last; ``motion`` (window,
-context + horizon, state), the arm's state at the same steps and then its plan; ``ahead`` (window, horizon, channel),
-counts above rest again. Every forecast is in counts above rest, of the same shape as ``ahead``:
+Windows are three arrays: ``past`` (window, context, channel), counts above rest, newest last; ``motion`` (window,
+context + horizon, state), the arm's state in the same rows and then its plan; ``ahead`` (window, horizon, channel),
+counts above rest. Every forecast is in counts above rest, with the shape of ``ahead``:
 
 - ``train_mean``: the mean of ``ahead`` over the training windows and steps, of each channel;
 - ``damped_trend``: x_t + (phi + phi^2 + ... + phi^h) (x_t - x_{t-lag}) / lag, h steps ahead (Gardner and McKenzie,
-  Forecasting trends in time series, 1985, equation 2), one phi and lag for all channels, of the least squared error on
-  the training windows. With phi = 0 it is persistence;
+  Forecasting trends in time series, 1985, equation 2), with the phi and lag, shared by all channels, that minimise the
+  squared error on the training windows. With phi = 0 it is persistence;
 - ``last_value_linear``: NLinear (Zeng, Chen, Zhang and Xu, Are Transformers Effective for Time Series Forecasting?,
-  2023, section 4): the last value is taken off, one map from context to horizon serves all channels, and it is put back;
-- ``ridge``: ridge regression of ``ahead - x_t``, all steps and channels at once, on the changes x_{t-j} - x_t and on the
-  past motion, features standardised (Hoerl and Kennard, Ridge Regression, 1970);
+  2023, section 4): the last value is subtracted, one map from context to horizon is shared by all channels, and the
+  last value is added again;
+- ``ridge``: ridge regression of ``ahead - x_t``, all steps and channels at once, on the changes x_{t-j} - x_t and the
+  past motion, with standardised features (Hoerl and Kennard, Ridge Regression, 1970);
 - ``ridge_actions``: the same with the planned motion among the features.
 
-Squared errors are in counts, so the axes that move most decide phi, lag and alpha.
+Squared errors are in counts, so the axes that move most determine phi, lag and alpha.
 
-All five follow from the same sums over windows, which are taken once, in pieces and as float64. Features that change
-for all channels alike, as in the trend and in NLinear, need the diagonal blocks of the ridge's matrices only; the ridge
-without actions needs the corner of those with actions.
+All five are computed from the same sums over windows, accumulated once, in chunks and as float64. The trend and NLinear
+are shared by all channels, so they need only the diagonal blocks of the ridge's matrices; the ridge without actions
+needs the leading block of the matrices with actions.
 """
 
 from __future__ import annotations
@@ -34,14 +35,16 @@ from tacpipe.errors import TacpipeError
 Windows = tuple[AnyFloats, AnyFloats, AnyFloats]  # past, motion and ahead
 
 NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions")
-ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # against standardised features and sums over windows, as in scikit-learn
+ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # for standardised features and sums over windows, as in scikit-learn
 PHIS = tuple(step / 20 for step in range(21))
-CHUNK = 2048  # windows whose features are held at once: 35 MB of 1,100 features and 960 targets
-RIDGE_SHARE = 1e-6  # fraction of NLinear's mean square added to each: repeated frames leave its matrix nearly singular
+CHUNK = 2048  # windows per chunk: 35 MB with 1,100 features and 960 targets
+RIDGE_SHARE = (
+    1e-6  # fraction of NLinear's mean square that regularises it: repeated frames make its matrix nearly singular
+)
 
 
 @dataclass(frozen=True)
-class Map:
+class AffineMap:
     """A map from features to increments of all steps and channels: bias + (features - centre) @ weight."""
 
     centre: AnyFloats  # (feature,)
@@ -50,42 +53,42 @@ class Map:
     alpha: float
 
     def __call__(self, features: AnyFloats) -> AnyFloats:
-        """Return increments in counts, (window, feature) to (window, step x channel)."""
+        """Return the increments (window, step x channel), in counts, of features (window, feature)."""
         increments: AnyFloats = (features - self.centre) @ self.weight + self.bias
         return increments
 
     def to_tensors(self, name: str) -> dict[str, AnyFloats]:
-        """Return its parts under ``name``."""
+        """Return its arrays, with names that start with ``name``."""
         parts = {"centre": self.centre, "weight": self.weight, "bias": self.bias, "alpha": np.array([self.alpha])}
         return {f"{name}.{part}": values for part, values in parts.items()}
 
     @classmethod
-    def from_tensors(cls, name: str, tensors: Mapping[str, AnyFloats]) -> Map:
-        """Return the map that `to_tensors` described."""
+    def from_tensors(cls, name: str, tensors: Mapping[str, AnyFloats]) -> AffineMap:
+        """Return the map that `to_tensors` stored."""
         centre, weight, bias, alpha = (tensors[f"{name}.{part}"] for part in ("centre", "weight", "bias", "alpha"))
         return cls(centre, weight, bias, float(alpha[0]))
 
 
 @dataclass(frozen=True)
 class FittedBaselines:
-    """Hold the fitted baselines, float32 as the forecasts."""
+    """The fitted baselines, in float32 like the forecasts."""
 
     mean_count: AnyFloats  # (channel,)
     phi: float
-    lag: int  # rows, or 0 if a single past frame shows no trend
+    lag: int  # rows, or 0 if the context is a single frame, which has no trend
     shared_weight: AnyFloats  # (context - 1, horizon)
     shared_bias: AnyFloats  # (horizon,), counts
-    ridge: Map
-    ridge_actions: Map
+    ridge: AffineMap
+    ridge_actions: AffineMap
 
     @classmethod
     def fit(cls, training: Windows, validation: Windows) -> FittedBaselines:
-        """Return the baselines fitted on ``training``, each (past, motion, ahead); ``validation`` picks the alphas.
+        """Fit the baselines on ``training``, a tuple (past, motion, ahead); the alphas are chosen on ``validation``.
 
-        Raises `TacpipeError` if a part has no windows, arrays do not fit one another or a value is not finite.
+        Raises `TacpipeError` if a part has no windows, shapes do not match or a value is not finite.
         """
-        _check("training", training)
-        _check("validation", validation)
+        _validate_windows("training", training)
+        _validate_windows("validation", validation)
         if [arrays.shape[1:] for arrays in training] != [arrays.shape[1:] for arrays in validation]:
             raise TacpipeError(
                 f"Validation windows of {_shapes(validation)} do not fit training windows of {_shapes(training)}; all "
@@ -96,9 +99,9 @@ class FittedBaselines:
         means = [arrays.mean(axis=0, dtype=np.float64) for arrays in training]
         centre = _features(means[0][None], means[1][None])[0]
         bias = (means[2] - means[0][-1]).ravel()
-        sums, evaluated = (_FeatureSums.over(part, centre, bias) for part in (training, validation))
-        blind = centre.size - horizon * motion.shape[2]  # features that do not know the plan
-        shared = _Shared.from_sums(sums, centre, bias, (context - 1, channels, horizon))
+        sums, evaluated = (_FeatureSums.accumulate(part, centre, bias) for part in (training, validation))
+        without_plan = centre.size - horizon * motion.shape[2]  # number of features without the plan
+        shared = _SharedSums.from_sums(sums, centre, bias, (context - 1, channels, horizon))
         phi, lag = shared.damped_trend()
         shared_weight, shared_bias = shared.least_squares()
         return cls(
@@ -107,13 +110,13 @@ class FittedBaselines:
             lag,
             shared_weight.astype(np.float32),
             shared_bias.astype(np.float32),
-            _ridge(sums.first(blind), evaluated.first(blind), centre[:blind], bias),
+            _ridge(sums.first(without_plan), evaluated.first(without_plan), centre[:without_plan], bias),
             _ridge(sums, evaluated, centre, bias),
         )
 
     @property
-    def chosen(self) -> dict[str, float]:
-        """The settings with the least squared error: phi, the lag in rows and the two alphas."""
+    def settings(self) -> dict[str, float]:
+        """The settings with the least squared error: phi, the lag in rows, and the two alphas."""
         return {
             "damped_trend.phi": self.phi,
             "damped_trend.lag": float(self.lag),
@@ -122,14 +125,14 @@ class FittedBaselines:
         }
 
     def predict(self, past: AnyFloats, motion: AnyFloats) -> dict[str, AnyFloats]:
-        """Return what `each` yields, by name."""
+        """Return the items of `forecasts` as a dict."""
         return dict(self.forecasts(past, motion))
 
     def forecasts(self, past: AnyFloats, motion: AnyFloats) -> Iterator[tuple[str, AnyFloats]]:
-        """Yield each baseline's name and counts above rest, (window, horizon, channel), float32.
+        """Yield each baseline's name and forecast in counts above rest, (window, horizon, channel), float32.
 
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
-        where these are not what was fitted.
+        if their shapes are not those of the training windows.
         """
         before, horizon = self.shared_weight.shape
         channels = len(self.mean_count)
@@ -155,7 +158,7 @@ class FittedBaselines:
             yield name, last + ridge(features[:, : len(ridge.centre)]).reshape(shape)
 
     def to_tensors(self) -> dict[str, AnyFloats]:
-        """Return all that `from_tensors` needs."""
+        """Return the arrays that `from_tensors` reads."""
         tensors: dict[str, AnyFloats] = {
             "train_mean": self.mean_count,
             "damped_trend.phi": np.array([self.phi]),
@@ -167,28 +170,28 @@ class FittedBaselines:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyFloats]) -> FittedBaselines:
-        """Return the baselines that `to_tensors` described."""
+        """Return the baselines that `to_tensors` stored."""
         return cls(
             tensors["train_mean"],
             float(tensors["damped_trend.phi"][0]),
             int(tensors["damped_trend.lag"][0]),
             tensors["last_value_linear.weight"],
             tensors["last_value_linear.bias"],
-            Map.from_tensors("ridge", tensors),
-            Map.from_tensors("ridge_actions", tensors),
+            AffineMap.from_tensors("ridge", tensors),
+            AffineMap.from_tensors("ridge_actions", tensors),
         )
 
 
 @dataclass(frozen=True)
 class _FeatureSums:
-    """Sums over windows of products of features and of features with targets, both less their training means."""
+    """Sums over windows of feature-feature and feature-target products, both centred on their training means."""
 
     windows: int
     xx: AnyFloats  # (feature, feature)
     xy: AnyFloats  # (feature, step x channel)
 
     @classmethod
-    def over(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
+    def accumulate(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
         past, motion, ahead = part
         xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
         for first in range(0, len(past), CHUNK):
@@ -199,16 +202,16 @@ class _FeatureSums:
             xx += features.T @ features
             xy += features.T @ increments
         if not (np.isfinite(xx).all() and np.isfinite(xy).all()):
-            raise TacpipeError("Some windows hold values that are not finite. Take windows over usable rows only.")
+            raise TacpipeError("Some windows contain values that are not finite. Use windows of usable rows only.")
         return cls(len(past), xx, xy)
 
     def first(self, features: int) -> _FeatureSums:
-        """Return the sums of the first ``features`` alone."""
+        """Return the sums of the first ``features`` features only."""
         return _FeatureSums(self.windows, self.xx[:features, :features], self.xy[:features])
 
 
 @dataclass(frozen=True)
-class _Shared:
+class _SharedSums:
     """The same sums for features that all channels share: over windows and channels, nothing taken off."""
 
     count: int  # windows x channels
@@ -218,10 +221,12 @@ class _Shared:
     xy: AnyFloats  # (context - 1, horizon)
 
     @classmethod
-    def from_sums(cls, sums: _FeatureSums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
-        """Return the sums of the blocks of each channel with itself; ``shape`` is context - 1, channel and horizon."""
+    def from_sums(
+        cls, sums: _FeatureSums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]
+    ) -> _SharedSums:
+        """Add up the diagonal blocks, those of each channel with itself; ``shape`` is context - 1, channels and horizon."""
         before, channels, horizon = shape
-        changes = before * channels  # the first features
+        changes = before * channels  # the changes are the first features
         x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
         xx = sums.xx[:changes, :changes].reshape(before, channels, before, channels)
         xy = sums.xy[:changes].reshape(before, channels, horizon, channels)
@@ -234,10 +239,10 @@ class _Shared:
         )
 
     def damped_trend(self) -> tuple[float, int]:
-        """Return the phi and the lag in rows whose trend has the least squared error."""
+        """Return phi and the lag in rows of the trend with the least squared error."""
         if not len(self.x):
             return 0.0, 0
-        lags = np.arange(1, len(self.x) + 1)  # changes come oldest first, and each is -lag times the slope
+        lags = np.arange(1, len(self.x) + 1)  # changes are ordered oldest first, and each is -lag times the slope
         damping = _damping(np.array(PHIS), len(self.y))  # (phi, step)
         slope_y = -self.xy[::-1] / lags[:, None]  # (lag, step)
         slope_slope = np.diagonal(self.xx)[::-1] / lags**2  # (lag,)
@@ -246,7 +251,7 @@ class _Shared:
         return PHIS[phi], int(lags[lag])
 
     def least_squares(self) -> tuple[AnyFloats, AnyFloats]:
-        """Return weight (context - 1, horizon) and bias (horizon,) of the least squared error."""
+        """Return the least-squares weight (context - 1, horizon) and bias (horizon,)."""
         x, y = self.x / self.count, self.y / self.count
         xx, xy = self.xx - self.count * np.outer(x, x), self.xy - self.count * np.outer(x, y)
         power = np.trace(xx) / max(len(x), 1)
@@ -254,44 +259,46 @@ class _Shared:
         return weight, y - x @ weight
 
 
-def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias: AnyFloats) -> Map:
-    """Return the ridge regression whose alpha has the least squared error on the windows of ``evaluated``.
+def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias: AnyFloats) -> AffineMap:
+    """Return the ridge regression with the alpha that minimises the squared error on the windows of ``evaluated``.
 
-    With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy: what is costly does not
+    With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy. The expensive products do not
     depend on alpha, neither for the weights nor for their error on other windows.
     """
     spread = np.sqrt(np.diagonal(sums.xx) / sums.windows)
-    moves = spread > np.finfo(np.float32).eps * np.abs(centre)  # else rounding would pass for a feature
+    moves = spread > np.finfo(np.float32).eps * np.abs(centre)  # rounding errors must not count as a feature
     gain = np.where(moves, 1 / np.where(moves, spread, 1), 0)
     values, vectors = np.linalg.eigh(sums.xx * np.outer(gain, gain))
-    turn = gain[:, None] * vectors  # maps standardised features to the basis in which their matrix is diagonal
-    xy = turn.T @ sums.xy
-    bent = (turn.T @ evaluated.xx @ turn) * (xy @ xy.T)
-    straight = np.einsum("fy,fy->f", xy, turn.T @ evaluated.xy)
+    basis = gain[:, None] * vectors  # maps standardised features to the basis that diagonalises their matrix
+    xy = basis.T @ sums.xy
+    quadratic = (basis.T @ evaluated.xx @ basis) * (xy @ xy.T)
+    linear = np.einsum("fy,fy->f", xy, basis.T @ evaluated.xy)
     shrinks = [1 / (np.maximum(values, 0) + alpha) for alpha in ALPHAS]
-    errors = [shrink @ bent @ shrink - 2 * shrink @ straight for shrink in shrinks]  # less what no alpha changes
+    errors = [
+        shrink @ quadratic @ shrink - 2 * shrink @ linear for shrink in shrinks
+    ]  # without the term that does not depend on alpha
     best = int(np.argmin(errors))
-    weight = turn @ (shrinks[best][:, None] * xy)
-    return Map(centre.astype(np.float32), weight.astype(np.float32), bias.astype(np.float32), ALPHAS[best])
+    weight = basis @ (shrinks[best][:, None] * xy)
+    return AffineMap(centre.astype(np.float32), weight.astype(np.float32), bias.astype(np.float32), ALPHAS[best])
 
 
 def _features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
-    """Return changes against the last frame, the oldest first, then the motion, its plan last: (window, feature)."""
+    """Return changes from the last frame, oldest first, then the motion with its plan: (window, feature)."""
     windows = len(past)
     return np.concatenate([(past[:, :-1] - past[:, -1:]).reshape(windows, -1), motion.reshape(windows, -1)], axis=1)
 
 
 def _damping(phi: AnyFloats, horizon: int) -> AnyFloats:
-    """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, (phi,) to (phi, step)."""
+    """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, shape (phi, step)."""
     total: AnyFloats = np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
     return total
 
 
-def _check(name: str, part: Windows) -> None:
+def _validate_windows(name: str, part: Windows) -> None:
     past, motion, ahead = part
     if not len(past):
         raise TacpipeError(
-            f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
+            f"The {name} recordings contain no window. Give more or longer recordings, or shorten context and horizon."
         )
     fits = (
         [arrays.ndim for arrays in part] == [3, 3, 3]
@@ -302,7 +309,7 @@ def _check(name: str, part: Windows) -> None:
     )
     if not fits:
         raise TacpipeError(
-            f"The {name} windows of {_shapes(part)} do not fit one another; past must be (window, context, channel), "
+            f"The {name} windows of {_shapes(part)} do not match; past must be (window, context, channel), "
             "motion (window, context + horizon, state) and ahead (window, horizon, channel)."
         )
 

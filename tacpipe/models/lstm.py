@@ -1,19 +1,20 @@
-"""Recurrent layers: an LSTM whose backward pass on a processor is written by hand, and float32 on a GPU.
+"""Recurrent layers: an LSTM with a hand-written backward pass for the CPU, and in float32 on a GPU.
 
 Hochreiter and Schmidhuber, Long Short-Term Memory (Neural Computation 1997), with the forget gate of Gers, Schmidhuber
 and Cummins, Learning to Forget (Neural Computation 2000), in torch's order of gates i, f, g, o:
 
-    i, f, o = sigmoid(a), g = tanh(a)    where a = W x + R h' + b, for each gate its rows
-    c = f c' + i g,  h = o tanh(c)       where h', c' are those of the step before
+    i, f, o = sigmoid(a), g = tanh(a)    where a = W x + R h' + b, with the rows of each gate
+    c = f c' + i g,  h = o tanh(c)       where h', c' are those of the previous step
 
 With dh and dc the loss's derivatives by h and c, those by a are
 
     dc += dh (o - h tanh(c))
     di = dc g i (1 - i),  df = dc c' f (1 - f),  dg = dc i (1 - g²),  do = dh tanh(c) o (1 - o)
 
-and then dc' = dc f, dh' = Rᵀ da. All factors of dc and dh are known after the forward pass, so they are computed for
-many steps at once; one step back is five operations. The gradient of all weights is one product over as many steps.
-How many they are is chosen so that they stay in a core's cache: over all steps, these products wait for memory.
+and then dc' = dc f, dh' = Rᵀ da. All factors of dc and dh are available after the forward pass, so they are computed
+for a block of steps at once, and one step back takes five operations. The gradient of all weights is one product per
+block. The block size is chosen so that a block fits into a core's cache: over all steps, these products are limited by
+memory.
 """
 
 from __future__ import annotations
@@ -34,57 +35,58 @@ from tacpipe.arrays import Bytes
 T = TypeVar("T")
 
 
-def through(layer: Callable[..., T], inputs: Tensor, *tensors: Any) -> T:
-    """Return what a layer returns for ``inputs`` and more tensors, tuples of tensors or None; on a GPU in float32.
+def run_layer(layer: Callable[..., T], inputs: Tensor, *tensors: Any) -> T:
+    """Call a layer, on a GPU in float32, and return its result.
 
-    Under `torch.autocast` cuDNN computes recurrent layers in float16 whatever type was asked for. Gradients below 6e-8
-    are zero there, and no loss is scaled to keep them from it.
+    ``inputs`` and ``tensors`` are passed to it; the latter may be tuples of tensors or None. Under `torch.autocast`,
+    cuDNN computes recurrent layers in float16 whatever type is requested. Gradients below 6e-8 become zero there,
+    because the loss is not scaled.
     """
-    if not in_float16(inputs):
+    if not would_use_float16(inputs):
         return layer(inputs, *tensors)
     with torch.autocast(inputs.device.type, enabled=False):
         return layer(inputs.float(), *map(_to_float32, tensors))
 
 
-def in_float16(inputs: Tensor) -> bool:
-    """Return whether a recurrent layer would be computed in float16 for such inputs."""
+def would_use_float16(inputs: Tensor) -> bool:
+    """Return whether autocast would compute a recurrent layer in float16 for these inputs."""
     return inputs.device.type == "cuda" and torch.is_autocast_enabled("cuda")
 
 
 def _to_float32(value: Any) -> Any:
-    """Return tensors, and those of tuples, in float32."""
+    """Convert tensors, also in tuples, to float32."""
     if isinstance(value, tuple):
         return tuple(map(_to_float32, value))
     return value if value is None else value.float()
 
 
-# weights that are computed lie apart, so cuDNN copies them together in every call
+# computed weights are not contiguous, so cuDNN copies them in every call
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
-CACHED = 2**17  # numbers of one kind that a core's cache holds beside others of their kind: half a megabyte
+CACHE_NUMBERS = 2**17  # numbers per array, half a megabyte, so that several arrays fit into a core's cache
 State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
 Weights = tuple[Tensor, Tensor, Tensor]  # W (4 hidden, input), R (4 hidden, hidden), b (4 hidden,)
 Lead = tuple[Tensor, Tensor]  # inputs of the first step only (window, more), and their columns of W (4 hidden, more)
 
 
 def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None = None) -> tuple[Tensor, State]:
-    """Return h of all steps, shape (step, window, hidden), and the last state; ``inputs`` is (step, window, input).
+    """Return h of all steps (step, window, hidden) and the last state, for ``inputs`` (step, window, input).
 
-    The state before the first step is zero where none is given. ``lead`` adds inputs that exist in the first step only.
+    The initial state is zero if ``state`` is None. ``lead`` adds inputs of the first step only.
     """
     if inputs.device.type != "cpu" or not torch.is_grad_enabled():
-        return through(_of_torch, inputs, state, weights, lead)
+        return run_layer(_torch_lstm, inputs, state, weights, lead)
     first = None if lead is None else lead[0] @ lead[1].t()
     hidden, cell = (None, None) if state is None else state
     from_input, from_state, bias = weights
     arguments = (inputs, first, hidden, cell, from_input, from_state, bias)
-    with torch.autocast("cpu", enabled=False):  # its products go to memory that is made before
+    with torch.autocast("cpu", enabled=False):  # products are written to preallocated memory
         converted = (argument if argument is None else argument.to(from_state.dtype) for argument in arguments)
         states, last_hidden, last_cell = _Layer.apply(*converted)  # type: ignore[no-untyped-call]
     return states, (last_hidden, last_cell)
 
 
-def _of_torch(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
-    """Do the same with torch's layer: cuDNN on a GPU, and without gradients the fastest on a processor too."""
+def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
+    """Compute the same with torch's layer: cuDNN on a GPU, and the fastest on a CPU without gradients."""
     from_input, from_state, bias = weights
     if lead is not None:
         later = lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)
@@ -101,7 +103,7 @@ def _of_torch(inputs: Tensor, state: State | None, weights: Weights, lead: Lead 
 
 
 class _Layer(torch.autograd.Function):
-    """h of all steps, and h and c after the last, of a layer that may begin at zero (``hidden`` and ``cell`` None)."""
+    """Return h of all steps, and the last h and c. The initial state is zero if ``hidden`` and ``cell`` are None."""
 
     @staticmethod
     def forward(
@@ -121,14 +123,14 @@ class _Layer(torch.autograd.Function):
         weights[2 * size : 3 * size] *= (
             2  # tanh(a) = 2 sigmoid(2 a) - 1, and torch's sigmoid takes a quarter of the time
         )
-        read = _empty(inputs, steps + 1, windows, used + 1)  # h', x and the 1 that b is multiplied with
+        read = _pooled_empty(inputs, steps + 1, windows, used + 1)  # h', x and a 1 that multiplies b
         read[0, :, :size] = 0.0 if hidden is None else hidden
         read[:-1, :, size:used] = inputs
         read[..., used] = 1.0
-        gates = _empty(inputs, steps, windows, 4 * size)
-        cells, tanhs = _empty(inputs, steps + 1, windows, size), _empty(inputs, steps, windows, size)
+        gates = _pooled_empty(inputs, steps, windows, 4 * size)
+        cells, tanhs = _pooled_empty(inputs, steps + 1, windows, size), _pooled_empty(inputs, steps, windows, size)
         cells[0] = 0.0 if cell is None else cell
-        # Views of all steps are made at once: at small batches a view costs as much as the arithmetic.
+        # Views of all steps are created at once: for small batches, a view costs as much as the arithmetic.
         columns = [part.unbind() for part in gates.chunk(4, dim=-1)]
         every_read, every_h, every_c = read.unbind(), read[..., :size].unbind(), cells.unbind()
         steps_of = zip(gates.unbind(), *columns, tanhs.unbind(), every_read, every_c, strict=False)
@@ -147,7 +149,7 @@ class _Layer(torch.autograd.Function):
             tanh.sigmoid_()
             torch.add(minus, tanh, alpha=2, out=tanh)
             torch.mul(o, tanh, out=every_h[step + 1])
-        ctx.set_materialize_grads(False)  # an encoder's unused states must not come back as zeros
+        ctx.set_materialize_grads(False)  # otherwise an encoder's unused states would be returned as zeros
         ctx.save_for_backward(from_input, from_state, read, gates, cells, tanhs)
         return read[1:, :, :size], every_h[-1].clone(), every_c[-1].clone()
 
@@ -163,19 +165,22 @@ class _Layer(torch.autograd.Function):
             if gradient is not None:
                 total += gradient
         later = None if by_states is None else by_states.unbind()
-        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # gradient of all three weights side by side
+        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # gradient of all three weights, concatenated
         needs = ctx.needs_input_grad
-        by_inputs = _empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
-        block = min(steps, max(1, CACHED // (windows * gates.shape[-1])))
-        every_gates, every_slopes = gates.new_empty(block, *gates.shape[1:]), gates.new_empty(block, windows, size)
-        views = _views(every_gates, every_slopes)
+        by_inputs = _pooled_empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
+        block = min(steps, max(1, CACHE_NUMBERS // (windows * gates.shape[-1])))
+        every_gates, every_slopes = (
+            gates.new_empty(block, *gates.shape[1:]),
+            gates.new_empty(block, windows, size),
+        )
+        views = _step_views(every_gates, every_slopes)
         forgets = gates[..., size : 2 * size].unbind()
         for start in reversed(range(0, steps, block)):
             stop = min(start + block, steps)
             by_gates = every_gates[: stop - start]
             before = slice(start, stop)
             after = read[start + 1 : stop + 1, :, :size]
-            _factors(gates[before], after, cells[before], tanhs[before], by_gates, every_slopes[: stop - start])
+            _write_factors(gates[before], after, cells[before], tanhs[before], by_gates, every_slopes[: stop - start])
             for step in reversed(range(start, stop)):
                 row, of_cell, of_output, slope = views[step - start]
                 dc.addcmul_(dh, slope)
@@ -202,16 +207,18 @@ class _Layer(torch.autograd.Function):
         )
 
 
-def _views(by_gates: Tensor, slopes: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Return da of a step as a whole (window, 4 hidden), of i, f, g (window, 3, hidden) and of o, and its slope."""
+def _step_views(by_gates: Tensor, slopes: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Return views of each step: da (window, 4 hidden), its i, f, g part (window, 3, hidden), its o part, and its slope."""
     steps, windows, size = slopes.shape
     of_cell = by_gates.view(steps, windows, 4, size)[:, :, :3].unbind()
     of_output = by_gates[..., 3 * size :].unbind()
     return list(zip(by_gates.unbind(), of_cell, of_output, slopes.unbind(), strict=True))
 
 
-def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_gates: Tensor, slopes: Tensor) -> None:
-    """Write what dc (of i, f, g) and dh (of o) are multiplied with to give da, and dh to be added to dc.
+def _write_factors(
+    gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_gates: Tensor, slopes: Tensor
+) -> None:
+    """Write the factors of dc (gates i, f, g) and dh (gate o) in da, and the slope, the factor of dh in dc.
 
     ``by_gates`` is (step, window, 4 hidden), ``slopes`` (step, window, hidden).
     """
@@ -226,21 +233,21 @@ def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_ga
     torch.addcmul(o, hiddens, tanhs, value=-1, out=slopes)
 
 
-_free: deque[Bytes] = deque(maxlen=16)  # enough for two layers in both directions, for this batch and the last
+_free: deque[Bytes] = deque(maxlen=16)  # enough for two layers in both directions, for this batch and the previous one
 
 
 class _Loan(Bytes if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
-    """Memory that can be lent again once no tensor uses it."""
+    """Memory that returns to the pool when no tensor uses it."""
 
     def __del__(self) -> None:
         _free.append(self.base)
 
 
-def _empty(like: Tensor, *shape: int) -> Tensor:
-    """Return a tensor of any content, in memory that earlier such tensors have left.
+def _pooled_empty(like: Tensor, *shape: int) -> Tensor:
+    """Return an uninitialised tensor, in memory of earlier such tensors if possible.
 
-    Tens of megabytes freed after every batch go back to the system, and to get their pages anew takes as long as a
-    fifth of the arithmetic. The tensor's storage owns the loan, so views keep it too.
+    Tens of megabytes that are freed after every batch return to the operating system, and faulting their pages in again
+    takes a fifth of the time of the arithmetic. The tensor's storage owns the loan, so views keep it alive.
     """
     needed = math.prod(shape) * like.element_size()
     for _ in range(len(_free)):

@@ -1,16 +1,16 @@
-"""MiniRocket, the fractions of a slide where ten thousand patterns occur, and a classifier that reads them.
+"""Transform slides with MiniRocket, and classify them by its features.
 
-Dempster, Schmidt and Webb, MiniRocket: A Very Fast (Almost) Deterministic Transform for Time Series Classification, 2021
-(arXiv 2012.08791), section 3, in its form for several channels. A pattern is one of 84 kernels of nine weights, three of
-them 2 and six -1, stretched by a dilation and laid over the sum of a few channels drawn at random. A feature is the
-fraction of positions at which the kernel's answer exceeds a bias, and biases are quantiles of the answers to training
-slides. Every other kernel looks only where it fits into the slide; the rest see zeros beyond its ends.
+Dempster, Schmidt and Webb, MiniRocket: A Very Fast (Almost) Deterministic Transform for Time Series Classification,
+2021 (arXiv 2012.08791), section 3, in its multivariate form. A pattern is one of 84 kernels of sums weights, three of
+them 2 and six -1, with a dilation, applied to the sum of a few randomly drawn channels. A feature is the fraction of
+positions at which the kernel's output exceeds a bias, and biases are quantiles of the outputs on training slides. Every
+other kernel is applied without padding; the rest see zeros beyond the ends of a slide.
 
-Nothing is learned but the biases, so few slides suffice; what the features mean is left to a linear readout.
+Only the biases are learned, so a few slides suffice; a linear readout interprets the features.
 
-Slides are laid out channel, time, slide: a shifted slide is then a slice, and no step of the arithmetic below copies or
-strides. Three things make it fast: the nine weights are summed once for all, by doubling (2, 4 and 8 shifts, then the
-ninth); a block of slides stays in the processor's cache; and positions are counted as bytes.
+Arrays are ordered channel, time, slide, so a shift in time is a slice and the arithmetic needs neither copies nor
+strides. Three things make it fast: the sums weights are summed once for all kernels, by doubling (2, 4 and 8 shifts,
+then the ninth); a block of slides fits into the CPU's cache; and positions are counted as bytes.
 """
 
 from __future__ import annotations
@@ -27,34 +27,35 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.readout import Readout
 from tacpipe.models.tensors import tensors_under
 
-LENGTH = 9  # weights of a kernel
-HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
-KERNELS = len(HEAVY)  # 84
-DILATIONS = 32  # most dilations of a kernel
-MAX_CHANNELS = 9  # most channels that one kernel sums
-GOLDEN = (5**0.5 + 1) / 2  # its multiples, modulo 1, fill the unit interval evenly
+LENGTH = 9  # weights per kernel
+HEAVY_POSITIONS = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): positions of the weights 2
+KERNELS = len(HEAVY_POSITIONS)  # 84
+MAX_DILATIONS = 32  # maximum number of dilations per kernel
+MAX_CHANNELS = 9  # maximum number of channels that a kernel sums
+GOLDEN = (5**0.5 + 1) / 2  # its multiples, modulo 1, cover the unit interval evenly
 BLOCK_BYTES = 2**18  # size of one channel of a block of slides: several such arrays fit into a cache of 1 MB
-COUNTED = 255  # positions that a byte can count
+MAX_BYTE_COUNT = 255  # largest number of positions that a byte can count
 
 
 @dataclass(frozen=True)
 class Rocket:
-    """The patterns and their biases. Features come dilation by dilation, then kernel by kernel, then bias by bias."""
+    """The patterns and their biases. Features are ordered by dilation, then kernel, then bias."""
 
     frames: int
     dilations: Int32s  # (dilation,), frames
-    counts: Int32s  # (dilation,): biases of each kernel
-    channels: Bools  # (dilation, kernel, channel): which it sums
+    counts: Int32s  # (dilation,): biases per kernel
+    channels: Bools  # (dilation, kernel, channel): whether the kernel sums the channel
     biases: AnyFloats  # (feature,), in the slides' unit
 
     @classmethod
     def fit(cls, x: AnyFloats, *, features: int = 10_000, seed: int = 0) -> Rocket:
-        """Return a transform for slides like the training slides ``x``, (slide, time, channel).
+        """Fit a transform on training slides ``x`` (slide, time, channel).
 
-        ``features`` is rounded down to a multiple of 84, and channels and slides that biases are taken of follow from
-        ``seed``. Raises `TacpipeError` for fewer than nine frames, fewer than 84 features, or values not finite.
+        ``features`` is rounded down to a multiple of 84. ``seed`` determines the channels of each kernel and the slides
+        of the biases. Raises `TacpipeError` if there are fewer than sums frames or 84 features, or a value is not
+        finite.
         """
-        _check(x)
+        _validate_slides(x)
         if features < KERNELS:
             raise TacpipeError(f"{features} features are too few for {KERNELS} kernels; use {KERNELS} or more.")
         slides, frames, channels = x.shape
@@ -66,21 +67,21 @@ class Rocket:
         chosen = drawn < channel_counts[..., None]
         examples = rng.integers(slides, size=(len(dilations), KERNELS))
         quantiles = np.arange(1, KERNELS * counts_per_kernel.sum() + 1) * GOLDEN % 1
-        padded, answers = _padded(x, dilations[-1]), []
+        padded, outputs = _padded(x, dilations[-1]), []
         for at, dilation in enumerate(dilations):
             for kernel in range(KERNELS):
                 example = padded[:, :, examples[at, kernel], None]
-                answers.append(_answer(example, frames, at, kernel, dilation, chosen)[:, 0])
-        quantiles_by_answer = np.split(quantiles, np.repeat(counts_per_kernel, KERNELS).cumsum()[:-1])
-        biases = [np.quantile(answer, levels) for answer, levels in zip(answers, quantiles_by_answer, strict=True)]
+                outputs.append(_kernel_output(example, frames, at, kernel, dilation, chosen)[:, 0])
+        quantiles_by_output = np.split(quantiles, np.repeat(counts_per_kernel, KERNELS).cumsum()[:-1])
+        biases = [np.quantile(output, levels) for output, levels in zip(outputs, quantiles_by_output, strict=True)]
         return cls(frames, dilations, counts_per_kernel, chosen, np.concatenate(biases).astype(np.float32))
 
     def transform(self, x: AnyFloats) -> AnyFloats:
-        """Return the features of slides (slide, time, channel): shares from 0 to 1, (slide, feature), float32.
+        """Return the features of slides (slide, time, channel): fractions from 0 to 1, (slide, feature), float32.
 
-        Raises `TacpipeError` if slides are not like those that were fitted, or values are not finite.
+        Raises `TacpipeError` if the shape of the slides differs from the training slides, or a value is not finite.
         """
-        _check(x)
+        _validate_slides(x)
         if x.shape[1:] != (self.frames, self.channels.shape[-1]):
             raise TacpipeError(
                 f"Slides of {x.shape} do not fit the transform; (slide, {self.frames}, {self.channels.shape[-1]}) "
@@ -93,22 +94,22 @@ class Rocket:
         return features
 
     def _block(self, x: AnyFloats) -> AnyFloats:
-        """Return the features of a few slides, (feature, slide)."""
+        """Return the features of a block of slides, (feature, slide)."""
         features, at = np.empty((len(self.biases), len(x)), np.float32), 0
         padded = _padded(x, self.dilations[-1])
         for index, (dilation, features_per_kernel) in enumerate(zip(self.dilations, self.counts, strict=True)):
             for kernel in range(KERNELS):
-                answer = _answer(padded, self.frames, index, kernel, dilation, self.channels)
-                flags = np.empty(answer.shape, np.bool_)
+                output = _kernel_output(padded, self.frames, index, kernel, dilation, self.channels)
+                flags = np.empty(output.shape, np.bool_)
                 for _ in range(features_per_kernel):
-                    np.greater(answer, self.biases[at], out=flags)
-                    features[at] = _counts(flags)
+                    np.greater(output, self.biases[at], out=flags)
+                    features[at] = _count_true(flags)
                     at += 1
-                features[at - features_per_kernel : at] /= len(answer)
+                features[at - features_per_kernel : at] /= len(output)
         return features
 
     def to_tensors(self) -> dict[str, AnyArray]:
-        """Return all that `from_tensors` needs."""
+        """Return the arrays that `from_tensors` reads."""
         return {
             "frames": np.array([self.frames], np.int32),
             "dilations": self.dilations,
@@ -119,7 +120,7 @@ class Rocket:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Rocket:
-        """Return the transform that `to_tensors` described. Raises `ValueError` if its parts do not fit one another."""
+        """Return the transform that `to_tensors` stored. Raises `ValueError` if its arrays do not match."""
         names = ("dilations", "each", "channels", "biases")
         rocket = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
         count = len(rocket.dilations)
@@ -137,12 +138,12 @@ class Rocket:
 
 
 def _dilations(frames: int, features_per_kernel: int) -> tuple[Int32s, Int32s]:
-    """Return the dilations and how many of a kernel's ``features_per_kernel`` features every one gets, both (dilation,).
+    """Return the dilations and how many of ``features_per_kernel`` each gets, both (dilation,).
 
-    They are spread evenly over powers of two, up to that at which a kernel spans the slide; those that fall on the same
-    whole number share it, and what rounding leaves over goes round from the first on.
+    They are spaced evenly over powers of two, up to the dilation at which a kernel spans the slide. Dilations that
+    round to the same integer are merged, and the remainder of rounding is distributed from the first on.
     """
-    limit = min(features_per_kernel, DILATIONS)
+    limit = min(features_per_kernel, MAX_DILATIONS)
     powers = np.linspace(0, np.log2((frames - 1) / (LENGTH - 1)), limit)
     dilations, shared = np.unique((2**powers).astype(np.int32), return_counts=True)
     counts = (shared * (features_per_kernel / limit)).astype(np.int32)
@@ -151,18 +152,20 @@ def _dilations(frames: int, features_per_kernel: int) -> tuple[Int32s, Int32s]:
 
 
 def _padded(x: AnyFloats, dilation: int) -> AnyFloats:
-    """Return slides with zeros before and after them for kernels up to ``dilation``, (channel, time, slide), float32."""
+    """Pad slides with zeros at both ends for kernels up to ``dilation``: (channel, time, slide), float32."""
     pad = (LENGTH // 2) * int(dilation)
     padded = np.zeros((x.shape[2], x.shape[1] + 2 * pad, x.shape[0]), np.float32)
     padded[:, pad : pad + x.shape[1]] = x.transpose(2, 1, 0)
     return padded
 
 
-def _answer(padded: AnyFloats, frames: int, index: int, kernel: int, dilation: int, channels: Bools) -> AnyFloats:
-    """Return what a kernel answers at each position, (time, slide)."""
+def _kernel_output(
+    padded: AnyFloats, frames: int, index: int, kernel: int, dilation: int, channels: Bools
+) -> AnyFloats:
+    """Return the output of a kernel at each position, (time, slide)."""
     reach = (LENGTH - 1) * int(dilation)
     spare = padded.shape[1] - frames
-    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # every other kernel reads zeros beyond the ends
+    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # every other kernel is padded
     first = (spare - (rows - frames)) // 2
     rows -= reach
     chosen = np.flatnonzero(channels[index, kernel])
@@ -171,102 +174,111 @@ def _answer(padded: AnyFloats, frames: int, index: int, kernel: int, dilation: i
         total = total + padded[chosen[1], first : first + rows + reach]
         for channel in chosen[2:]:
             total += padded[channel, first : first + rows + reach]
-    nine = total[:-dilation] + total[dilation:]
-    nine = nine[: -2 * dilation] + nine[2 * dilation :]
-    nine = nine[: -4 * dilation] + nine[4 * dilation :]  # eight of them
-    nine = nine[:rows]
-    nine += total[reach:]
-    heavy = [total[weight * dilation : weight * dilation + rows] for weight in HEAVY[kernel]]
-    answer = heavy[0] + heavy[1]
-    answer += heavy[2]
-    answer *= 3
-    answer -= nine
-    return answer
+    sums = total[:-dilation] + total[dilation:]
+    sums = sums[: -2 * dilation] + sums[2 * dilation :]
+    sums = sums[: -4 * dilation] + sums[4 * dilation :]  # sums of eight
+    sums = sums[:rows]
+    sums += total[reach:]
+    heavy = [total[weight * dilation : weight * dilation + rows] for weight in HEAVY_POSITIONS[kernel]]
+    output = heavy[0] + heavy[1]
+    output += heavy[2]
+    output *= 3
+    output -= sums
+    return output
 
 
-def _counts(flags: Bools) -> AnyArray:
-    """Return how many of the flags (time, slide) are set, (slide,)."""
+def _count_true(flags: Bools) -> AnyArray:
+    """Count the True flags (time, slide) of each slide, (slide,)."""
     byte = flags.view(np.uint8)
-    parts = [np.add.reduce(byte[at : at + COUNTED], axis=0, dtype=np.uint8) for at in range(0, len(byte), COUNTED)]
+    parts = [
+        np.add.reduce(byte[at : at + MAX_BYTE_COUNT], axis=0, dtype=np.uint8)
+        for at in range(0, len(byte), MAX_BYTE_COUNT)
+    ]
     total: AnyFloats = np.sum(parts, axis=0, dtype=np.float32)
     return total
 
 
-def _check(x: AnyFloats) -> None:
+def _validate_slides(x: AnyFloats) -> None:
     if x.ndim != 3 or not x.size or x.shape[1] < LENGTH:
         raise TacpipeError(
             f"Slides of {x.shape} cannot be transformed; they must be (slide, time, channel), with {LENGTH} frames or "
             "more."
         )
     if not np.isfinite(x).all():
-        raise TacpipeError("Some slides hold values that are not finite. Segment them again, or leave these out.")
+        raise TacpipeError("Some slides contain values that are not finite. Segment them again, or exclude these.")
 
 
-QUANTILES = (0.5, 0.75, 0.9, 1.0)  # taken over the channels at one moment
-SHARES = (0.0, 0.3, 1.0)  # weights of strength that are tried, patterns have 1; finer steps let it in by chance
+QUANTILES = (0.5, 0.75, 0.9, 1.0)  # over the channels at each moment
+STRENGTH_WEIGHTS = (
+    0.0,
+    0.3,
+    1.0,
+)  # candidate weights of strength, relative to 1 for patterns; a finer grid would select it by chance
 
 
 @dataclass(frozen=True)
 class MinirocketClassifier:
-    """Hold a fitted classifier.
+    """Classify slides by MiniRocket features and contact strength, with a nearest-mean readout.
 
-    The MiniRocket classifier: how often patterns occur in a slide, with how strong it is, read out by the nearest mean.
-
-    Patterns are those of MiniRocket, sought in the channels of a slide and in six more that describe how pressure lies
-    across all channels at each moment: mean, standard deviation, three quantiles and the highest. Strength is the mean,
-    the standard deviation and the mean step of each channel's root, for variance grows with pressure. Where contact is
-    loosely controlled, strength depends much on the material from few slides; where it drifts, it misleads. So its
-    weight next to patterns is the one that errs least on training slides that are left out one by one.
+    Patterns are computed on the channels of a slide and on six more that summarise all channels at each moment: mean,
+    standard deviation, three quantiles and maximum. Strength is the mean, the standard deviation and the mean step of
+    each channel's square root, because variance grows with pressure. If contact is poorly controlled, strength reveals
+    the material even with few slides; if it drifts, strength misleads. So its weight is the one with the smallest
+    leave-one-out error on training slides.
     """
 
-    ANY_LENGTH: ClassVar[bool] = False  # True: slides of fewer frames than in training are read, too
+    ANY_LENGTH: ClassVar[bool] = False  # True: also reads slides with fewer frames than in training
     patterns: Rocket
     readout: Readout
     share: float  # weight of strength; patterns have 1
 
     @classmethod
     def fit(cls, x: AnyFloats, labels: Ints, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
-        """Return the classifier of training slides (slide, time, channel) and their classes (slide,), whole numbers.
+        """Fit a classifier on training slides (slide, time, channel) and their classes (slide,), integers.
 
-        ``features`` is the number of patterns; ``seed`` that of the draws among them. Raises `TacpipeError` for slides
-        that no pattern fits into, values not finite, or fewer than two classes.
+        ``features`` is the number of patterns, drawn with ``seed``. Raises `TacpipeError` if slides are too short for
+        the patterns, a value is not finite, or there are fewer than two classes.
         """
         wide = with_profile(x)
         patterns = Rocket.fit(wide, features=features, seed=seed)
-        return cls(patterns, *_read(patterns.transform(wide), _strength(wide), labels))
+        return cls(patterns, *_fit_readout(patterns.transform(wide), _strength(wide), labels))
 
-    def relabelled(self, x: AnyFloats, labels: Ints) -> MinirocketClassifier:
-        """Return a classifier with the same patterns, its readout fitted to slides ``x`` and other ``labels``."""
+    def with_labels(self, x: AnyFloats, labels: Ints) -> MinirocketClassifier:
+        """Return a classifier with the same patterns, with its readout fitted to slides ``x`` and other ``labels``."""
         wide = with_profile(x)
-        return MinirocketClassifier(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
+        return MinirocketClassifier(
+            self.patterns, *_fit_readout(self.patterns.transform(wide), _strength(wide), labels)
+        )
 
     @property
     def classes(self) -> Int32s:
-        """The classes in the order of scores, (class,)."""
+        """The classes (class,), in the order of the scores."""
         return self.readout.classes
 
     def scores(self, x: AnyFloats) -> AnyFloats:
-        """Return the scores of slides (slide, time, channel), (slide, class), float32; the highest wins.
+        """Return the scores (slide, class), float32, of slides (slide, time, channel).
 
-        Raises `TacpipeError` if slides are not like those that were fitted, or values are not finite.
+        The class with the highest score wins.
+
+        Raises `TacpipeError` if the shape of the slides differs from the training slides, or a value is not finite.
         """
         wide = with_profile(x)
         return self.readout.scores(np.concatenate([self.patterns.transform(wide), _strength(wide)], axis=1))
 
     def predict(self, x: AnyFloats) -> Int32s:
-        """Return the class of the highest score of each slide, (slide,)."""
+        """Return the class with the highest score of each slide, (slide,)."""
         predicted: Int32s = self.classes[self.scores(x).argmax(axis=1)]
         return predicted
 
     def to_tensors(self) -> dict[str, AnyArray]:
-        """Return all that `from_tensors` needs."""
+        """Return the arrays that `from_tensors` reads."""
         parts = {"patterns": self.patterns.to_tensors(), "readout": self.readout.to_tensors()}
         tensors = {f"{name}.{key}": value for name, part in parts.items() for key, value in part.items()}
         return tensors | {"share": np.array([self.share])}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> MinirocketClassifier:
-        """Return the classifier that `to_tensors` described."""
+        """Return the classifier that `to_tensors` stored."""
         return cls(
             Rocket.from_tensors(tensors_under("patterns.", tensors)),
             Readout.from_tensors(tensors_under("readout.", tensors)),
@@ -274,25 +286,27 @@ class MinirocketClassifier:
         )
 
 
-def _read(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Readout, float]:
-    """Return the readout of patterns and strength, each (slide, feature), and the weight of strength."""
+def _fit_readout(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Readout, float]:
+    """Fit a readout of patterns and strength, each (slide, feature), and return it with the weight of strength."""
     features = np.concatenate([patterns, strength], axis=1)
 
-    def shares(share: float) -> AnyFloats:
+    def feature_shares(share: float) -> AnyFloats:
         return np.repeat([1 / patterns.shape[1], share / strength.shape[1]], [patterns.shape[1], strength.shape[1]])
 
-    best = min(SHARES, key=lambda share: Readout.fit(features, labels, shares(share)).left_out_error)
-    return Readout.nearest_mean(features, labels, shares(best)), best
+    best = min(
+        STRENGTH_WEIGHTS, key=lambda share: Readout.fit(features, labels, feature_shares(share)).leave_one_out_error
+    )
+    return Readout.nearest_mean(features, labels, feature_shares(best)), best
 
 
 def with_profile(x: AnyFloats) -> AnyFloats:
-    """Return slides with the mean, spread and quantiles of their channels as six more channels, float32."""
+    """Append the mean, spread and quantiles of the channels at each moment as six more channels, float32."""
     across = [x.mean(axis=2), x.std(axis=2), *np.quantile(x, QUANTILES, axis=2)]
     return np.concatenate([x, np.stack(across, axis=2)], axis=2, dtype=np.float32)
 
 
 def _strength(x: AnyFloats) -> AnyFloats:
-    """Return the mean, the standard deviation and the mean step of each channel's root, (slide, 3 x channel)."""
-    root = np.sign(x) * np.sqrt(np.abs(x))  # a tared sensor may go below zero
+    """Return the mean, standard deviation and mean step of each channel's square root, (slide, 3 x channel)."""
+    root = np.sign(x) * np.sqrt(np.abs(x))  # a tared sensor may be below zero
     steps = np.abs(np.diff(root, axis=1)).mean(axis=1)
     return np.concatenate([root.mean(axis=1), root.std(axis=1), steps], axis=1)

@@ -1,10 +1,10 @@
-"""Networks that read points: patches about the contacts, PointNet, and the fast layers that both use.
+"""Networks that read points: patches around the contacts, PointNet, and the fast layers of both.
 
-Normalising a batch needs mean and variance of what a linear layer gives. Both follow from mean and covariance of what
-it is given, which is an order of magnitude smaller, so the layer and its normalisation become one affine map and nothing
-is passed over twice. The largest value of a channel over a cloud depends on one point alone, so going back through it
-costs a row a channel instead of a product over all points. The maths is that of `torch.nn.Linear`,
-`torch.nn.BatchNorm1d` and `torch.max`, down to rounding; of points equally large the first takes all the gradient.
+Batch normalisation needs mean and variance of a linear layer's output. Both follow from mean and covariance of its
+input, which is an order of magnitude smaller, so the layer and its normalisation become one affine map and no array is
+read twice. The maximum of a channel over a cloud depends on a single point, so its backward pass needs one row per
+channel instead of a product over all points. The results are those of `torch.nn.Linear`, `torch.nn.BatchNorm1d` and
+`torch.max`, up to rounding; among equal maxima, the first point receives the gradient.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 EPSILON = 1e-5  # added to a variance, as in torch
 MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
-FEW = 16  # clouds, which a plain sum adds up in the order of einsum
+MAX_PLAIN_SUM = 16  # maximum number of clouds for a plain sum, which has the summation order of einsum
 
 
 class NormalisedLinear(nn.Module):
-    """A linear layer with batch normalisation behind it, over points: what `torch.nn.BatchNorm1d` of a linear gives.
+    """A linear layer followed by batch normalisation over points, as `torch.nn.BatchNorm1d` of a `torch.nn.Linear`.
 
-    In training it is normalised by the batch at hand and keeps running means, by which it is normalised otherwise.
+    In training it normalises by the batch and updates running means, by which it normalises otherwise.
     """
 
     mean: Tensor
@@ -41,7 +41,7 @@ class NormalisedLinear(nn.Module):
         nn.init.kaiming_uniform_(self.weight, a=5**0.5)  # the initial weights of torch.nn.Linear
 
     def affine(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return weight (output, input) and bias (output,) of the layer for these inputs (…, input)."""
+        """Return the layer's weight (output, input) and bias (output,) for these inputs (…, input)."""
         if self.training:
             with torch.autocast(inputs.device.type, enabled=False):  # small differences of sums over many points
                 mean, variance = self._moments(inputs.reshape(-1, inputs.shape[-1]).to(self.weight.dtype))
@@ -55,7 +55,7 @@ class NormalisedLinear(nn.Module):
         return nn.functional.linear(inputs, *self.affine(inputs))
 
     def _moments(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
+        """Return mean and variance (output,) over rows (row, input), and update the running ones."""
         centre, rows = inputs.mean(dim=0), len(inputs)
         centred = inputs - centre
         covariance = centred.T @ centred / rows  # (input, input)
@@ -69,58 +69,60 @@ class NormalisedLinear(nn.Module):
 
 
 class LargestOverPoints(torch.autograd.Function):
-    """The largest value over points (cloud, output) of an affine map of points (cloud, point, input)."""
+    """Compute the maximum over points (cloud, output) of an affine map of points (cloud, point, input)."""
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return the largest values."""
-        largest, places = (_largest_cached if points.device.type == "cpu" else _largest)(points, weight)
-        ctx.save_for_backward(points, weight, places)
+        """Return the maxima."""
+        largest, indices = (_largest_product_cached if points.device.type == "cpu" else _largest_product)(
+            points, weight
+        )
+        ctx.save_for_backward(points, weight, indices)
         return largest + bias
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the gradients: each reaches the one point that was largest."""
-        points, weight, places = ctx.saved_tensors
+        """Return the gradients, which are nonzero only at the points of the maxima."""
+        points, weight, indices = ctx.saved_tensors
         (gradient,) = gradients
-        at = (places + torch.arange(len(places), device=places.device)[:, None] * points.shape[1]).ravel()
+        at = (indices + torch.arange(len(indices), device=indices.device)[:, None] * points.shape[1]).ravel()
         rows = points.reshape(-1, points.shape[2])  # (cloud and point, input)
         to_points = torch.zeros_like(rows)
         to_points.index_add_(0, at, (gradient[:, :, None] * weight).view(len(at), -1))
-        to_weight = _weighed(gradient, rows.index_select(0, at).view(*places.shape, -1))
+        to_weight = _weighted_sum(gradient, rows.index_select(0, at).view(*indices.shape, -1))
         return to_points.view_as(points), to_weight, gradient.sum(dim=0)
 
 
-def _weighed(weights: Tensor, rows: Tensor) -> Tensor:
-    """Return the sums over clouds (output, input) of rows (cloud, output, input) by weights (cloud, output).
+def _weighted_sum(weights: Tensor, rows: Tensor) -> Tensor:
+    """Return the sums over clouds (output, input) of rows (cloud, output, input) with weights (cloud, output).
 
-    Of few clouds a product of matrices per output, which is what einsum makes of it, takes six times as long.
+    For few clouds, einsum's matrix product per output takes six times as long.
     """
-    if len(rows) > FEW or rows.device.type != "cpu":
+    if len(rows) > MAX_PLAIN_SUM or rows.device.type != "cpu":
         return torch.einsum("co,coi->oi", weights, rows)
     return (weights[:, :, None] * rows).sum(dim=0)
 
 
-def _largest(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the largest products over points (cloud, output), and which point gives each."""
+def _largest_product(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the maximum products over points (cloud, output), and the index of the point of each."""
     maxima = torch.max(weight @ points.transpose(1, 2), dim=2)
     return maxima.values, maxima.indices
 
 
-def _largest_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `_largest` does; a cloud at a time, whose products stay in the cache, and by numpy's faster argmax."""
+def _largest_product_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the same, one cloud at a time, so that products stay in the cache, with numpy's faster argmax."""
     products = points.new_empty(len(weight), points.shape[1])  # (output, point)
     largest = points.new_empty(len(points), len(weight))
-    places = torch.empty(largest.shape, dtype=torch.long)
-    for cloud, at in enumerate(places):
+    indices = torch.empty(largest.shape, dtype=torch.long)
+    for cloud, at in enumerate(indices):
         torch.mm(weight, points[cloud].T, out=products)
         at.copy_(torch.from_numpy(products.numpy().argmax(axis=1)))
         torch.gather(products, 1, at[:, None], out=largest[cloud][:, None])
-    return largest, places
+    return largest, indices
 
 
-def largest(layer: NormalisedLinear, points: Tensor) -> Tensor:
-    """Return the largest value over points (cloud, output) of the layer on clouds (cloud, point, input)."""
+def largest_output(layer: NormalisedLinear, points: Tensor) -> Tensor:
+    """Return the maximum over points (cloud, output) of a layer's output on clouds (cloud, point, input)."""
     weight, bias = layer.affine(points)
     with torch.autocast(points.device.type, enabled=False):
         maxima: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
@@ -134,23 +136,23 @@ WIDTHS = (64, 128, 256)
 
 @dataclass(frozen=True)
 class PointNetworkShape:
-    """Sizes of what a network of touch reads and predicts."""
+    """Sizes of the inputs and outputs of a network of touch."""
 
     channels: int  # numbers per point
     numbers: int  # numbers that describe the grasp
-    values: int  # predicted values, those of all targets side by side
+    values: int  # predicted values of all targets, concatenated
 
 
 class PatchNetwork(nn.Module):
-    """Map patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value).
+    """Predict touch (cloud, value) from patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number).
 
-    Touch from what lies under the fingertips: patches about both contacts and a coarse view of the object, in metres.
+    The patches are the surface under both fingertips and a coarse view of the object, in metres.
 
-    Contact depends on the surface about the contact, its curvature, slope and edges, and on sizes in metres. So points
-    are read in the axes of the grasp, those about each contact through layers of their own, and the grasp's own sizes
-    beside them. Moving object, hand and wrist together changes nothing of what is read. Two backbones describe a patch:
+    Contact depends on the surface around it (curvature, slope and edges) and on sizes in metres. So points are given in
+    the axes of the grasp, the contact patches have layers of their own, and the grasp's sizes are inputs, too. Moving
+    object, hand and wrist together does not change the inputs. Two backbones describe a patch:
 
-    - ``points``: every point alone, as in PointNet;
+    - ``points``: every point separately, as in PointNet;
     - ``edges``: every point with its nearest neighbours (EdgeConv; Wang et al., Dynamic graph CNN, 2019).
     """
 
@@ -159,7 +161,7 @@ class PatchNetwork(nn.Module):
     ) -> None:
         super().__init__()
         backbones = {"points": PointBackbone, "edges": EdgeBackbone}
-        self.near: nn.Module = backbones[backbone](channels)  # the same for both contacts
+        self.near: nn.Module = backbones[backbone](channels)  # shared by both contacts
         self.whole: nn.Module = backbones[backbone](channels)
         self.head = nn.Sequential(
             nn.Linear(3 * 2 * WIDTHS[-1] + numbers, hidden),
@@ -173,7 +175,7 @@ class PatchNetwork(nn.Module):
         )
 
     def forward(self, patches: Tensor, numbers: Tensor) -> Tensor:
-        """Return the values of touch; the patches are those about g1, about g2, and the whole cloud."""
+        """Return the values of touch. The patches are those around g1, around g2, and the whole cloud."""
         clouds, _, points, channels = patches.shape
         near = self.near(patches[:, :2].reshape(-1, points, channels)).view(clouds, -1)
         values: Tensor = self.head(torch.cat([near, self.whole(patches[:, 2]), numbers], dim=1))
@@ -181,7 +183,7 @@ class PatchNetwork(nn.Module):
 
 
 class PointBackbone(nn.Module):
-    """Largest and mean value of each channel over points, (cloud, point, channel) to (cloud, 512)."""
+    """Return the maximum and mean of each channel over points: (cloud, point, channel) to (cloud, 512)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -192,11 +194,11 @@ class PointBackbone(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the features."""
-        return _pooled(self.layers(points))
+        return _pool(self.layers(points))
 
 
 class EdgeBackbone(nn.Module):
-    """The same behind one layer that reads each point with its 12 nearest ones: how they lie about it."""
+    """Like `PointBackbone`, after a layer that reads each point with the offsets of its 12 nearest neighbours."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -205,17 +207,17 @@ class EdgeBackbone(nn.Module):
         self.layers = nn.Sequential(nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, last))
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the features; neighbours are those in space, which comes first among the channels."""
+        """Return the features. Neighbours are found by the first three channels, the position."""
         clouds, count, channels = points.shape
         distances = torch.cdist(points[:, :, :3], points[:, :, :3])
         nearest = distances.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
         rows = torch.arange(clouds, device=points.device)[:, None, None]
         around = points[rows, nearest] - points[:, :, None]  # (cloud, point, neighbour, channel)
         centre = points[:, :, None].expand(clouds, count, nearest.shape[2], channels)
-        return _pooled(self.layers(self.edges(torch.cat([centre, around], dim=3)).amax(dim=2)))
+        return _pool(self.layers(self.edges(torch.cat([centre, around], dim=3)).amax(dim=2)))
 
 
-def _pooled(values: Tensor) -> Tensor:
+def _pool(values: Tensor) -> Tensor:
     return torch.cat([values.amax(dim=1), values.mean(dim=1)], dim=1)
 
 
@@ -226,13 +228,14 @@ HEADS = {f"fc{depth}": (1024, 512, 256, 128, 64, 32)[:depth] for depth in range(
 
 
 class PointNet(nn.Module):
-    """Map points (cloud, point, channel) and numbers of the grasp (cloud, number) to values of touch (cloud, value).
+    """Predict values of touch (cloud, value) from points (cloud, point, channel) and the grasp's numbers (cloud, number).
 
-    PointNet for touch (Zapata-Impata et al., Generation of tactile data from 3D vision and target robotic grasps, 2020).
+    PointNet for touch (Zapata-Impata et al., Generation of tactile data from 3D vision and target robotic grasps,
+    2020).
 
-    Every point goes through the same layers, the largest value of each of 1,024 channels over the cloud describes the
-    whole, and fully connected layers make touch of it and of the grasp (Qi et al., PointNet, CVPR 2017). The trunk is
-    that of the group's published code: one learned transform of all input channels, and no loss that keeps it
+    Every point passes through the same layers, the maximum of each of 1,024 channels over the cloud describes the
+    whole, and fully connected layers predict touch from it and the grasp (Qi et al., PointNet, CVPR 2017). The trunk
+    follows the group's published code: one learned transform of all input channels, and no loss that keeps it
     orthogonal.
     """
 
@@ -242,7 +245,7 @@ class PointNet(nn.Module):
         super().__init__()
         self.transform = PointTransform(channels) if transform else None
         self.points = PointFeatures(channels)
-        self.head = _connected(FEATURES + grasp, head, outputs)
+        self.head = _fully_connected(FEATURES + grasp, head, outputs)
 
     def forward(self, points: Tensor, grasp: Tensor) -> Tensor:
         """Return the values of touch."""
@@ -253,7 +256,7 @@ class PointNet(nn.Module):
 
 
 class PointFeatures(nn.Module):
-    """The largest value of each channel over a cloud, (cloud, point, channel) to (cloud, 1024)."""
+    """Return the maximum of each channel over a cloud: (cloud, point, channel) to (cloud, 1024)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -262,32 +265,32 @@ class PointFeatures(nn.Module):
         self.last = NormalisedLinear(sizes[-1], FEATURES)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the features; there is no ReLU behind the last layer."""
+        """Return the features; the last layer has no ReLU."""
         for layer in self.layers:
             points = torch.relu(layer(points))
-        return largest(self.last, points)
+        return largest_output(self.last, points)
 
 
 class PointTransform(nn.Module):
-    """A learned map of a cloud's channels, (cloud, point, channel) to (cloud, channel, channel).
+    """Learn a linear map of a cloud's channels: (cloud, point, channel) to (cloud, channel, channel).
 
-    It is the identity and what is learned beside it, which begins at random, as in the group's published code.
+    It is the identity plus a learned part, initialised at random, as in the group's published code.
     """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.channels = channels
         self.points = PointFeatures(channels)
-        self.head = _connected(FEATURES, TRANSFORM_LAYERS, channels * channels)
+        self.head = _fully_connected(FEATURES, TRANSFORM_LAYERS, channels * channels)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the map to multiply points with from the right."""
+        """Return the matrix by which points are multiplied from the right."""
         transform: Tensor = self.head(torch.relu(self.points(points))).view(-1, self.channels, self.channels)
         return transform + torch.eye(self.channels, device=points.device)
 
 
-def _connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
-    """Return fully connected layers with batch normalisation and ReLU, and a plain one at the end."""
+def _fully_connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Return fully connected layers with batch normalisation and ReLU, and a linear output layer."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(inputs, width), nn.BatchNorm1d(width), nn.ReLU()]

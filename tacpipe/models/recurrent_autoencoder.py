@@ -1,9 +1,9 @@
-"""Networks that classify slides: the recurrent autoencoder, the recurrent classifier, and their encoders of frames.
+"""Networks that classify slides: the recurrent autoencoder, the recurrent classifier, and their frame encoders.
 
-Gao, Taunyazov, Lin and Wu, Supervised Autoencoder Joint Learning on Heterogeneous Tactile Sensory Data (IROS 2020).
-A slide goes through its sensor's header frame by frame and through an LSTM; its last state gives the latents, 40
-numbers, which a linear layer classifies and a second LSTM turns into the slide again. Sizes are the paper's; where the
-paper is silent, those of the published code.
+Gao, Taunyazov, Lin and Wu, Supervised Autoencoder Joint Learning on Heterogeneous Tactile Sensory Data (IROS 2020). A
+slide passes through its sensor's header frame by frame and through an LSTM. The LSTM's last state determines the 40
+latents, which a linear layer classifies and a second LSTM decodes to the slide. Sizes are the paper's or, if it does
+not state them, those of the published code.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.lstm import lstm
 
-GRID = (6, 10)  # triangles of a RoboSkin patch and taxels of a triangle
-WIDTH = 18  # features of a header: what the convolution gives, and as many of the perceptron's, so that both compare
+GRID = (6, 10)  # triangles of a RoboSkin patch and taxels per triangle
+WIDTH = 18  # features of a header: the output size of the convolution, also used for the perceptron
 KERNEL = (3, 5)
 MAPS = 3
 POOL = 2
-OTHER = "other"  # key of a choice of headers: all sensors without such a grid
+OTHER = "other"  # key for all sensors without such a grid
 
 
-class Plain(nn.Module):
-    """Frames are their own features.
+class Identity(nn.Module):
+    """A header that uses frames as features.
 
-    A header encodes each frame to features and has a mirror that decodes features to a frame. Frames are (time, slide,
-    channel); features (time, slide, width).
+    A header encodes each frame as features, and its inverse decodes features to a frame. Frames are (time, slide,
+    channel); features are (time, slide, width).
     """
 
     def __init__(self, channels: int) -> None:
@@ -47,9 +47,10 @@ class Plain(nn.Module):
 
 
 class Perceptron(nn.Module):
-    """One layer of 18 tanh units, and a linear one back.
+    """A header with one layer of 18 tanh units, and a linear layer as decoder.
 
-    The paper names a single-layer perceptron before BioTac's LSTM; its published code has none, so its width is ours.
+    The paper mentions a single-layer perceptron before BioTac's LSTM; its published code has none, so the width is our
+    choice.
     """
 
     def __init__(self, channels: int) -> None:
@@ -68,12 +69,12 @@ class Perceptron(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution over the grid of triangles and taxels, pooled; transposed and up-sampled on the way back.
+    """A header with a convolution over the grid of triangles and taxels, and pooling; the decoder reverses both.
 
-    Three maps of a 3 x 5 kernel without padding, and the largest of each 2 x 2: 18 features, as in the published code
-    of the joint-learning paper (IROS 2020). Its mirror up-samples to the nearest and ends in a rectifier, because counts
-    above rest are not negative. ``unpool`` "last" puts each feature back where the pool of the *last* encoded frame took
-    its largest from, as the published code does: right for that frame only, and a path around the latents.
+    Three maps of a 3 x 5 kernel without padding, and 2 x 2 max pooling: 18 features, as in the published code of the
+    joint-learning paper (IROS 2020). The decoder upsamples to the nearest and ends with a ReLU, because counts above
+    rest are not negative. ``unpool`` "last" puts each feature back at the position of the maximum in the *last* encoded
+    frame, as the published code does. This is correct for that frame only, and lets information bypass the latents.
     """
 
     def __init__(self, channels: int, unpool: str = "nearest") -> None:
@@ -81,7 +82,7 @@ class Convolution(nn.Module):
         if channels != GRID[0] * GRID[1]:
             raise TacpipeError(
                 f"A convolution reads a grid of {GRID[0]} x {GRID[1]} channels and this sensor has {channels}. "
-                f"Give it the header none or mlp."
+                f"Use the header none or mlp."
             )
         if unpool not in ("nearest", "last"):
             raise TacpipeError(f"unpool is {unpool!r}; it must be nearest or last.")
@@ -117,10 +118,13 @@ class Convolution(nn.Module):
         return torch.relu(self.decoder(maps)).reshape(steps, slides, -1)
 
 
-def build(kind: str, channels: int, unpool: str = "nearest") -> Plain | Perceptron | Convolution:
-    """Return the header ``kind``: none, mlp or cnn. Raises `TacpipeError` for another, and where it does not fit."""
+def build(kind: str, channels: int, unpool: str = "nearest") -> Identity | Perceptron | Convolution:
+    """Return the header ``kind``: none, mlp or cnn.
+
+    Raises `TacpipeError` if the kind is unknown or the channels do not fit.
+    """
     if kind == "none":
-        return Plain(channels)
+        return Identity(channels)
     if kind == "mlp":
         return Perceptron(channels)
     if kind == "cnn":
@@ -128,22 +132,24 @@ def build(kind: str, channels: int, unpool: str = "nearest") -> Plain | Perceptr
     raise TacpipeError(f"There is no header {kind!r}; there are none, mlp and cnn.")
 
 
-def chosen(assignments: str, sensors: Mapping[str, int]) -> dict[str, str]:
-    """Return the header of each sensor; ``assignments`` is text like ``biotac=none,roboskin=cnn`` and may leave some out.
+def parse_headers(assignments: str, sensors: Mapping[str, int]) -> dict[str, str]:
+    """Return the header of each sensor.
 
-    ``sensors`` has the number of channels. A grid of triangles gets a convolution by default, others what ``other``
-    states, or none.
+    ``assignments`` is text such as ``biotac=none,roboskin=cnn`` and may be incomplete.
 
-    >>> chosen("biotac=mlp", {"biotac": 19, "roboskin": 60})
+    ``sensors`` has the number of channels. The default is a convolution for a grid of triangles, and otherwise the
+    header assigned to ``other``, or none. Raises `TacpipeError` if ``assignments`` contains an unknown sensor.
+
+    >>> parse_headers("biotac=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}
-    >>> chosen("other=mlp", {"biotac": 19, "roboskin": 60})
+    >>> parse_headers("other=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}
     """
     headers = dict(part.strip().partition("=")[::2] for part in assignments.split(",") if part.strip())
     default = headers.pop(OTHER, "none")
     unknown = sorted(set(headers) - set(sensors))
     if unknown:
-        raise TacpipeError(f"headers names the sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
+        raise TacpipeError(f"headers has the unknown sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
     return {
         name: headers.get(name, "cnn" if channels == GRID[0] * GRID[1] else default)
         for name, channels in sensors.items()
@@ -162,13 +168,11 @@ class AutoencoderShape:
     channels: int
     classes: int
     header: str = "none"  # none, mlp or cnn
-    decoder: str = "D1"  # D1: the latents are the decoder's first state; D2: they are its input at every step
+    decoder: str = "D1"  # D1: the latents are the decoder's initial state; D2: they are its input at every step
     hidden: int = HIDDEN
     latents: int = LATENTS
-    unpool: str = "nearest"  # undoes the pooling of a cnn: nearest, or last as in the published code
-    dropout: float = (
-        0.0  # fraction of the latents, or last states, left out before the classifier in each training step
-    )
+    unpool: str = "nearest"  # reverses the pooling of a cnn: nearest, or last as in the published code
+    dropout: float = 0.0  # of the latents, or last states, before the classifier
 
 
 class NetworkOutput(NamedTuple):
@@ -180,7 +184,7 @@ class NetworkOutput(NamedTuple):
 
 
 class RecurrentAutoencoder(nn.Module):
-    """Header, LSTM, latents, classifier, and the decoder's LSTM and header."""
+    """A header, an LSTM encoder, latents, a classifier, and an LSTM decoder with its header."""
 
     ANY_LENGTH = True  # reads slides of any number of frames
 
@@ -199,31 +203,31 @@ class RecurrentAutoencoder(nn.Module):
         self.to_features = nn.Linear(shape.hidden, width)
 
     def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
-        """Return the output for slides ``frames`` (time, slide, channel); without ``decode`` no frames."""
-        last = _through(self.encoder, self.header.encode(frames))[-1]  # (slide, hidden)
+        """Return the output for slides ``frames`` (time, slide, channel); without ``decode``, its frames are None."""
+        last = _run_layer(self.encoder, self.header.encode(frames))[-1]  # (slide, hidden)
         latents = self.to_latents(last)
-        return NetworkOutput(latents, self.classify(latents), self._decoded(latents, len(frames)) if decode else None)
+        return NetworkOutput(latents, self.classify(latents), self._decode(latents, len(frames)) if decode else None)
 
     def classify(self, latents: Tensor) -> Tensor:
-        """Return the scores (slide, class) of latents (slide, latent), of this sensor or of another."""
+        """Return the scores (slide, class) of latents (slide, latent), of this sensor or another."""
         scores: Tensor = self.classifier(nn.functional.dropout(latents, self.shape.dropout, self.training))
         return scores
 
-    def _decoded(self, latents: Tensor, steps: int) -> Tensor:
+    def _decode(self, latents: Tensor, steps: int) -> Tensor:
         initial = self.from_latents(latents)  # (slide, hidden)
         if self.shape.decoder == "D1":
             zeros = initial.new_zeros(steps, len(initial), 1)
-            states = _through(self.decoder, zeros, initial)
+            states = _run_layer(self.decoder, zeros, initial)
         else:
-            states = _through(self.decoder, initial.expand(steps, *initial.shape))
+            states = _run_layer(self.decoder, initial.expand(steps, *initial.shape))
         return self.header.decode(self.to_features(states))
 
 
 class RecurrentClassifier(nn.Module):
-    """The paper's X-LSTM: header, LSTM, and a linear layer that classifies its last state, which are its latents."""
+    """The paper's X-LSTM: a header, an LSTM, and a linear classifier of its last state, which serves as latents."""
 
     ANY_LENGTH = True
-    DECODES = False  # there are no reconstructed frames whose error could be measured
+    DECODES = False  # there is no reconstruction error
 
     def __init__(self, shape: AutoencoderShape) -> None:
         super().__init__()
@@ -233,8 +237,8 @@ class RecurrentClassifier(nn.Module):
         self.classifier = nn.Linear(shape.hidden, shape.classes)
 
     def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
-        """Return the output for slides ``frames`` (time, slide, channel), which has no frames."""
-        last = _through(self.encoder, self.header.encode(frames))[-1]
+        """Return the output for slides ``frames`` (time, slide, channel), without frames."""
+        last = _run_layer(self.encoder, self.header.encode(frames))[-1]
         return NetworkOutput(last, self.classify(last), None)
 
     def classify(self, latents: Tensor) -> Tensor:
@@ -243,32 +247,32 @@ class RecurrentClassifier(nn.Module):
         return scores
 
 
-def parameters(network: nn.Module) -> int:
-    """Return how many weights a network has."""
+def count_weights(network: nn.Module) -> int:
+    """Return the number of weights of a network."""
     return sum(weight.numel() for weight in network.parameters())
 
 
-def _through(layer: nn.LSTM, inputs: Tensor, hidden: Tensor | None = None) -> Tensor:
-    """Return the states (time, slide, hidden) of a layer whose cell begins at zero, and so does h if none is given."""
-    from_input, from_state, *biases = layer.parameters()  # torch keeps two biases, and adds them
+def _run_layer(layer: nn.LSTM, inputs: Tensor, hidden: Tensor | None = None) -> Tensor:
+    """Return the states (time, slide, hidden) of a layer. The initial cell is zero, and so is h if ``hidden`` is None."""
+    from_input, from_state, *biases = layer.parameters()  # torch has two biases, and adds them
     state = None if hidden is None else (hidden, torch.zeros_like(hidden))
     states, _ = lstm(inputs, state, (from_input, from_state, biases[0] + biases[1]))
     return states
 
 
 class PlainClassifier(nn.Module):
-    """Its scores are its latents too: there is nothing before them that another sensor's classifier could read."""
+    """A classifier whose scores also serve as latents, so other sensors' classifiers have no latents to read."""
 
     def __init__(self, network: nn.Module) -> None:
-        """Take a network from slides (time, slide, channel) to scores (slide, class)."""
+        """Wrap a network from slides (time, slide, channel) to scores (slide, class)."""
         super().__init__()
         self.network = network
 
     def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
-        """Return the output for slides ``frames`` (time, slide, channel), which has no frames."""
+        """Return the output for slides ``frames`` (time, slide, channel), without frames."""
         scores: Tensor = self.network(frames)
         return NetworkOutput(scores, scores, None)
 
     def classify(self, latents: Tensor) -> Tensor:
-        """Return ``latents`` (slide, class), which are scores."""
+        """Return ``latents`` (slide, class), which are the scores."""
         return latents

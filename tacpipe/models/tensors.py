@@ -1,4 +1,4 @@
-"""Select the tensors of a part by their names, and limit the threads that torch and numpy compute with."""
+"""Select tensors by a prefix of their names, and limit torch and numpy to one thread."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ Value = TypeVar("Value")
 
 
 def tensors_under(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the entries whose name begins with ``prefix``, without it.
-
-    >>> tensors_under("a.", {"a.weight": 1, "b.weight": 2})
-    {'weight': 1}
-    """
+    """Return the entries whose name starts with ``prefix``, with the prefix removed."""
     return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
 
@@ -28,9 +24,9 @@ _is_limited: ContextVar[bool] = ContextVar("within", default=False)
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Have torch and numpy work in one thread: a row is too little to share, and sums in several threads round otherwise.
+    """Limit torch and numpy to one thread: a row is too small to parallelise, and parallel sums round differently.
 
-    Within another such block it does nothing, and costs nothing.
+    Nested blocks have no effect and no cost.
     """
     if _is_limited.get():
         yield
@@ -47,5 +43,5 @@ def one_thread() -> Iterator[None]:
 
 @functools.cache
 def _libraries() -> ThreadpoolController:
-    """Return the libraries of linear algebra that are loaded; to look for them takes a millisecond."""
+    """Return the loaded linear algebra libraries, cached because searching for them takes a millisecond."""
     return ThreadpoolController()

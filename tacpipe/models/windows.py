@@ -1,4 +1,4 @@
-"""Hold windows of touch and arm, time first, in the units of the recording."""
+"""Define forecasting windows of touch and arm, time first, in the units of the recording."""
 
 from __future__ import annotations
 
@@ -9,54 +9,54 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-MOTION, UP = 15, 3  # columns of the motion and of the direction up, as a plain network reads them
-POSE = 7  # columns of ``arm`` that hold position and quaternion; velocity follows
+MOTION, UP = 15, 3  # columns of the motion and of the up direction, as a plain network reads them
+POSE = 7  # columns of ``arm`` with position and quaternion; velocity follows
 ARM = 13
 
 
 class ForecastWindows(NamedTuple):
-    """Windows of one length; rows of the past, the last of them now, then those of the plan."""
+    """Windows of equal length: rows of the past, up to the present, then rows of the plan."""
 
     touch: Tensor  # (context, window, feature): latents in their codec's unit, or counts above rest
     arm: Tensor  # (context + horizon, window, 13): position m, quaternion xyzw, velocity m/s, angular velocity rad/s
-    finger: Tensor  # (context, window): width between the fingers, m, or 0 if it is not recorded
+    finger: Tensor  # (context, window): width between the fingers, m; 0 if it was not recorded
 
     @property
     def context(self) -> int:
-        """How many rows of the past there are."""
+        """The number of past rows."""
         return len(self.touch)
 
     @property
     def horizon(self) -> int:
-        """How many rows the plan has."""
+        """The number of planned rows."""
         return len(self.arm) - len(self.touch)
 
 
 @dataclass(frozen=True)
 class ForecastShape:
-    """Sizes of what a forecaster reads and predicts, and where each channel lies."""
+    """Sizes of a forecaster's inputs and outputs, and the layout of its channels."""
 
     features: int  # channels of touch, or latents
     context: int  # rows of the past
-    horizon: int  # rows of the plan, and steps that are predicted
+    horizon: int  # rows of the plan, and predicted steps
     layout: Sequence[Mapping[str, str]] = ()  # stream, taxel and axis of each channel; empty for latents
-    increments: bool = False  # features are what a row adds to the one before
+    increments: bool = False  # features are differences from the previous row
 
     @property
     def past(self) -> int:
-        """The numbers of a row of the past that a plain network reads: change, level, repetition, gripper and motion."""
+        """The number of inputs per past row of a plain network: change, level, repetition, gripper and motion."""
         return 2 * self.features + 2 + self.plan
 
     @property
     def plan(self) -> int:
-        """The numbers of a row of the plan that a plain network reads: motion and up."""
+        """The number of inputs per planned row of a plain network: motion and up."""
         return MOTION + UP
 
 
 def repeats(touch: Tensor) -> Tensor:
-    """Return 1 where a row of ``touch`` (context, window, feature) repeats the one before, (context, window); else 0.
+    """Return 1 where a row of ``touch`` (context, window, feature) equals the previous row, else 0: (context, window).
 
-    The first row counts as new: what came before it lies outside the window.
+    The first row counts as new, because the row before it is outside the window.
     """
     same = (touch[1:] == touch[:-1]).all(dim=-1)
     return torch.cat([same.new_zeros(1, touch.shape[1]), same]).to(touch.dtype)
@@ -74,16 +74,16 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def motion(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-    """Return motion in the frame that the hand has now (context + horizon, window, 12), and up in it (window, 3).
+    """Return motion in the present frame of the hand (context + horizon, window, 12), and up in this frame (window, 3).
 
-    Columns: where the hand is from now, m; how it is turned from now, as the vector part of the rotation's skew
-    symmetric half; velocity, m/s; angular velocity, rad/s. Neither place nor heading of the arm is an input: the load on a
-    fingertip follows from weight and acceleration as the hand sees them.
+    Columns: position relative to the present, m; rotation relative to the present, as the vector part of the rotation
+    matrix's skew-symmetric half; velocity, m/s; angular velocity, rad/s. Neither position nor heading of the arm is an
+    input: the load on a fingertip depends on weight and acceleration in the frame of the hand.
     """
     position, quaternions = windows.arm[..., :3], windows.arm[..., 3:POSE]
     now = windows.context - 1
     turned = rotations(quaternions)  # (row, window, 3, 3)
-    inward = turned[now].transpose(-1, -2)  # (window, 3, 3), from the base's frame to the hand's
+    inward = turned[now].transpose(-1, -2)  # (window, 3, 3), from the base frame to the hand frame
     displacement = _apply(inward, position - position[now])
     relative = inward @ turned
     vector = 0.5 * torch.stack(
@@ -99,15 +99,15 @@ def motion(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
 
 
 def without_plan(windows: ForecastWindows) -> ForecastWindows:
-    """Return the windows with every row of the plan replaced by the last row of the past: the model reads nothing of it."""
+    """Replace every row of the plan by the last row of the past, so that the model gets no plan."""
     now = windows.arm[windows.context - 1 : windows.context]
     return windows._replace(arm=torch.cat([windows.arm[: windows.context], now.expand(windows.horizon, -1, -1)]))
 
 
-def with_plans_of(windows: ForecastWindows, sources: Tensor) -> ForecastWindows:
-    """Return the windows with the plans of ``sources`` (window,), begun where the hand is now: plausible, and wrong.
+def swap_plans(windows: ForecastWindows, sources: Tensor) -> ForecastWindows:
+    """Replace plans by those of the windows ``sources`` (window,), moved to start at the present pose.
 
-    Positions, orientations and velocities of the other plan are turned as one rigid motion from its own start to here.
+    The plans are plausible but wrong. Positions, orientations and velocities are transformed by one rigid motion.
     """
     now = windows.context - 1
     start, source_start = windows.arm[now], windows.arm[now, sources]  # (window, 13)
@@ -136,7 +136,7 @@ def _conjugate(quaternions: Tensor) -> Tensor:
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
-    """Return the quaternion (…, 4) that turns by ``second`` and then by ``first``."""
+    """Return the quaternion (…, 4) of the rotation by ``second``, followed by ``first``."""
     a, b = first[..., :3], second[..., :3]
     vector = first[..., 3:] * b + second[..., 3:] * a + torch.linalg.cross(a, b)
     scalar = first[..., 3:] * second[..., 3:] - (a * b).sum(-1, keepdim=True)

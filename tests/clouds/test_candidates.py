@@ -151,7 +151,7 @@ def test_a_grasp_never_opens_wider_or_less_than_the_fingers() -> None:
         (shapes.box((0.1, 0.2, 1e-4)), "200 by 100 mm|196 by 98 mm"),
         (shapes.cylinder(0.09, 0.4), r"is 17\d to 18\d mm wide where it was cut, and the fingers open 20 to 130 mm"),
         (shapes.sphere(0.4, points=100), "too sparse"),
-        (Cloud(shapes.sphere(0.04).points_m - shapes.PLACE_M.astype(np.float32)), "lies within the cloud"),
+        (Cloud(shapes.sphere(0.04).points_m - shapes.PLACE_M.astype(np.float32)), "is inside the cloud"),
     ],
 )
 def test_a_cloud_that_cannot_be_grasped_is_refused_with_the_reason(cloud: Cloud, sentence: str) -> None:

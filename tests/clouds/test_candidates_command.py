@@ -127,13 +127,13 @@ def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypat
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("nowhere.ply", "no file nowhere.ply"),
+        ("nowhere.ply", "nowhere.ply does not exist"),
         ("nowhere", "nowhere does not exist or is empty"),
         ("bottle.ply --recording a", "--recording a selects from a dataset"),
         ("bottle.ply -o grasps.xlsx", "grasps.xlsx must end in .csv"),
         ("bottle.ply --picture grasps.doc", ".pdf, .png, .svg"),
         ("bottle.ply --count 0", "0 candidates"),
-        ("bottle.ply --camera-m 0.05 -0.1 1.2", "lies within the cloud"),
+        ("bottle.ply --camera-m 0.05 -0.1 1.2", "is inside the cloud"),
         ("bottle.ply --model nowhere", "nowhere does not exist or is empty"),
     ],
 )

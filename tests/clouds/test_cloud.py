@@ -24,7 +24,7 @@ POINTS = arrays.arrays(
 def test_a_table_and_its_bytes_give_back_the_cloud(points: np.ndarray, coloured: bool) -> None:
     colours = (np.abs(points) * 25).astype(np.uint8) if coloured else None
     cloud = Cloud(points, colours)
-    back = Cloud.of(from_parquet(to_parquet(cloud.table())))
+    back = Cloud.from_table(from_parquet(to_parquet(cloud.table())))
     assert back.points_m.dtype == np.float32
     np.testing.assert_array_equal(back.points_m, points)
     assert (back.colours is None) == (colours is None)
@@ -45,7 +45,7 @@ def test_a_table_tells_the_unit_and_component_of_each_column() -> None:
 
 def test_a_table_with_two_colours_alone_is_a_cloud_without_colours() -> None:
     table = Cloud(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8)).table()
-    assert Cloud.of(table.drop_columns(["green"])).colours is None
+    assert Cloud.from_table(table.drop_columns(["green"])).colours is None
 
 
 def test_a_cloud_is_as_long_as_it_has_points() -> None:
@@ -58,7 +58,7 @@ def test_a_cloud_is_as_long_as_it_has_points() -> None:
     [
         (np.zeros((4, 2)), None, r"shape \(4, 2\)"),
         (np.zeros(3), None, r"shape \(3,\)"),
-        (np.zeros((4, 3)), np.zeros((3, 3), np.uint8), r"colours of the shape \(3, 3\)"),
+        (np.zeros((4, 3)), np.zeros((3, 3), np.uint8), r"Colours have the shape \(3, 3\)"),
         (
             np.array([[0, 0, 0], [0, np.nan, 0], [np.inf, 0, 0]]),
             None,

@@ -27,7 +27,7 @@ def assert_right_handed(axes: np.ndarray) -> None:
 @given(SEEDS, st.booleans())
 def test_axes_are_a_rotation_whose_second_is_the_closing_axis(seed: int, wrist: bool) -> None:
     random_grasp = grasp(seed, wrist=wrist)
-    axes = frame.wrist_of(random_grasp)
+    axes = frame.wrist_axes(random_grasp)
     assert_right_handed(axes)
     np.testing.assert_allclose(axes[:, 1], random_grasp.closing, atol=1e-12)
 
@@ -36,13 +36,13 @@ def test_axes_are_a_rotation_whose_second_is_the_closing_axis(seed: int, wrist: 
 def test_a_wrist_that_closes_along_its_second_axis_is_what_the_axes_are(seed: int) -> None:
     random_grasp = grasp(seed)
     assert random_grasp.wrist is not None
-    np.testing.assert_allclose(frame.wrist_of(random_grasp), random_grasp.wrist, atol=1e-9)
+    np.testing.assert_allclose(frame.wrist_axes(random_grasp), random_grasp.wrist, atol=1e-9)
 
 
 def test_without_a_wrist_the_hand_comes_down_the_line_of_sight() -> None:
-    axes = frame.estimated_wrist(at([-0.03, 0, 0.9], [0.03, 0, 0.9]))
+    axes = frame.estimate_wrist(at([-0.03, 0, 0.9], [0.03, 0, 0.9]))
     np.testing.assert_allclose(axes, np.column_stack([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), atol=1e-12)
-    slanted = frame.estimated_wrist(at([0.4, 0, 0.4], [0.4, 0.1, 0.4]))  # middle at (0.4, 0.05, 0.4)
+    slanted = frame.estimate_wrist(at([0.4, 0, 0.4], [0.4, 0.1, 0.4]))  # middle at (0.4, 0.05, 0.4)
     np.testing.assert_allclose(slanted[:, 0], np.array([1, 0, 1]) / np.sqrt(2), atol=1e-12)
 
 
@@ -57,7 +57,7 @@ def test_without_a_wrist_the_hand_comes_down_the_line_of_sight() -> None:
 def test_a_grasp_whose_line_of_sight_tells_nothing_still_has_axes(
     g1: list[float], g2: list[float], approach: list[float]
 ) -> None:
-    axes = frame.estimated_wrist(at(g1, g2))
+    axes = frame.estimate_wrist(at(g1, g2))
     assert_right_handed(axes)
     np.testing.assert_allclose(axes[:, 0], approach, atol=1e-9)
 
@@ -65,11 +65,11 @@ def test_a_grasp_whose_line_of_sight_tells_nothing_still_has_axes(
 def test_a_wrist_that_approaches_along_the_closing_axis_still_turns_its_axes_with_it() -> None:
     side_grasp = at([0, 0, 0.8], [0.06, 0, 0.8], np.eye(3))
     turn = Rotation.from_rotvec([0.3, -1.0, 0.7]).as_matrix()
-    axes = frame.wrist_of(side_grasp)
+    axes = frame.wrist_axes(side_grasp)
     assert_right_handed(axes)
     np.testing.assert_allclose(axes[:, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(
-        frame.wrist_of(side_grasp.moved(turn, np.array([0.1, 0.2, 0.3]))), turn @ axes, atol=1e-9
+        frame.wrist_axes(side_grasp.moved(turn, np.array([0.1, 0.2, 0.3]))), turn @ axes, atol=1e-9
     )
 
 

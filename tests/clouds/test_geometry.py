@@ -171,7 +171,7 @@ def test_swapping_the_fingers_swaps_the_features_of_their_contacts() -> None:
 
 def test_the_place_tells_both_points_and_two_axes_in_the_frame_of_the_cloud() -> None:
     _, grasp = on_box()
-    place = geometry.place(grasp)
+    place = geometry.pose_features(grasp)
     assert len(place) == 12
     assert [place[f"g1_m_{axis}"] for axis in "xyz"] == grasp.g1_m.tolist()
     assert [place[f"approach_{axis}"] for axis in "xyz"] == [0, 0, 1]
@@ -182,7 +182,7 @@ def test_the_place_tells_both_points_and_two_axes_in_the_frame_of_the_cloud() ->
 def test_a_table_holds_a_row_a_grasp(coloured: bool, placed: bool) -> None:
     eggs = [egg(seed) for seed in range(3)]
     clouds = [Cloud(points, colours) for points, _, colours in eggs]
-    rows, names = geometry.table(clouds, [grasp for _, grasp, _ in eggs], coloured=coloured, placed=placed)
+    rows, names = geometry.feature_table(clouds, [grasp for _, grasp, _ in eggs], coloured=coloured, placed=placed)
     assert rows.shape == (3, len(names))
     assert ("colour_mean_r" in names, "g1_m_x" in names) == (coloured, placed)
     features = geometry.features(clouds[1], eggs[1][1])

@@ -39,7 +39,7 @@ def test_a_table_and_its_bytes_give_back_the_grasp(seed: int, wrist: bool) -> No
     table = from_parquet(to_parquet(original.table(17)))
     assert table.column_names == ["t_ns", *POINTS, *(WRIST if wrist else ())]
     assert table["t_ns"].to_pylist() == [17]
-    assert_same(Grasp.of(table), original, atol=0)
+    assert_same(Grasp.from_table(table), original, atol=0)
 
 
 def test_a_table_holds_the_wrist_axis_by_axis() -> None:
@@ -111,7 +111,7 @@ def _motion(original: Grasp, moved: Grasp) -> tuple[np.ndarray, np.ndarray]:
         ([0, 0, 1], [0, 1, 1], np.eye(4), "nine finite numbers"),
         ([0, 0, 1], [0, 1, 1], np.full((3, 3), np.nan), "nine finite numbers"),
         ([0, 0, 1], [0, 1, 1], np.diag([1.0, 1, -1]), "determinant -1"),
-        ([0, 0, 1], [0, 1, 1], np.diag([1.0, 1, 1.01]), "miss being a rotation by 0.0201"),
+        ([0, 0, 1], [0, 1, 1], np.diag([1.0, 1, 1.01]), "deviate from a rotation by 0.0201"),
     ],
 )
 def test_what_no_hand_can_do_is_refused(
@@ -125,4 +125,4 @@ def test_what_no_hand_can_do_is_refused(
 def test_a_table_of_no_or_several_rows_is_no_grasp(rows: int) -> None:
     table = grasp(0).table(0)
     with pytest.raises(TacpipeError, match=rf"{rows} rows"):
-        Grasp.of(pa.concat_tables([table] * rows) if rows else table.slice(0, 0))
+        Grasp.from_table(pa.concat_tables([table] * rows) if rows else table.slice(0, 0))

@@ -30,7 +30,7 @@ def turned(seed: int) -> np.ndarray:
 
 def normalised(method: str, cloud: Cloud, rotation: np.ndarray = STILL, wrist: np.ndarray | None = None) -> np.ndarray:
     points = cloud.points_m.astype(float) @ rotation.T
-    scaled: np.ndarray = geometry.normalised(method, points, Extent.of(cloud), rotation, wrist)
+    scaled: np.ndarray = geometry.normalise(method, points, Extent.from_cloud(cloud), rotation, wrist)
     return scaled
 
 
@@ -57,7 +57,7 @@ def test_minmax_fills_minus_1_to_1_along_each_axis_also_after_a_turn(seed: int, 
 
 def test_the_corners_are_few_and_the_centroid_is_that_of_all_points() -> None:
     cloud = blob(count=3000)
-    extent = Extent.of(cloud)
+    extent = Extent.from_cloud(cloud)
     assert 4 <= len(extent.corners_m) < 200
     np.testing.assert_allclose(extent.centroid_m, cloud.points_m.astype(float).mean(axis=0))
 
@@ -102,14 +102,14 @@ def test_flat_clouds_are_scaled_along_what_they_have(points: np.ndarray) -> None
 
 def test_colours_are_scaled_by_their_own_extremes_or_by_black_and_white() -> None:
     colours = np.array([[0, 100, 7], [51, 200, 7], [255, 150, 7]], np.uint8)
-    extent = Extent.of(Cloud(np.eye(3, dtype=np.float32), colours))
+    extent = Extent.from_cloud(Cloud(np.eye(3, dtype=np.float32), colours))
     shares = colours / 255.0
-    minmax = geometry.colours_normalised("minmax", shares, extent)
+    minmax = geometry.normalise_colours("minmax", shares, extent)
     assert minmax.tolist() == [pytest.approx(row, abs=1e-12) for row in ([-1, -1, -1], [-0.6, 1, -1], [1, 0, -1])]
-    by_range = geometry.colours_normalised("wrist", shares, extent)
+    by_range = geometry.normalise_colours("wrist", shares, extent)
     assert by_range[:, 0].tolist() == pytest.approx([-1, -0.6, 1])
     for method in ("none", "sphere"):
-        assert geometry.colours_normalised(method, shares, extent) is shares
+        assert geometry.normalise_colours(method, shares, extent) is shares
 
 
 @settings(max_examples=30)

@@ -27,7 +27,7 @@ def test_an_ellipsoids_normals_are_found_also_on_the_side_that_was_not_seen(
     points = on_ellipsoid(rng, radii_m)
     visible = points[points[:, 2] > 0]  # Seen from above
     turn, shift_m = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
-    misfit_m, surface = geometry.fitted(turn.apply(visible) + shift_m)
+    misfit_m, surface = geometry.fit_quadric(turn.apply(visible) + shift_m)
     assert misfit_m < 1e-6
     hidden = points[points[:, 2] < 0][0]
     truth = turn.apply(hidden / radii_m**2)
@@ -38,12 +38,12 @@ def test_an_ellipsoids_normals_are_found_also_on_the_side_that_was_not_seen(
 def test_the_misfit_is_the_noise_of_the_points() -> None:
     rng = np.random.default_rng(0)
     points = on_ellipsoid(rng, np.array([0.05, 0.05, 0.05])) * (1 + rng.normal(0, 0.02, (RNG_POINTS, 1)))
-    misfit_m, _ = geometry.fitted(points)
+    misfit_m, _ = geometry.fit_quadric(points)
     assert misfit_m == pytest.approx(0.001, rel=0.15)  # 2 % of 50 mm
 
 
 def test_points_of_a_plane_face_along_its_normal() -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.05, 0.05, (RNG_POINTS, 2)), rng.normal(0, 1e-5, RNG_POINTS)])
-    _, surface = geometry.fitted(points)
+    _, surface = geometry.fit_quadric(points)
     assert abs(surface.normal(points[0])[2]) == pytest.approx(1, abs=1e-2)

@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.clouds.segmentation import from_grasp_m, heights_m, object_rows, table_plane
+from tacpipe.clouds.segmentation import distances_from_grasp_m, heights_m, object_rows, table_plane
 from tacpipe.errors import TacpipeError
 from tests.clouds.scene_fakes import LIMITS, Scene, scene
 
@@ -71,9 +71,9 @@ def test_the_fingers_tell_which_of_several_things_is_meant() -> None:
 def test_points_are_as_far_from_a_grasp_as_from_its_line_or_from_its_line_of_sight() -> None:
     grasp = Grasp(np.array([-0.05, 0.0, 1.0]), np.array([0.05, 0.0, 1.0]))
     points_m = np.array([(0.0, 0.02, 1.0), (-0.08, 0.0, 1.04), (0.05, 0.0, 1.0), (0.09, 0.03, 1.0)])
-    np.testing.assert_allclose(from_grasp_m(points_m, grasp), [0.02, 0.05, 0.0, 0.05], atol=1e-12)
+    np.testing.assert_allclose(distances_from_grasp_m(points_m, grasp), [0.02, 0.05, 0.0, 0.05], atol=1e-12)
     before_m = np.array([(0.01, 0.0, 0.95), (0.0, 0.0, 0.9), (0.03, 0.0, 0.86), (0.0, 0.0, 1.07)])
-    np.testing.assert_allclose(from_grasp_m(before_m, grasp), [0.01, 0.0, 0.05, 0.07], atol=1e-12)
+    np.testing.assert_allclose(distances_from_grasp_m(before_m, grasp), [0.01, 0.0, 0.05, 0.07], atol=1e-12)
 
 
 def test_a_tall_thing_is_found_though_its_grasp_lies_far_beneath_what_the_camera_sees_of_it() -> None:
@@ -87,10 +87,10 @@ def test_a_tall_thing_is_found_though_its_grasp_lies_far_beneath_what_the_camera
 
 def test_a_view_without_a_table_is_refused_with_what_was_found() -> None:
     view = scene()
-    with pytest.raises(TacpipeError, match=r"No table is found: the largest planes hold .* % of \d+ points"):
+    with pytest.raises(TacpipeError, match=r"No table was found: the largest planes contain .* % of \d+ points"):
         object_rows(part(view, view.ball), view.grasp, LIMITS)
     beneath = replace(view, grasp=view.grasp.moved(np.eye(3), -0.05 * view.normal))
-    with pytest.raises(TacpipeError, match="one with the grasp in front of it must hold 20 %"):
+    with pytest.raises(TacpipeError, match="one behind the grasp must contain 20 %"):
         object_rows(beneath.cloud, beneath.grasp, LIMITS)
     with pytest.raises(TacpipeError, match=r"0 %.*2 points"):
         object_rows(Cloud(view.cloud.points_m[:2]), view.grasp, LIMITS)

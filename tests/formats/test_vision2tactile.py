@@ -40,10 +40,10 @@ def test_a_grasp_has_its_cloud_its_points_and_one_reading_at_its_folders_time(tm
     marked = {"session": "bleach-2019-06-27", "published": "vision2tactile"}
     assert result.attributes == {"sensor": "biotac-sp", "object": "bleach", **marked}
     assert set(result.streams) == {"cloud", "grasp", "reading"}
-    cloud = Cloud.of(result.streams["cloud"])
+    cloud = Cloud.from_table(result.streams["cloud"])
     np.testing.assert_array_equal(cloud.points_m, points_m())
     np.testing.assert_array_equal(np.asarray(cloud.colours), colours())
-    grasp = Grasp.of(result.streams["grasp"])
+    grasp = Grasp.from_table(result.streams["grasp"])
     np.testing.assert_allclose([grasp.g1_m, grasp.g2_m], points_m()[:2], rtol=1e-6)
     assert grasp.wrist is None
     for stream in ("grasp", "reading"):
@@ -75,7 +75,7 @@ def test_a_wrist_is_read_row_by_row_where_the_file_has_fifteen_numbers(tmp_path:
     wrist = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix()
     path.write_text(path.read_text() + "," + ",".join(f"{value:.6g}" for value in wrist.ravel()) + "\n")
     (result,) = read(tmp_path).values()
-    np.testing.assert_allclose(np.asarray(Grasp.of(result.streams["grasp"]).wrist), wrist, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(Grasp.from_table(result.streams["grasp"]).wrist), wrist, atol=1e-5)
     path.write_text(",".join(path.read_text().split(",")[:6]) + ",1,0,0,0,1,0,0,0,-1")
     with pytest.raises(TacpipeError, match=r"best-grasp\.txt"):
         read(tmp_path)
@@ -235,7 +235,7 @@ def test_the_published_grasps_lie_on_their_clouds_and_within_the_published_range
     }  # fmt: skip
     sizes = []
     for recording in result.values():
-        cloud, grasp = Cloud.of(recording.streams["cloud"]), Grasp.of(recording.streams["grasp"])
+        cloud, grasp = Cloud.from_table(recording.streams["cloud"]), Grasp.from_table(recording.streams["grasp"])
         sizes.append(len(cloud))
         assert cloud.colours is not None
         assert 0.026 < grasp.opening_m < 0.121

@@ -36,7 +36,7 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
         lab.run(command)
     recordings = tacpipe.open(lab.folder / "data/g")
     name = sorted(recordings.recordings)[0]
-    cloud, grasp = Cloud.of(recordings[name].table("cloud")), Grasp.of(recordings[name].table("grasp"))
+    cloud, grasp = Cloud.from_table(recordings[name].table("cloud")), Grasp.from_table(recordings[name].table("grasp"))
     (lab.folder / "clouds").mkdir()
     (lab.folder / "clouds" / "cup.ply").write_bytes(point_files.pack_ply(cloud.points_m, cloud.colours))
     (port,) = free_ports(1)

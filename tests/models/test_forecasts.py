@@ -215,7 +215,9 @@ def test_the_grid_of_a_layout_is_read_off_it() -> None:
     ],
 )
 def test_channels_that_do_not_lie_taxel_by_taxel_are_refused(layout: list[dict[str, str]]) -> None:
-    with pytest.raises(TacpipeError, match=f"these {len(layout)} do not" if layout else "the recordings hold latents"):
+    with pytest.raises(
+        TacpipeError, match=f"these {len(layout)} channels are not" if layout else "the recordings contain latents"
+    ):
         grid(layout)
 
 

@@ -27,7 +27,7 @@ def sklearn(trees: int = 12, leaf: int = 2, **options: object) -> ExtraTreesRegr
 @pytest.mark.parametrize("leaf", [1, 4])
 def test_a_forest_says_what_scikit_learn_says(outputs: int, leaf: int) -> None:
     features, values = rows(outputs=outputs)
-    forest = Forest.fitted(features, values, trees=12, leaf=leaf, seed=7)
+    forest = Forest.fit(features, values, trees=12, leaf=leaf, seed=7)
     reference = sklearn(leaf=leaf).fit(features.astype(np.float32), values if outputs > 1 else values[:, 0])
     unseen, _ = rows(25, seed=1)
     predicted = forest.predict(unseen)
@@ -48,9 +48,9 @@ def test_a_row_on_a_cut_goes_the_way_it_goes_in_scikit_learn() -> None:
 
 
 def test_tensors_and_their_bytes_give_back_the_forest() -> None:
-    forest = Forest.fitted(*rows(), trees=3, leaf=2, seed=0)
-    restored = Forest.from_tensors(load(save(forest.tensors())))
-    for name, tensor in forest.tensors().items():
+    forest = Forest.fit(*rows(), trees=3, leaf=2, seed=0)
+    restored = Forest.from_tensors(load(save(forest.to_tensors())))
+    for name, tensor in forest.to_tensors().items():
         assert np.array_equal(getattr(restored, name), tensor.numpy())
         assert getattr(restored, name).dtype == getattr(forest, name).dtype
     unseen, _ = rows(5, seed=2)
@@ -58,20 +58,20 @@ def test_tensors_and_their_bytes_give_back_the_forest() -> None:
 
 
 def test_a_forest_in_another_unit_tells_the_same_values_in_it() -> None:
-    forest, unit = Forest.fitted(*rows(), trees=3, leaf=2, seed=0), np.array([2.0, 0.1, -1.0])
+    forest, unit = Forest.fit(*rows(), trees=3, leaf=2, seed=0), np.array([2.0, 0.1, -1.0])
     unseen, _ = rows(5, seed=2)
-    np.testing.assert_allclose(forest.times(unit).predict(unseen), forest.predict(unseen) * unit, rtol=1e-6)
+    np.testing.assert_allclose(forest.scaled(unit).predict(unseen), forest.predict(unseen) * unit, rtol=1e-6)
 
 
 def test_trees_of_a_single_leaf_say_the_mean() -> None:
     features, values = rows(5)
-    forest = Forest.fitted(features, values, trees=4, leaf=5, seed=0)
+    forest = Forest.fit(features, values, trees=4, leaf=5, seed=0)
     assert len(forest.children) == 4
     np.testing.assert_allclose(forest.predict(features), np.tile(values.mean(axis=0), (5, 1)), rtol=1e-6)
 
 
 def test_trees_of_unlike_depth_stand_side_by_side() -> None:
-    short, long = Forest.fitted(*rows(4), trees=2, leaf=4, seed=0), Forest.fitted(*rows(), trees=1, leaf=1, seed=1)
+    short, long = Forest.fit(*rows(4), trees=2, leaf=4, seed=0), Forest.fit(*rows(), trees=1, leaf=1, seed=1)
     start = len(short.children)
     joined = Forest(
         np.concatenate([short.roots, long.roots + start]),
@@ -83,7 +83,7 @@ def test_trees_of_unlike_depth_stand_side_by_side() -> None:
 
 
 def test_the_same_seed_gives_the_same_trees_and_another_does_not() -> None:
-    first, same, reseeded = (Forest.fitted(*rows(), trees=2, leaf=2, seed=seed) for seed in (1, 1, 2))
+    first, same, reseeded = (Forest.fit(*rows(), trees=2, leaf=2, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(first.cuts, same.cuts)
     assert not np.array_equal(first.values, reseeded.values)
 

@@ -60,7 +60,7 @@ def test_tensors_hold_everything() -> None:
 
 def test_slides_that_cannot_be_told_apart_by_level_say_why() -> None:
     x, labels = slides()
-    with pytest.raises(TacpipeError, match="do not fit one another"):
+    with pytest.raises(TacpipeError, match="do not match"):
         Level.fit(x, labels[1:])
     with pytest.raises(TacpipeError, match="3 slides of 3 classes do not show"):
         Level.fit(x[:3], labels[:3])

@@ -66,7 +66,7 @@ def test_a_ridge_is_that_of_scikit_learn_at_the_alpha_that_validates_best(
     x, y = features(validation, plan), increments(validation)
     errors = [np.square(oracle.predict(x) - y).mean() for oracle in oracles]
     best = int(np.argmin(errors))
-    assert fitted.chosen[f"{name}.alpha"] == linear.ALPHAS[best]
+    assert fitted.settings[f"{name}.alpha"] == linear.ALPHAS[best]
     assert 0 < best < len(linear.ALPHAS) - 1, "the test should not be decided by the ends of the grid"
     expected = validation[0][:, -1:] + oracles[best].predict(x).reshape(-1, HORIZON, CHANNELS)
     np.testing.assert_allclose(fitted.predict(*validation[:2])[name], expected, atol=0.01)
@@ -85,7 +85,7 @@ def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(
 
     grid = list(itertools.product(linear.PHIS, range(1, CONTEXT)))
     phi, lag = min(grid, key=lambda array: float(np.square(trend(*array) - ahead).sum()))
-    assert (fitted.chosen["damped_trend.phi"], fitted.chosen["damped_trend.lag"]) == (phi, lag)
+    assert (fitted.settings["damped_trend.phi"], fitted.settings["damped_trend.lag"]) == (phi, lag)
     assert phi > 0
     assert (lag > 1) == (repeats > 1)
     np.testing.assert_allclose(fitted.predict(*windows[:2])["damped_trend"], trend(phi, lag), atol=0.01)
@@ -201,14 +201,14 @@ def test_a_single_past_frame_has_no_trend_but_a_motion() -> None:
     baselines = FittedBaselines.fit(walk(1, context=1), walk(2, context=1))
     past, motion, _ = walk(3, context=1)
     predicted = baselines.predict(past, motion)
-    assert baselines.chosen["damped_trend.lag"] == 0
+    assert baselines.settings["damped_trend.lag"] == 0
     assert np.array_equal(predicted["damped_trend"], np.repeat(past, HORIZON, axis=1))
     assert np.ptp(predicted["ridge"] - past) > 1
 
 
 def test_baselines_read_back_are_the_same(fitted: FittedBaselines) -> None:
     read = FittedBaselines.from_tensors(load(save(fitted.to_tensors())))
-    assert read.chosen == fitted.chosen
+    assert read.settings == fitted.settings
     before, after = fitted.predict(*walk(2)[:2]), read.predict(*walk(2)[:2])
     assert tuple(after) == linear.NAMES
     for name in linear.NAMES:
@@ -220,12 +220,12 @@ def test_baselines_read_back_are_the_same(fitted: FittedBaselines) -> None:
 def test_windows_that_are_none_or_do_not_fit_are_refused() -> None:
     past, motion, ahead = walk(1)
     none = past[:0], motion[:0], ahead[:0]
-    with pytest.raises(TacpipeError, match="training recordings hold no window"):
+    with pytest.raises(TacpipeError, match="training recordings contain no window"):
         FittedBaselines.fit(none, walk(2))
-    with pytest.raises(TacpipeError, match="validation recordings hold no window"):
+    with pytest.raises(TacpipeError, match="validation recordings contain no window"):
         FittedBaselines.fit(walk(1), none)
     for part in ((past, motion[:, 1:], ahead), (past, motion, ahead[:, :, 1:]), (past[1:], motion, ahead)):
-        with pytest.raises(TacpipeError, match="do not fit one another"):
+        with pytest.raises(TacpipeError, match="do not match"):
             FittedBaselines.fit(part, walk(2))
     with pytest.raises(TacpipeError, match="do not fit training windows"):
         FittedBaselines.fit(walk(1), (past[:, 1:], motion[:, 1:], ahead))

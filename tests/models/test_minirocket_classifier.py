@@ -57,7 +57,7 @@ def test_shuffled_labels_are_learned_from_the_same_patterns_and_tell_nothing() -
     new, truth = textured(300, seed=1)
     shuffled = np.random.default_rng(0).permutation(labels)
     fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
-    relabelled = fitted.relabelled(x, shuffled)
+    relabelled = fitted.with_labels(x, shuffled)
     assert np.mean(relabelled.predict(new) == truth) < 0.6
     fitted_alone = MinirocketClassifier.fit(x, shuffled, features=PATTERNS)
     assert np.array_equal(relabelled.scores(new), fitted_alone.scores(new))

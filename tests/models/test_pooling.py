@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from tacpipe.models import point_networks
-from tacpipe.models.point_networks import LargestOverPoints, NormalisedLinear, largest
+from tacpipe.models.point_networks import LargestOverPoints, NormalisedLinear, largest_output
 
 Sizes = tuple[int, int, int, int]  # clouds, points, inputs, outputs
 SIZES = st.tuples(st.integers(1, 4), st.integers(2, 40), st.integers(1, 9), st.integers(1, 12))
@@ -56,7 +56,7 @@ def test_values_statistics_and_all_gradients_are_those_of_torch(sizes: Sizes, se
     plain = Plain(layer)
     points.requires_grad_()
     for _ in range(2):  # the running statistics follow twice
-        ours_values = largest(layer, points) if pooled else layer(points)
+        ours_values = largest_output(layer, points) if pooled else layer(points)
         torch_values = plain(points).amax(dim=1) if pooled else plain(points)
         torch.testing.assert_close(ours_values, torch_values, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(layer.mean, plain.normal.running_mean, rtol=1e-10, atol=1e-10)
@@ -79,7 +79,7 @@ def test_when_nothing_is_learned_the_running_statistics_normalise_as_in_torch(po
         plain(points + at)
     layer.eval(), plain.eval()
     before = layer.mean.clone()
-    ours_values = largest(layer, points) if pooled else layer(points)
+    ours_values = largest_output(layer, points) if pooled else layer(points)
     torch_values = plain(points).amax(dim=1) if pooled else plain(points)
     torch.testing.assert_close(ours_values, torch_values, rtol=1e-9, atol=1e-9)
     assert torch.equal(layer.mean, before)
@@ -93,7 +93,7 @@ def test_a_batch_says_nothing_of_another_when_nothing_is_learned() -> None:
     layer, points = layer_and_points((4, 9, 3, 6), 2)
     layer(points)
     layer.eval()
-    torch.testing.assert_close(largest(layer, points)[:1], largest(layer, points[:1]))
+    torch.testing.assert_close(largest_output(layer, points)[:1], largest_output(layer, points[:1]))
 
 
 def test_the_gradients_of_the_largest_value_are_those_of_small_differences() -> None:
@@ -123,7 +123,7 @@ class Pooled(nn.Module):
         self.layer = layer
 
     def forward(self, points: Tensor) -> Tensor:
-        return largest(self.layer, points)
+        return largest_output(self.layer, points)
 
 
 @settings(deadline=None, max_examples=20)
@@ -132,15 +132,16 @@ def test_one_cloud_at_a_time_gives_what_all_at_once_give(sizes: Sizes, seed: int
     layer, points = layer_and_points(sizes, seed)
     with torch.no_grad():
         (values, places), (batched_values, at) = (
-            way(points, layer.weight) for way in (point_networks._largest_cached, point_networks._largest)
+            way(points, layer.weight)
+            for way in (point_networks._largest_product_cached, point_networks._largest_product)
         )
     torch.testing.assert_close(values, batched_values)
     assert torch.equal(places, at)
 
 
-@pytest.mark.parametrize("way", [point_networks._largest_cached, point_networks._largest])
+@pytest.mark.parametrize("way", [point_networks._largest_product_cached, point_networks._largest_product])
 def test_of_points_equally_large_one_alone_takes_the_gradient(way: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_networks, "_largest_cached", way)
+    monkeypatch.setattr(point_networks, "_largest_product_cached", way)
     points = torch.tensor([[[1.0, 0.0], [2.0, 5.0], [2.0, -5.0], [2.0, 1.0]]]).requires_grad_()
     weight = torch.tensor([[1.0, 0.0]]).requires_grad_()
     maxima = LargestOverPoints.apply(points, weight, torch.tensor([0.5]))  # type: ignore[no-untyped-call]
@@ -156,21 +157,21 @@ def test_a_channel_that_never_moves_becomes_its_shift() -> None:
     layer, _ = layer_and_points((1, 1, 3, 4), 5)
     points = torch.ones(2, 10, 3, dtype=torch.float64)
     torch.testing.assert_close(layer(points), layer.shift.expand(2, 10, 4), atol=1e-9, rtol=0)
-    torch.testing.assert_close(largest(layer, points), layer.shift.expand(2, 4), atol=1e-9, rtol=0)
+    torch.testing.assert_close(largest_output(layer, points), layer.shift.expand(2, 4), atol=1e-9, rtol=0)
 
 
 def test_points_that_are_not_finite_are_not_passed_over() -> None:
     layer, points = layer_and_points((2, 5, 3, 4), 6)
     layer.eval()
     points[1, 3, 0] = torch.nan
-    maxima = largest(layer, points)
+    maxima = largest_output(layer, points)
     assert torch.isfinite(maxima[0]).all()
     assert torch.isnan(maxima[1]).all()
 
 
-@pytest.mark.parametrize("clouds", [1, 2, point_networks.FEW, point_networks.FEW + 1, 40])
+@pytest.mark.parametrize("clouds", [1, 2, point_networks.MAX_PLAIN_SUM, point_networks.MAX_PLAIN_SUM + 1, 40])
 def test_rows_of_few_clouds_and_of_many_are_weighed_and_added_up(clouds: int) -> None:
     torch.manual_seed(clouds)
     weights, rows = torch.randn(clouds, 50), torch.randn(clouds, 50, 7)
     expected = torch.einsum("co,coi->oi", weights.double(), rows.double())
-    torch.testing.assert_close(point_networks._weighed(weights, rows).double(), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(point_networks._weighted_sum(weights, rows).double(), expected, rtol=1e-5, atol=1e-5)

@@ -48,7 +48,7 @@ def test_alpha_is_the_one_that_errs_least_when_slides_are_left_out_one_by_one(se
     readout = Readout.fit(rows, labels)
     assert readout.alpha == min(errors, key=errors.__getitem__)
     assert ALPHAS[0] < readout.alpha < ALPHAS[-1]
-    assert readout.left_out_error == pytest.approx(errors[readout.alpha], rel=1e-3)
+    assert readout.leave_one_out_error == pytest.approx(errors[readout.alpha], rel=1e-3)
 
 
 def test_scores_are_those_of_scikit_learns_ridge_on_standardised_features() -> None:
@@ -115,7 +115,7 @@ def test_two_classes_are_enough_and_one_is_not() -> None:
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
     rows, labels = features()
-    with pytest.raises(TacpipeError, match="do not fit one another"):
+    with pytest.raises(TacpipeError, match="do not match"):
         Readout.fit(rows, labels[1:])
     with pytest.raises(TacpipeError, match=r"\(slide, 60\) was fitted"):
         Readout.fit(rows, labels).scores(rows[:, 1:])

@@ -12,7 +12,7 @@ from tacpipe.models.recurrent_autoencoder import (
     AutoencoderShape,
     RecurrentAutoencoder,
     RecurrentClassifier,
-    parameters,
+    count_weights,
 )
 
 BIOTAC, ROBOSKIN = AutoencoderShape(19, 20), AutoencoderShape(60, 20, header="cnn")
@@ -20,17 +20,17 @@ BIOTAC, ROBOSKIN = AutoencoderShape(19, 20), AutoencoderShape(60, 20, header="cn
 
 def test_the_networks_have_as_many_weights_as_the_published_ones() -> None:
     biotac, roboskin = RecurrentAutoencoder(BIOTAC), RecurrentAutoencoder(ROBOSKIN)
-    assert parameters(biotac) == 83_319
-    assert parameters(roboskin) == 82_962
-    assert parameters(biotac.encoder) == 39_960
-    assert parameters(roboskin.encoder) == 39_600
-    assert parameters(biotac.to_latents) == 3_640
-    assert parameters(biotac.classifier) == 820
-    assert parameters(biotac.from_latents) == 3_690
-    assert parameters(biotac.decoder) == 33_480
-    assert parameters(biotac.to_features) == 1_729
-    assert parameters(roboskin.to_features) == 1_638
-    assert parameters(roboskin.header) == 48 + 46
+    assert count_weights(biotac) == 83_319
+    assert count_weights(roboskin) == 82_962
+    assert count_weights(biotac.encoder) == 39_960
+    assert count_weights(roboskin.encoder) == 39_600
+    assert count_weights(biotac.to_latents) == 3_640
+    assert count_weights(biotac.classifier) == 820
+    assert count_weights(biotac.from_latents) == 3_690
+    assert count_weights(biotac.decoder) == 33_480
+    assert count_weights(biotac.to_features) == 1_729
+    assert count_weights(roboskin.to_features) == 1_638
+    assert count_weights(roboskin.header) == 48 + 46
 
 
 class Plainly(nn.Module):
@@ -109,7 +109,7 @@ def test_the_classifier_alone_has_its_last_state_for_latents_and_makes_no_frames
     output = network(torch.rand(6, 3, 19))
     assert output.frames is None
     torch.testing.assert_close(network.classifier(output.latents), output.scores)
-    assert parameters(network) == 39_960 + 90 * 20 + 20
+    assert count_weights(network) == 39_960 + 90 * 20 + 20
 
 
 @pytest.mark.parametrize("kind", [RecurrentAutoencoder, RecurrentClassifier])
@@ -129,5 +129,5 @@ def test_what_cannot_be_built_is_refused_with_what_can() -> None:
         RecurrentAutoencoder(AutoencoderShape(19, 20, header="cnn"))
     with pytest.raises(TacpipeError, match="no header 'fft'"):
         RecurrentAutoencoder(AutoencoderShape(19, 20, header="fft"))
-    with pytest.raises(TacpipeError, match="the sensor digit; the recordings have biotac"):
-        recurrent_autoencoder.chosen("digit=mlp", {"biotac": 19})
+    with pytest.raises(TacpipeError, match="the unknown sensor digit; the recordings have biotac"):
+        recurrent_autoencoder.parse_headers("digit=mlp", {"biotac": 19})

@@ -34,7 +34,7 @@ def centres() -> np.ndarray:
 
 
 def test_bands_are_those_that_every_sensor_can_tell() -> None:
-    assert COMMON.way_m == pytest.approx(0.075)  # the forearm's 75 frames at 50 Hz and 50 mm/s
+    assert COMMON.distance_m == pytest.approx(0.075)  # the forearm's 75 frames at 50 Hz and 50 mm/s
     assert COMMON.edges_per_m[0] == pytest.approx(3 / 0.075)
     assert COMMON.edges_per_m[-1] == pytest.approx(0.6 * 50 / 2 / 0.05)
     assert len(COMMON.edges_per_m) == BANDS + 1
@@ -47,7 +47,7 @@ def test_a_wave_of_the_surface_is_in_its_band_at_any_speed_and_rate(
 ) -> None:
     felt = Sampling(int(0.08 / speed_m_s * rate_hz) + 1, rate_hz, speed_m_s)
     spectra = read(felt, slides(felt, {per_m: 100.0}))[:, :-1]
-    if felt.highest_per_m > 300:
+    if felt.max_per_m > 300:
         nearest = np.abs(np.log(centres()[spectra.argmax(axis=1)] / per_m))
         assert (nearest <= np.log(centres()[1] / centres()[0]) + 1e-9).all()
 
@@ -106,9 +106,9 @@ def test_slides_are_read_alike_one_by_one_or_many_at_once() -> None:
 
 
 def test_slides_that_cannot_be_read_are_refused() -> None:
-    with pytest.raises(TacpipeError, match=r"do not go 0\.075 m; \(slide, time, channel\) of 300 frames"):
+    with pytest.raises(TacpipeError, match=r"shorter than 0\.075 m; give \(slide, time, channel\) with 300 frames"):
         read(FINGER, np.zeros((2, 299, 3)))
     with pytest.raises(TacpipeError, match="not finite"):
         read(FINGER, np.full((2, 400, 3), np.nan))
-    with pytest.raises(TacpipeError, match=r"goes 0\.075 m and shows waves of more than 40 periods a metre"):
+    with pytest.raises(TacpipeError, match=r"is 0\.075 m long and resolves more than 40 periods per metre"):
         Bands.common([FINGER, FOREARM, Sampling(400, 10.0, 0.1)])

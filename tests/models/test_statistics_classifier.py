@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load, save
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.readout import CHUNK, VIEWS, StatisticsClassifier, View, read, statistics
+from tacpipe.models.readout import CHUNK, VIEWS, StatisticsClassifier, View, statistics, view_features
 
 ACROSS = 6  # channels that describe all others at one moment
 
@@ -70,8 +70,8 @@ def test_a_slide_has_the_same_statistics_however_many_are_read_at_once() -> None
 def test_a_slide_without_its_level_reads_alike_wherever_it_is_pressed() -> None:
     x = np.random.default_rng(0).normal(size=(2, 9, 3))
     lifted = x + np.array([0.0, 30.0, 500.0])
-    np.testing.assert_allclose(read(lifted, "level_removed"), read(x, "level_removed"), atol=1e-5)
-    assert np.abs(read(lifted, "level") - read(x, "level")).max() > 1
+    np.testing.assert_allclose(view_features(lifted, "level_removed"), view_features(x, "level_removed"), atol=1e-5)
+    assert np.abs(view_features(lifted, "level") - view_features(x, "level")).max() > 1
 
 
 @pytest.mark.parametrize(("slides", "views"), [(rippled, ("all", "level_removed")), (pressed, ("all", "level"))])

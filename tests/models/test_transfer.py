@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from sklearn.covariance import LedoitWolf
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.transfer import STEADY, Gaussians, Labelled, Transfer
+from tacpipe.models.transfer import REGULARISATION, Gaussians, Labelled, Transfer
 
 WIDE, CLASSES = 5, 10
 MEANS = 2 * np.random.default_rng(0).normal(size=(CLASSES, WIDE))
@@ -119,7 +119,7 @@ def test_scores_are_logarithms_of_normal_densities() -> None:
     )
     expected = np.array(
         [
-            multivariate_normal(mean, cov + STEADY * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
+            multivariate_normal(mean, cov + REGULARISATION * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
             for mean, cov in zip(transfer.learned.mean, transfer.learned.covariance, strict=True)
         ]
     ).T
@@ -145,7 +145,7 @@ def test_tensors_hold_everything() -> None:
 
 
 def test_slides_that_teach_nothing_are_refused() -> None:
-    with pytest.raises(TacpipeError, match=" 2 classes in common; 3 "):
+    with pytest.raises(TacpipeError, match=" 2 classes in common; a map between them needs 3"):
         Transfer.fit(sided(range(4), 4), [sided(range(2, 8), 4)])
     with pytest.raises(TacpipeError, match="8 slides of 1 classes do not show"):
         Transfer.fit(sided([3], 8))

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tacpipe.models.windows import POSE, ForecastWindows, motion, repeats, rotations, with_plans_of, without_plan
+from tacpipe.models.windows import POSE, ForecastWindows, motion, repeats, rotations, swap_plans, without_plan
 from tests.models.window_fakes import CONTEXT, HORIZON, windows
 
 
@@ -99,7 +99,7 @@ def test_dealt_out_plans_leave_the_past_and_begin_where_the_hand_is() -> None:
     inputs = double(windows())
     resting = inputs.arm.clone()
     resting[CONTEXT:] = resting[CONTEXT - 1]  # a plan that stays begins, and ends, at its own pose
-    dealt = with_plans_of(inputs._replace(arm=resting), torch.roll(torch.arange(6), 1))
+    dealt = swap_plans(inputs._replace(arm=resting), torch.roll(torch.arange(6), 1))
     assert torch.equal(dealt.arm[:CONTEXT], inputs.arm[:CONTEXT])
     assert torch.equal(dealt.touch, inputs.touch)
     assert torch.allclose(dealt.arm[CONTEXT:, :, :3], inputs.arm[CONTEXT - 1, :, :3], atol=1e-9)
@@ -109,12 +109,12 @@ def test_dealt_out_plans_leave_the_past_and_begin_where_the_hand_is() -> None:
 
 def test_dealt_out_plans_are_the_others_as_their_own_hands_see_them() -> None:
     inputs, sources = double(windows()), torch.tensor([3, 0, 5, 1, 2, 4])
-    steps, before = motion(with_plans_of(inputs, sources))[0], motion(inputs)[0]
+    steps, before = motion(swap_plans(inputs, sources))[0], motion(inputs)[0]
     assert torch.allclose(steps[CONTEXT:], before[CONTEXT:, sources], atol=1e-9)
     assert torch.allclose(steps[:CONTEXT], before[:CONTEXT])
 
 
 def test_everybody_s_own_plan_is_no_change() -> None:
     inputs = double(windows())
-    dealt = with_plans_of(inputs, torch.arange(6))
+    dealt = swap_plans(inputs, torch.arange(6))
     assert torch.allclose(dealt.arm, inputs.arm, atol=1e-9)

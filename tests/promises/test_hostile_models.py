@@ -339,11 +339,11 @@ def test_trees_that_point_beyond_their_nodes_are_refused(part: str, value: int) 
 
 def test_a_forest_as_it_was_grown_is_one() -> None:
     rng = np.random.default_rng(0)
-    grown = Forest.fitted(rng.normal(size=(60, 4)), rng.normal(size=(60, 3)), trees=5, leaf=2, seed=0)
-    grown.check(4, 3)
+    grown = Forest.fit(rng.normal(size=(60, 4)), rng.normal(size=(60, 3)), trees=5, leaf=2, seed=0)
+    grown.validate(4, 3)
     for features, values in ((3, 3), (4, 2)):
         with pytest.raises(ValueError):
-            grown.check(features, values)
+            grown.validate(features, values)
 
 
 # ---- as commands

@@ -12,7 +12,7 @@ import pytest
 from tacpipe.channels import schema
 from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.grasp import Grasp, estimated_wrist
+from tacpipe.clouds.grasp import Grasp, estimate_wrist
 from tacpipe.plugins.registry import load
 from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.clouds import Clouds
@@ -36,7 +36,7 @@ def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
 def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     full_scene, stage = scene(), load("segment.grasps")
     assert full_scene.cloud.colours is not None
-    wrist = estimated_wrist(full_scene.grasp)
+    wrist = estimate_wrist(full_scene.grasp)
     grasp = Grasp(full_scene.grasp.g1_m, full_scene.grasp.g2_m, wrist if kind == "wrist" else None)
     record = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
@@ -49,5 +49,7 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     segmented, expected = (
         stage(stage.params(), FakeRecording(streams)).streams for streams in (acquired_streams, expected_streams)
     )
-    np.testing.assert_array_equal(Cloud.of(segmented["cloud"]).points_m, Cloud.of(expected["cloud"]).points_m)
+    np.testing.assert_array_equal(
+        Cloud.from_table(segmented["cloud"]).points_m, Cloud.from_table(expected["cloud"]).points_m
+    )
     assert segmented["grasp"].equals(expected["grasp"])

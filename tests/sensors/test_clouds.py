@@ -63,7 +63,7 @@ def test_a_stream_of_clouds_has_the_columns_of_a_scene() -> None:
     samples = sensor.decode([TEXT_PLY])
 
     columns = [pa.array(np.ascontiguousarray(column)) for block in samples.values for column in block.T]
-    scene = Cloud.of(
+    scene = Cloud.from_table(
         pa.Table.from_arrays([pa.array([1, 1]), *columns], names=["t_ns", *(f.name for f in sensor.fields())])
     )
     assert scene.colours is not None and scene.colours[0].tolist() == [255, 0, 9]

@@ -110,7 +110,7 @@ def test_a_grasp_becomes_the_columns_that_grasps_are_read_from() -> None:
 
     columns = [pa.array(column) for block in samples.values for column in block.T]
     table = pa.Table.from_arrays([pa.array([9]), *columns], names=["t_ns", *(field.name for field in sensor.fields())])
-    grasp = Grasp.of(table)
+    grasp = Grasp.from_table(table)
     assert samples.rows is not None and samples.rows.tolist() == [1]
     assert grasp.g1_m.tolist() == GRASP["g1"]
     assert grasp.g2_m.tolist() == GRASP["g2"]

@@ -52,7 +52,7 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
     strong = TouchModel.load(trained(dataset, tmp_path, trees=20, leaf=2))
     rng = np.random.default_rng(0)
     for shard in list(dataset.recordings.values())[:12]:
-        cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
+        cloud, grasp = Cloud.from_table(shard.table("cloud")), Grasp.from_table(shard.table("grasp"))
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
         moved = Cloud((cloud.points_m @ turn.T + shift_m).astype(np.float32), cloud.colours)
         reading, moved_reading = strong.predict(cloud, grasp), strong.predict(moved, grasp.moved(turn, shift_m))

@@ -138,7 +138,7 @@ def test_clouds_openings_and_readings_are_of_the_size_of_published_ones() -> Non
     assert min(points) >= 800
     assert max(points) <= 6500
     assert 1000 < np.median(points) < 3500
-    openings = [Grasp.of(grasp_recording.streams["grasp"]).opening_m for grasp_recording in recordings]
+    openings = [Grasp.from_table(grasp_recording.streams["grasp"]).opening_m for grasp_recording in recordings]
     assert 0.05 < np.median(openings) < 0.09
     for target, (low, high) in biotac_sp.RANGES.items():
         read = np.array(
@@ -163,7 +163,7 @@ def test_a_finished_recording_has_the_streams_and_attributes_of_a_grasp() -> Non
         "session": "cylinder-01-s01",
     }
     assert all(name == "t_ns" or name.startswith("gt_") for name in grasp_recording.streams["truth"].column_names)
-    assert Cloud.of(grasp_recording.streams["cloud"]).colours is not None
+    assert Cloud.from_table(grasp_recording.streams["cloud"]).colours is not None
 
 
 def test_a_trial_follows_from_seed_and_number_whatever_the_number_of_trials() -> None:
@@ -224,7 +224,7 @@ def test_spheres_of_all_sizes_look_the_same_but_for_scale_and_are_gripped_throug
 def test_spheres_differ_in_size_and_so_in_what_is_felt() -> None:
     rig = GraspRig(spheres=True, effort_spread=0.05)
     recordings = [recording(index, rig) for index in range(40)]
-    opening = np.array([Grasp.of(grasp_recording.streams["grasp"]).opening_m for grasp_recording in recordings])
+    opening = np.array([Grasp.from_table(grasp_recording.streams["grasp"]).opening_m for grasp_recording in recordings])
     pressure = np.array(
         [grasp_recording.streams["reading"].column("mf_pdc")[0].as_py() for grasp_recording in recordings]
     )
@@ -263,9 +263,9 @@ def test_a_raw_recording_is_the_same_grasp_before_anything_is_cut_out() -> None:
     raw_truth, finished_truth = truth(raw), truth(finished)
     assert all(raw_truth[name] == finished_truth[name] for name in finished_truth)
     surface = raw.streams["scene_truth"].column("gt_surface").to_numpy()
-    points = Cloud.of(raw.streams["scene"]).points_m
+    points = Cloud.from_table(raw.streams["scene"]).points_m
     assert len(points) == len(surface) > 100_000
-    object_points, finished_points = points[surface == 1], Cloud.of(finished.streams["cloud"]).points_m
+    object_points, finished_points = points[surface == 1], Cloud.from_table(finished.streams["cloud"]).points_m
     assert len(object_points) == pytest.approx(len(finished_points), rel=0.02)
     np.testing.assert_allclose(object_points.mean(axis=0), finished_points.mean(axis=0), atol=3e-4)
     view = scene(2)

@@ -62,8 +62,8 @@ def test_of_simulated_scenes_nearly_all_points_of_the_object_and_nearly_no_other
     shard: Recording, simulated: list[RecordingOutput]
 ) -> None:
     for recording in simulated:
-        object_points_m = Cloud.of(cut(shard(recording.streams)).streams["cloud"]).points_m
-        scene_points_m = Cloud.of(recording.streams["scene"]).points_m
+        object_points_m = Cloud.from_table(cut(shard(recording.streams)).streams["cloud"]).points_m
+        scene_points_m = Cloud.from_table(recording.streams["scene"]).points_m
         is_object = recording.streams["scene_truth"].column("gt_surface").to_numpy() == OBJECT
         true_points = set(map(tuple, scene_points_m[is_object].tolist()))
         true_count = sum(point in true_points for point in map(tuple, object_points_m.tolist()))
@@ -102,7 +102,7 @@ def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Rec
     truth = pa.table({"t_ns": [START_NS], "gt_force_n": [2.0]})
     output = cut(shard(raw(ball_scene, truth=truth)))
     assert set(output.streams) == {"cloud", "grasp", "reading", "truth"}
-    cloud = Cloud.of(output.streams["cloud"])
+    cloud = Cloud.from_table(output.streams["cloud"])
     true_points = {tuple(point) for point in ball_scene.cloud.points_m[ball_scene.ball].tolist()}
     true_count = sum(tuple(point) in true_points for point in cloud.points_m.tolist())
     assert true_count >= 0.95 * len(cloud) and true_count >= 0.95 * len(true_points)
@@ -112,7 +112,7 @@ def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Rec
     assert cloud.colours is not None
     for point, colour in zip(cloud.points_m.tolist(), cloud.colours, strict=True):
         assert (colour_by_point[tuple(point)] == colour).all()
-    np.testing.assert_array_equal(Grasp.of(output.streams["grasp"]).g1_m, ball_scene.grasp.g1_m)
+    np.testing.assert_array_equal(Grasp.from_table(output.streams["grasp"]).g1_m, ball_scene.grasp.g1_m)
     assert output.streams["truth"].equals(truth)
 
 
@@ -201,11 +201,11 @@ def test_what_cannot_be_found_is_told_with_the_recording(shard: Recording) -> No
     away = ball_scene.grasp.moved(np.eye(3), 0.3 * ball_scene.normal)
     with pytest.raises(TacpipeError, match=r"Recording trial: No object is near the grasp: .* mm from the lines"):
         cut(shard(raw(ball_scene, grasp=away.table(START_NS))))
-    with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
+    with pytest.raises(TacpipeError, match="Recording trial: No table was found"):
         cut(shard(raw(ball_scene, scene=Cloud(ball_scene.cloud.points_m[ball_scene.ball]).table())))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
         cut(shard(raw(ball_scene, biotac_sp=touched(CLOSED))))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
         cut(shard(raw(ball_scene)), on_count=400.0)
-    with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
+    with pytest.raises(TacpipeError, match="Recording trial: No table was found"):
         cut(shard(raw(ball_scene)), plane_fraction=0.99)

@@ -68,7 +68,7 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
     assert predictions.attributes["simulated"] is True
     name = predictions.table("grasps").to_pydict()["recording"][0]
     shard = tacpipe.open("grasps").recordings[name]
-    cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
+    cloud, grasp = Cloud.from_table(shard.table("cloud")), Grasp.from_table(shard.table("grasp"))
     predicted = model.predict(cloud, grasp)
     row = predictions.table("model").to_pylist()[0]
     assert predicted.pdc_th == pytest.approx(row["pdc_th"], rel=1e-5)

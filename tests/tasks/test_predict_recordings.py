@@ -52,11 +52,11 @@ def test_a_predictor_of_touch_predicts_from_python_what_the_command_writes_to_th
     shard = given.recordings["trial-007"]
     (row,) = model.predict(shard).to_pylist()
     assert row == next(one for one in wanted.to_pylist() if one["recording"] == "trial-007")
-    touch = model.predict(Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp")))
+    touch = model.predict(Cloud.from_table(shard.table("cloud")), Grasp.from_table(shard.table("grasp")))
     assert np.float32(touch.pdc_th) == row["pdc_th"] and np.float32(touch.e_mf[6]) == row["e_mf_07"]
     assert model.predict(tacpipe.open("data/pinched")["trial-007"]).to_pylist() == [row]  # segmented on the way
     with pytest.raises(UsageError, match="Give predict"):
-        model.predict(Cloud.of(shard.table("cloud")))
+        model.predict(Cloud.from_table(shard.table("cloud")))
 
 
 def test_the_steps_from_python_are_those_of_the_command() -> None:

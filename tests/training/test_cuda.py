@@ -64,9 +64,9 @@ def test_a_model_of_a_gpu_is_evaluated_alike_where_there_is_none(project: Path) 
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
 def test_recurrent_layers_stay_in_float32_under_autocast(kind: type[nn.GRU | nn.LSTM]) -> None:
     layer, inputs = kind(3, 5).cuda(), torch.randn(7, 2, 3, device="cuda")
-    expected, _ = lstm.through(layer, inputs)
+    expected, _ = lstm.run_layer(layer, inputs)
     with torch.autocast("cuda", torch.bfloat16):
-        states, _ = lstm.through(layer, inputs)
+        states, _ = lstm.run_layer(layer, inputs)
     assert torch.equal(states, expected)
 
 

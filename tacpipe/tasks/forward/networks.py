@@ -146,7 +146,7 @@ def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
         return windows_of.without_plan(windows)
     if actions == "shuffled":
         count = windows.touch.shape[1]
-        return windows_of.with_plans_of(windows, torch.randperm(count).to(windows.touch.device))
+        return windows_of.swap_plans(windows, torch.randperm(count).to(windows.touch.device))
     return windows
 
 
@@ -180,7 +180,7 @@ def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
         )
     scaling_methods = [name for name in METHODS if hasattr(network, name)]
     if not scaling_methods:
-        return PlainForecast(network, sizes, loss=forecasts.resolved_loss("auto", changes=sizes.increments))
+        return PlainForecast(network, sizes, loss=forecasts.resolve_loss("auto", changes=sizes.increments))
     lacking = [name for name in (*METHODS, "change_only") if not hasattr(network, name)]
     if lacking:
         raise TacpipeError(

@@ -129,9 +129,11 @@ class Change(ForwardModelParams):
         choice = self.architecture
         if choice == forecasts.AUTO and isinstance(start, Change):
             choice = start.architecture
-        architecture = cast("Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(choice, layout))
+        architecture = cast(
+            "Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolve_architecture(choice, layout)
+        )
         return dataclasses.replace(
-            self, architecture=architecture, loss=forecasts.resolved_loss(self.loss, changes=changes)
+            self, architecture=architecture, loss=forecasts.resolve_loss(self.loss, changes=changes)
         )
 
     def build(self, shape: ForecastShape) -> nn.Module:

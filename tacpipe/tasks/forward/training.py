@@ -148,7 +148,7 @@ def train(
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
         linear = FittedBaselines.fit(_linear(training_rows), _linear(validation_rows))
-        config["baselines"] = linear.chosen
+        config["baselines"] = linear.settings
         files[BASELINES] = save_arrays(
             {name: np.ascontiguousarray(array) for name, array in linear.to_tensors().items()}
         )

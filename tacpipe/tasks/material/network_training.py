@@ -84,7 +84,7 @@ def train_network(
     mapped_to = params.aligned_sensor
     if joint:
         _require_same_materials(training_slides, Naming.from_json(config))
-    kinds = recurrent_autoencoder.chosen(
+    kinds = recurrent_autoencoder.parse_headers(
         params.headers, {name: len(sensor_slides.layout.channels) for name, sensor_slides in training_slides.items()}
     )
     shapes = {

@@ -53,7 +53,7 @@ def fit_rockets(
         if params.baselines:
             shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= baseline_tensors(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
+            baselines |= baseline_tensors(PERMUTED_LABELS, name, strong.with_labels(frames, shuffled))
     return _files(config, tensors, baselines)
 
 
@@ -134,7 +134,7 @@ def fit_spectra(
             f"hold_out leaves no sensor that learns {Naming.from_json(config).name(missing[0])}; leave at least one."
         )
     config["spectra"] = {
-        "way_m": bands.way_m,
+        "way_m": bands.distance_m,
         "edges_per_m": bands.edges_per_m.tolist(),
         "speed_m_s": {name: sampling.speed_m_s for name, sampling in sampled.items()},
     }

@@ -115,7 +115,7 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     table, points = shard.table("grasp"), shard.table("cloud")
     try:
         require_columns(table, ["t_ns"])
-        cloud, grasp = Cloud.of(points), Grasp.of(table)
+        cloud, grasp = Cloud.from_table(points), Grasp.from_table(table)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {shard.name}: {error}") from None
     check(f"Recording {shard.name}", cloud, grasp)

@@ -16,8 +16,8 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.geometry import (
     NORMALISATIONS,
     Extent,
-    colours_normalised,
-    normalised,
+    normalise,
+    normalise_colours,
     random_rotation,
 )
 from tacpipe.clouds.grasp import Grasp, local_points
@@ -92,13 +92,13 @@ class CloudSources:
     @cached_property
     def extents(self) -> list[Extent]:
         """Extent of each cloud."""
-        return [Extent.of(cloud) for cloud in self.clouds]
+        return [Extent.from_cloud(cloud) for cloud in self.clouds]
 
     @cached_property
     def wrists(self) -> list[Floats | None]:
         """Rotation of each wrist, or its estimate."""
         if self.inputs.wrist == "estimated":
-            return [frame.estimated_wrist(grasp) for grasp in self.grasps]
+            return [frame.estimate_wrist(grasp) for grasp in self.grasps]
         return [grasp.wrist for grasp in self.grasps]
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
@@ -121,11 +121,11 @@ class CloudSources:
             wrist = None if wrist is None else rotation @ wrist
             indices = rng.choice(len(cloud), inputs.points, replace=False, shuffle=False)
             positions = np.concatenate([cloud.points_m[indices], grasp.g1_m[None], grasp.g2_m[None]]) @ rotation.T
-            positions = normalised(inputs.normalisation, positions, extent, rotation, wrist)
+            positions = normalise(inputs.normalisation, positions, extent, rotation, wrist)
             points[row, :, :3] = positions[:-2]
             if inputs.coloured:
                 assert cloud.colours is not None
-                points[row, :, 3:] = colours_normalised(inputs.normalisation, cloud.colours[indices] / 255.0, extent)
+                points[row, :, 3:] = normalise_colours(inputs.normalisation, cloud.colours[indices] / 255.0, extent)
             if inputs.grasp_numbers:
                 numbers[row, :6] = positions[-2:].ravel()
             if inputs.posed:
@@ -253,6 +253,7 @@ def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices
 
 def _grasp_features(grasps: Sequence[Grasp], with_position: bool) -> Float32s:
     rows = [
-        [grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if with_position else []) for grasp in grasps
+        [grasp.opening_m / UNIT_M] + (list(geometry.pose_features(grasp).values()) if with_position else [])
+        for grasp in grasps
     ]
     return np.array(rows, np.float32)

@@ -212,7 +212,7 @@ def limits(
             f"objects with `tacpipe label RECORDINGS NAME --label object=…`, or leave some out with --exclude."
         )
     coloured = all(cloud.colours is not None for cloud in grasps.clouds)
-    rows, _ = geometry.table(grasps.clouds, grasps.grasps, coloured=coloured)
+    rows, _ = geometry.feature_table(grasps.clouds, grasps.grasps, coloured=coloured)
     contacts_m = np.array([[grasp.g1_m, grasp.g2_m] for grasp in grasps.grasps])  # (grasp, finger, axis)
     trial = _Trial(grasps, rows, draws, trees, seed, advance or (lambda *_, **__: None))
     largest_size = max(counts.values()) * (FOLDS - 1) // FOLDS
@@ -266,7 +266,7 @@ class _Trial:
                 trained.append(len(sample))
                 for name, values in readings.items():
                     leaf = max(1, min(LEAF, len(sample) // 4))
-                    forest = Forest.fitted(
+                    forest = Forest.fit(
                         rows[name][sample], values[sample], trees=self.trees, leaf=leaf, seed=self.seed + draw
                     )
                     constant = np.tile(values[trained_on].mean(axis=0), (len(tested), 1))

@@ -159,7 +159,7 @@ class ForestMember:
         """Return the values of all targets of this member as columns (grasp, value), device counts."""
         if self.coloured:
             require_colours(grasps.names, grasps.clouds)
-        rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
+        rows, names = geometry.feature_table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
             raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
         by_target = average_by_target((group, forest.predict(rows)) for group, forest in self.forests)

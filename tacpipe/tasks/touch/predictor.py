@@ -301,7 +301,7 @@ def _load_member(
             for number, group in enumerate(description["groups"])
         )
         for group, forest in forests:
-            forest.check(len(description["features"]), sum(biotac_sp.width(target) for target in group))
+            forest.validate(len(description["features"]), sum(biotac_sp.width(target) for target in group))
         if {target for group, _ in forests for target in group} != {*targets}:
             raise ValueError(f"the forests do not predict {excerpt(targets)}")
         return members.ForestMember(

@@ -142,7 +142,9 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
     training, targets = grasps.training, grasps.targets
     if params.coloured:
         require_colours(training.names, training.clouds)
-    rows, names = geometry.table(training.clouds, training.grasps, coloured=params.coloured, placed=params.place)
+    rows, names = geometry.feature_table(
+        training.clouds, training.grasps, coloured=params.coloured, placed=params.place
+    )
     readings = {target: training.readings[target] for target in targets}
     groups: list[tuple[str, ...]] = [(target,) for target in targets]
     if params.adds_joint_forest and len(targets) > 1:
@@ -159,7 +161,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
     }
     forest_tensors: dict[str, Tensor] = {}
     for number, (_, forest) in enumerate(forests):
-        forest_tensors |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
+        forest_tensors |= {f"{number}.{name}": tensor for name, tensor in forest.to_tensors().items()}
     model.add_member(description, forest_tensors)
     if params.shrink_novel:
 
@@ -186,8 +188,8 @@ def _fit_forests(
         values = np.concatenate([readings[target] for target in group], axis=1)
         unit = members.units(values, group)
         leaf = params.leaf or _best_leaf_size(rows, values / unit, params)
-        forest = Forest.fitted(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
-        forests.append((group, forest.times(unit)))
+        forest = Forest.fit(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
+        forests.append((group, forest.scaled(unit)))
         leaves.append(leaf)
     return forests, leaves
 

@@ -116,7 +116,7 @@ def test_a_random_turn_takes_cloud_grasp_and_wrist_along(seed: int, method: str)
     turn = geometry.random_rotation(rng(seed), 180.0)  # the first that is drawn
     assert planned.wrist is not None
     np.testing.assert_allclose(numbers[6:].reshape(3, 3), turn @ planned.wrist, atol=1e-6)
-    expected = geometry.normalised(method, cloud_points @ turn.T, Extent.of(cloud(0)), turn, None)
+    expected = geometry.normalise(method, cloud_points @ turn.T, Extent.from_cloud(cloud(0)), turn, None)
     np.testing.assert_allclose(np.sort(points, axis=0), np.sort(expected, axis=0), atol=1e-5)
     if method == "none":
         ends = np.stack([planned.g1_m, planned.g2_m])
@@ -132,7 +132,7 @@ def test_in_the_wrists_axes_turns_are_not_seen() -> None:
 
 def test_an_estimated_wrist_stands_for_the_one_that_is_told() -> None:
     numbers = sources("xyzpose", wrist="estimated").fixed([0], 0)[1][0]
-    np.testing.assert_allclose(numbers[6:].reshape(3, 3), frame.estimated_wrist(grasp(0)), atol=1e-6)
+    np.testing.assert_allclose(numbers[6:].reshape(3, 3), frame.estimate_wrist(grasp(0)), atol=1e-6)
     blind = CloudSources(
         CloudInputs("xyzpose", 5, "wrist", wrist="estimated"), ["g"], [cloud(0)], [grasp(0, wrist=False)]
     )

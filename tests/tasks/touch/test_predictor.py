@@ -81,7 +81,7 @@ def test_a_tree_ensemble_predicts_the_mean_of_a_targets_own_forest_and_that_of_a
     batch = grasps(6, 1)
     (member,) = models["tree-ensemble"].members
     assert isinstance(member, members.ForestMember)
-    rows, _ = geometry.table(batch.clouds, batch.grasps, coloured=True)
+    rows, _ = geometry.feature_table(batch.clouds, batch.grasps, coloured=True)
     forest_values = [forest.predict(rows) for _, forest in member.forests]
     readings = models["tree-ensemble"].predict_grasps(batch)
     np.testing.assert_allclose(readings["pdc_th"], (forest_values[0] + forest_values[4][:, :1]) / 2)

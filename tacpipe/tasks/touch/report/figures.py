@@ -224,7 +224,7 @@ def _has_grasp(shard: Recording) -> bool:
 
 
 def _cloud_chart(shard: Recording, words: str) -> Chart:
-    cloud, grasp = Cloud.of(shard.table(CLOUD)), Grasp.of(shard.table(GRASP))
+    cloud, grasp = Cloud.from_table(shard.table(CLOUD)), Grasp.from_table(shard.table(GRASP))
     contacts_m = np.array([grasp.g1_m, grasp.g2_m])
     middle = contacts_m.mean(axis=0)
     indices = np.unique(np.linspace(0, len(cloud) - 1, POINTS).astype(int))
