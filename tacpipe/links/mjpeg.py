@@ -11,8 +11,9 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
 from tacpipe.links.link import Arrived, DescriptorLink
 from tacpipe.printable import excerpt, plain
-from tacpipe.sensors.camera import Frame, pack_frame, pack_settings, read_shape
+from tacpipe.sensors.camera import Frame, pack_frame, pack_settings
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.video.images import read_shape
 
 MAX_HEAD_BYTES = 1 << 14  # limit of the head of a response or of an image
 MAX_IMAGE_BYTES = 1 << 25

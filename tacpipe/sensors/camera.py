@@ -21,6 +21,7 @@ from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Options, Samples, Sensor
 from tacpipe.video.encoding import jpeg_format
+from tacpipe.video.images import read_shape
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -29,14 +30,6 @@ MAGIC = b"TPCF"
 FRAME, SETTINGS = b"F", b"S"
 HEAD = struct.Struct("<4scxxxIIqq")  # magic, kind, size of the content, number, stamp in us, device's time in ns
 COUNTS = 1 << 32  # modulus of the number of a frame
-START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
-END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
-PIXEL_FORMATS = {
-    (1, 1): "yuvj444p",
-    (2, 1): "yuvj422p",
-    (2, 2): "yuvj420p",
-    (1, 2): "yuvj440p",
-}  # by ratio of luma to chroma
 STATED = ("rate_hz", "stamps", "read_back", "encoding")  # options that a settings packet can contain
 Stamps = Literal["", "kernel", "server", "arrival"]
 
@@ -48,14 +41,6 @@ class Frame(NamedTuple):
     t_us: int  # on the monotonic clock of this computer
     t_device_ns: int  # on the device's clock; 0 if unknown
     content: bytes
-
-
-class ImageShape(NamedTuple):
-    """Size and pixel format in the header of a JPEG image."""
-
-    width_px: int
-    height_px: int
-    pixel_format: str  # FFmpeg's name
 
 
 def pack_frame(frame: Frame) -> bytes:
@@ -87,32 +72,6 @@ def unpack_settings(packet: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return settings if isinstance(settings, dict) else None
-
-
-def read_shape(image: bytes) -> ImageShape | None:
-    """Return the size and the pixel format of a JPEG image, or None for bytes that are not a complete JPEG image."""
-    if image[:2] != START or image.rfind(END, max(2, len(image) - END_BYTES)) < 0:
-        return None
-    place = 2
-    while place + 4 <= len(image) and image[place] == 0xFF:
-        marker, size = image[place + 1], int.from_bytes(image[place + 2 : place + 4])
-        if 0xC0 <= marker <= 0xC2:
-            return _shape_of_frame(image[place + 4 : place + 2 + size])
-        place += 2 + size
-    return None
-
-
-def _shape_of_frame(segment: bytes) -> ImageShape | None:
-    """Return the shape in a start-of-frame segment: bits, height, width, components, and the sampling of each."""
-    if len(segment) < 6 or segment[0] != 8 or len(segment) < 6 + 3 * segment[5]:
-        return None
-    height, width, components = int.from_bytes(segment[1:3]), int.from_bytes(segment[3:5]), segment[5]
-    pixel_format = "gray" if components == 1 else ""
-    if components == 3:
-        (luma_x, luma_y), (chroma_x, chroma_y) = (divmod(segment[place], 16) for place in (7, 10))
-        ratio = (luma_x // max(chroma_x, 1), luma_y // max(chroma_y, 1))
-        pixel_format = PIXEL_FORMATS.get(ratio, "")
-    return ImageShape(width, height, pixel_format) if pixel_format and width and height else None
 
 
 def options(data: Chunks) -> list[Options]:

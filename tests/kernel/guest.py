@@ -132,8 +132,9 @@ def camera() -> dict[str, Any]:
     from tacpipe.links.opening import open_link
     from tacpipe.recording.reading import LinkReader
     from tacpipe.sensors import variants
-    from tacpipe.sensors.camera import Camera, read_shape, unpack_frame, unpack_settings
+    from tacpipe.sensors.camera import Camera, unpack_frame, unpack_settings
     from tacpipe.sensors.framing import Chunks
+    from tacpipe.video.images import read_shape
 
     until = time.monotonic() + 30
     while not (ports := v4l2.cameras()) and time.monotonic() < until:

@@ -17,7 +17,8 @@ from tacpipe.links import mjpeg
 from tacpipe.links.link import LinkLostError, parse
 from tacpipe.links.mjpeg import MultipartParser
 from tacpipe.links.opening import open_link
-from tacpipe.sensors.camera import Camera, ImageShape, read_shape, unpack_frame, unpack_settings
+from tacpipe.sensors.camera import Camera, unpack_frame, unpack_settings
+from tacpipe.video.images import ImageShape, read_shape
 from tests.video import videos
 
 OK = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"

@@ -26,6 +26,7 @@ from tacpipe.formats.arrays.tree import (
     is_encoded,
     is_text,
     picture_column,
+    pixel_format,
     plain_attributes,
 )
 from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream
@@ -138,7 +139,8 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
     skipped |= long
     parts_read = []
     for part in streams_and_scalars.parts:
-        if part.frames and episodes.row_count(episode, part) and not is_encoded(tree, part.arrays[0], episode.start):
+        array, is_empty = part.arrays[0], not episodes.row_count(episode, part)
+        if part.frames and not is_empty and not pixel_format(array) and not is_encoded(tree, array, episode.start):
             skipped[part.source] = "holds pictures that are not encoded as JPEG, PNG or WebP, which are not read"
         else:
             parts_read.append(part)
@@ -196,7 +198,7 @@ def _first_rows(tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table:
 def _block_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
     """Return the number of rows read at once. It covers whole chunks, because a file cannot read less."""
     row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all_arrays)
-    if part.frames and episodes.row_count(episode, part):
+    if part.frames and episodes.row_count(episode, part) and not pixel_format(part.arrays[0]):
         row_bytes += encoded_size(tree, part.arrays[0], episode.start)
     rows = max(1, BLOCK_BYTES // row_bytes)
     chunk_rows = max(array.chunk_rows for array in part.all_arrays)

@@ -13,7 +13,15 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, Tree, is_frames, reason_left_out, walk
+from tacpipe.formats.arrays.tree import (
+    ArrayDescription,
+    StoredAttributes,
+    Tree,
+    is_frames,
+    pixel_format,
+    reason_left_out,
+    walk,
+)
 from tacpipe.formats.container import Time, TimeUnit
 from tacpipe.io import memory
 from tacpipe.printable import plain
@@ -167,7 +175,7 @@ class StreamArrays:
     source: str
     arrays: Sequence[ArrayDescription]
     time: ArrayDescription | None
-    frames: bool = False  # whether its only array contains encoded images
+    frames: bool = False  # whether its only array contains images
 
     @property
     def all_arrays(self) -> Sequence[ArrayDescription]:
@@ -244,7 +252,7 @@ def _divide_by_length(
     single_streams = [
         array
         for array in arrays
-        if array.dtype.kind == "V" or (is_frames(array) and "quantity" not in array.attributes)
+        if array.dtype.kind == "V" or pixel_format(array) or (is_frames(array) and "quantity" not in array.attributes)
     ]
     by_length: dict[int, list[ArrayDescription]] = {}
     for array in arrays:
@@ -261,7 +269,8 @@ def _divide_by_length(
         time = _clock_array(
             by_length.get(array.shape[0], []), [clock for clock in above if clock.shape[0] == array.shape[0]]
         )
-        yield StreamArrays(episode.inside(array.path), [array], time, is_frames(array))
+        is_picture = is_frames(array) or pixel_format(array) is not None
+        yield StreamArrays(episode.inside(array.path), [array], time, is_picture)
 
 
 def _clock_array(same: Sequence[ArrayDescription], above: Sequence[ArrayDescription]) -> ArrayDescription | None:

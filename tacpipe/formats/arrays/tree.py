@@ -1,7 +1,7 @@
 """A tree of named arrays, as HDF5 and Zarr have it, and its arrays as columns, one per value of a row.
 
-Columns have quantity, unit and place in the metadata of the field. Encoded pictures are one column of bytes: elements of
-their own length, or rows padded with zeros, as in ALOHA.
+Columns have quantity, unit and place in the metadata of the field. Pictures are one column of bytes. Encoded ones are
+elements of their own length, or rows padded with zeros, as in ALOHA. Decoded ones are the pixels of a row of the array.
 """
 
 from __future__ import annotations
@@ -20,12 +20,16 @@ from tacpipe.formats.table import column_names
 from tacpipe.formats.table.column_names import ColumnMeaning
 from tacpipe.io import memory
 from tacpipe.printable import plain
+from tacpipe.video.images import PICTURE, raw_format
+from tacpipe.video.stream import MAX_SIDE_PX, VideoFormat
 
 MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
 MAX_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
 IMAGE_SIDE = 32  # pixels that a picture has at least
 IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
 COLOURS = (1, 3, 4)  # channels of a picture
+ENCODINGS = {(1, "u1"): "mono8", (3, "u1"): "rgb8", (4, "u1"): "rgba8", (1, "u2"): "mono16"}  # by channels and type
+DERIVED = "derived_from"  # attribute of an array that repeats another one, with its name
 
 
 # value of an attribute: of HDF5 as h5py and numpy give it, of Zarr as JSON
@@ -152,6 +156,23 @@ def is_frames(array: ArrayDescription) -> bool:
     return array.dtype == np.uint8 and len(array.shape) == 2 and _named_as_image(array.path)
 
 
+def pixel_format(array: ArrayDescription) -> VideoFormat | None:
+    """Return the format of decoded images, or None if the array has none or their type is no pixel format.
+
+    >>> pixel_format(ArrayDescription("obs/agentview_image", (9, 84, 64, 3), np.dtype("uint8"))).describe()
+    'rawvideo, 64 x 84 pixels'
+    """
+    if not is_image(array) or len(array.shape) > 4:
+        return None
+    height, width, colours = array.shape[1:] if len(array.shape) == 4 else (*array.shape[1:], 1)
+    if colours not in COLOURS:
+        colours, height, width = height, width, colours  # (time, colour, row, column), as in PyTorch
+    encoding = ENCODINGS.get((colours, f"{array.dtype.kind}{array.dtype.itemsize}"))
+    if encoding is None or max(height, width) > MAX_SIDE_PX:
+        return None
+    return raw_format(encoding, width, height, big_endian=array.dtype.byteorder == ">")
+
+
 def is_image(array: ArrayDescription) -> bool:
     """Return whether an array contains one decoded image per row.
 
@@ -170,13 +191,18 @@ def is_image(array: ArrayDescription) -> bool:
 def reason_left_out(array: ArrayDescription) -> str:
     """Return why an array is not read as columns, as in "NAME …", or empty if it is.
 
-    >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
-    'holds decoded pictures (480 x 640 x 3), which are not read'
+    >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("float32")))
+    'holds decoded pictures (480 x 640 x 3) of float32; uint8 and, without colours, uint16 are read'
     """
     if array.problem:
         return array.problem
+    if DERIVED in array.attributes:
+        return f"repeats {plain(str(array.attributes[DERIVED]))}"
     if is_image(array):
-        return f"holds decoded pictures ({' x '.join(map(str, array.shape[1:]))}), which are not read"
+        if pixel_format(array) is not None:
+            return ""
+        shape = " x ".join(map(str, array.shape[1:]))
+        return f"holds decoded pictures ({shape}) of {array.dtype}; uint8 and, without colours, uint16 are read"
     if array.dtype.kind not in "biufSUOTV" or (array.dtype.itemsize > 8 and array.dtype.kind == "f"):
         return f"has the type {array.dtype}, which is not read"
     if array.dtype.kind == "O" and not is_text(array) and not is_frames(array):
@@ -218,7 +244,6 @@ def _named_as_image(path: str) -> bool:
     return any(word in path.lower() for word in IMAGE_NAMES)
 
 
-PICTURE = "data"  # column name, the same as for image messages
 MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # image formats by their first bytes
 
 
@@ -242,7 +267,13 @@ def encoded_size(tree: Tree, array: ArrayDescription, row: int) -> int:
 
 
 def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field, pa.Array]:
-    """Return field and values of an image column: the bytes as written, without trailing zeros."""
+    """Return field and values of an image column: the bytes as written without trailing zeros, or the pixels."""
+    video_format = pixel_format(array)
+    if video_format is not None:
+        if values.ndim == 4 and values.shape[-1] not in COLOURS:
+            values = np.moveaxis(values, 1, -1)
+        pixels = [np.ascontiguousarray(image).tobytes() for image in values]
+        return pa.field(PICTURE, pa.binary(), metadata=video_format.to_metadata()), pa.array(pixels, pa.binary())
     pictures = picture_array(array, values)
     kind = next(filter(None, (picture_encoding(picture.as_py()) for picture in pictures)), "")
     about = {"quantity": "image", **({"encoding": kind} if kind else {})}

@@ -21,6 +21,7 @@ import pyarrow as pa
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.bags import mcap_file, ros, ros_files
+from tacpipe.formats.bags.images import declare_images
 from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Record, TopicConnection
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
 from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
@@ -349,9 +350,10 @@ class _BagReading:
                 rows = None if self.ended_early else topic_stream.content.rows
                 exported = self.exported.get(topic)
                 name = exported.stream if exported is not None and exported.stream else source
-                streams_with_origin.append(
-                    (exported, SourceStream(source, name, topic_stream.time, topic_stream.content, rows))
-                )
+                content = topic_stream.content
+                if exported is None:
+                    content = declare_images(content, self.types[topic])
+                streams_with_origin.append((exported, SourceStream(source, name, topic_stream.time, content, rows)))
                 if topic_stream.note:
                     self.notes.append(f"{plain(source)}: {topic_stream.note}; its log times are used.")
         if self.undescribed:

@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
-from tacpipe.formats.arrays.tree import PICTURE as PICTURE
 from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import EpisodeDescription, FeatureDescription, LeRobotDescription
@@ -32,6 +31,7 @@ from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.video.files import VideoScan, packet_stream, read_packets, scan
+from tacpipe.video.images import PICTURE
 from tacpipe.video.stream import cut_rows
 
 NATIVE = "tacpipe"  # folder with the original streams of an exported dataset, one folder per recording

@@ -29,6 +29,7 @@ from tacpipe.plugins.stage import Shared
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
 from tacpipe.video import files as video_files
+from tacpipe.video.images import frames_from_images
 
 RUN_ROWS = 1 << 21  # number of rows sorted at once
 MAX_CHANNELS = 1 << 14  # a column with more distinct names does not contain channels
@@ -166,7 +167,7 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 
     If the layout's ``stream`` sets neither time nor columns, the container's declarations apply. Metadata of the time
-    column are copied to ``t_ns``. Raises the errors of `stream_batches`.
+    column are copied to ``t_ns``. A column of images becomes packets. Raises the errors of `stream_batches`.
     """
     stream = stream if stream.time.is_declared else replace(stream, time=source.time)
     if not stream.time.is_declared:
@@ -185,7 +186,8 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
     time_metadata = {key: value for key, value in about.items() if key not in ("unit", "quantity")}
     reader = _batches(file, stream, None, declared, time_metadata)
-    return reader.read_all() if isinstance(source.content, pa.Table) else reader
+    table_or_reader = reader.read_all() if isinstance(source.content, pa.Table) else reader
+    return frames_from_images(table_or_reader, f"{path}, {plain(source.source)}", stream.time.rate_hz)
 
 
 def _batches(

@@ -15,7 +15,7 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.plugins import extras
-from tacpipe.sensors.camera import Camera, read_shape, unpack_frame
+from tacpipe.sensors.camera import Camera, unpack_frame
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, gel
 from tacpipe.simulation.emulation.network import HOST, Connection, Tcp
@@ -24,6 +24,7 @@ from tacpipe.simulation.emulation.world import Cycle, World
 from tacpipe.video import files
 from tacpipe.video.decoding import jpeg_images
 from tacpipe.video.encoding import encode_images, jpeg_format
+from tacpipe.video.images import read_shape
 
 BOUNDARY = b"tacpipe-frame"
 PATH = "/stream"

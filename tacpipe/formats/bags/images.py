@@ -1,0 +1,74 @@
+"""Declare the images in messages of ROS and Foxglove, so that they become streams of frames."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+
+from tacpipe.formats.container import Batched
+from tacpipe.video.images import PICTURE, RAW_FORMATS, raw_format
+
+COMPRESSED = "CompressedImage"
+RAW = ("Image", "RawImage")
+LAYOUT = ("height", "width", "encoding", "is_bigendian", "step")  # columns of raw images; Foxglove has no is_bigendian
+
+
+def declare_images(content: Batched, message_type: str) -> Batched:
+    """Return the rows of a topic with the quantity image at the data of image messages.
+
+    Raw images are without padding, and columns that describe them become metadata, if all of them are alike and have
+    pixels that can be decoded. Other rows stay as they are.
+    """
+    name = message_type.replace(".", "/").rpartition("/")[2]
+    schema = content.schema
+    if PICTURE not in schema.names or not pa.types.is_binary(schema.field(PICTURE).type):
+        return content
+    if name == COMPRESSED:
+        return _with_metadata(content, {"quantity": "image"})
+    return _raw_images(content) if name in RAW else content
+
+
+def _with_metadata(content: Batched, metadata: dict[str, str], left_out: tuple[str, ...] = ()) -> Batched:
+    """Return rows with metadata at the images and without some columns."""
+    fields = [
+        field.with_metadata({**(field.metadata or {}), **metadata}) if field.name == PICTURE else field
+        for field in content.schema
+        if field.name not in left_out
+    ]
+    schema = pa.schema(fields)
+    return content.mapped(schema, lambda table: pa.table([table.column(field.name) for field in fields], schema))
+
+
+def _raw_images(content: Batched) -> Batched:
+    """Return rows of raw images; unchanged if images differ in layout, or if their encoding cannot be decoded."""
+    present = [name for name in LAYOUT if name in content.schema.names]
+    if not {"height", "width", "encoding", "step"} <= set(present):
+        return content
+    layouts = {
+        tuple(layout.values())
+        for table in content.read()
+        for layout in table.select(present).group_by(present).aggregate([]).to_pylist()
+    }
+    if len(layouts) != 1:
+        return content
+    layout = dict(zip(present, layouts.pop(), strict=True))
+    width, height, step = int(layout["width"]), int(layout["height"]), int(layout["step"])
+    video_format = raw_format(layout["encoding"], width, height, big_endian=bool(layout.get("is_bigendian")))
+    if video_format is None:
+        return content
+    row_bytes = width * RAW_FORMATS[layout["encoding"]][1]
+    sizes = {len(image) for table in content.read() for image in table.column(PICTURE).to_pylist()}
+    if step < row_bytes or sizes != {step * height}:
+        return content
+    declared = _with_metadata(content, video_format.to_metadata(), tuple(present))
+    if step == row_bytes:
+        return declared
+
+    def without_padding(table: pa.Table) -> pa.Table:
+        images = [
+            b"".join(image[start : start + row_bytes] for start in range(0, step * height, step))
+            for image in table.column(PICTURE).to_pylist()
+        ]
+        at = table.schema.get_field_index(PICTURE)
+        return table.set_column(at, table.schema.field(at), pa.array(images, pa.binary()))
+
+    return declared.mapped(declared.schema, without_padding)
