@@ -21,7 +21,7 @@ from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, MAX_SIDE_PX, PACKET
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Int64s
+    from tacpipe.arrays import AnyArray, ArrayType, Int64s
 
 START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
 END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
@@ -90,6 +90,8 @@ RAW_FORMATS = {
     **{"bayer_bggr8": ("bayer_bggr8", 1), "bayer_gbrg8": ("bayer_gbrg8", 1), "bayer_grbg8": ("bayer_grbg8", 1)},
 }  # pixel format and bytes per pixel by the encoding of a ROS image
 _TWO_BYTES = ("gray16", "rgb48", "bgr48")
+COLOURS = (1, 3, 4)  # number of colours of a decoded image
+ENCODINGS = {(1, "u1"): "mono8", (3, "u1"): "rgb8", (4, "u1"): "rgba8", (1, "u2"): "mono16"}  # by colours and type
 
 
 def raw_format(encoding: str, width_px: int, height_px: int, *, big_endian: bool = False) -> VideoFormat | None:
@@ -104,6 +106,28 @@ def raw_format(encoding: str, width_px: int, height_px: int, *, big_endian: bool
     if pixel_format in _TWO_BYTES:
         pixel_format += "be" if big_endian else "le"
     return VideoFormat(RAW, width_px, height_px, pixel_format, MICROSECOND)
+
+
+def array_format(shape: tuple[int, ...], kind: ArrayType) -> VideoFormat | None:
+    """Return the format of decoded images (frame, row, column), or with colours last or after the frame; else None.
+
+    >>> array_format((9, 3, 48, 64), np.dtype("uint8")).describe()
+    'rawvideo, 64 x 48 pixels'
+    """
+    if len(shape) not in (3, 4):
+        return None
+    height, width, colours = shape[1:] if len(shape) == 4 else (*shape[1:], 1)
+    if colours not in COLOURS:
+        colours, height, width = height, width, colours  # (frame, colour, row, column), as in PyTorch
+    encoding = ENCODINGS.get((colours, f"{kind.kind}{kind.itemsize}"), "")
+    return raw_format(encoding, width, height, big_endian=kind.byteorder == ">")
+
+
+def raw_images(images: AnyArray) -> list[bytes]:
+    """Return the pixels of each decoded image, row by row with its colours together, as `array_format` describes them."""
+    if images.ndim == 4 and images.shape[-1] not in COLOURS:
+        images = np.moveaxis(images, 1, -1)
+    return [np.ascontiguousarray(image).tobytes() for image in images]
 
 
 def image_format(image: bytes) -> VideoFormat | None:

@@ -20,15 +20,13 @@ from tacpipe.formats.table import column_names
 from tacpipe.formats.table.column_names import ColumnMeaning
 from tacpipe.io import memory
 from tacpipe.printable import plain
-from tacpipe.video.images import PICTURE, raw_format
-from tacpipe.video.stream import MAX_SIDE_PX, VideoFormat
+from tacpipe.video.images import COLOURS, PICTURE, array_format, raw_images
+from tacpipe.video.stream import VideoFormat
 
 MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
 MAX_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
 IMAGE_SIDE = 32  # pixels that a picture has at least
 IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
-COLOURS = (1, 3, 4)  # channels of a picture
-ENCODINGS = {(1, "u1"): "mono8", (3, "u1"): "rgb8", (4, "u1"): "rgba8", (1, "u2"): "mono16"}  # by channels and type
 DERIVED = "derived_from"  # attribute of an array that repeats another one, with its name
 
 
@@ -162,15 +160,7 @@ def pixel_format(array: ArrayDescription) -> VideoFormat | None:
     >>> pixel_format(ArrayDescription("obs/agentview_image", (9, 84, 64, 3), np.dtype("uint8"))).describe()
     'rawvideo, 64 x 84 pixels'
     """
-    if not is_image(array) or len(array.shape) > 4:
-        return None
-    height, width, colours = array.shape[1:] if len(array.shape) == 4 else (*array.shape[1:], 1)
-    if colours not in COLOURS:
-        colours, height, width = height, width, colours  # (time, colour, row, column), as in PyTorch
-    encoding = ENCODINGS.get((colours, f"{array.dtype.kind}{array.dtype.itemsize}"))
-    if encoding is None or max(height, width) > MAX_SIDE_PX:
-        return None
-    return raw_format(encoding, width, height, big_endian=array.dtype.byteorder == ">")
+    return array_format(array.shape, array.dtype) if is_image(array) else None
 
 
 def is_image(array: ArrayDescription) -> bool:
@@ -270,10 +260,8 @@ def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field,
     """Return field and values of an image column: the bytes as written without trailing zeros, or the pixels."""
     video_format = pixel_format(array)
     if video_format is not None:
-        if values.ndim == 4 and values.shape[-1] not in COLOURS:
-            values = np.moveaxis(values, 1, -1)
-        pixels = [np.ascontiguousarray(image).tobytes() for image in values]
-        return pa.field(PICTURE, pa.binary(), metadata=video_format.to_metadata()), pa.array(pixels, pa.binary())
+        pixels = pa.array(raw_images(values), pa.binary())
+        return pa.field(PICTURE, pa.binary(), metadata=video_format.to_metadata()), pixels
     pictures = picture_array(array, values)
     kind = next(filter(None, (picture_encoding(picture.as_py()) for picture in pictures)), "")
     about = {"quantity": "image", **({"encoding": kind} if kind else {})}

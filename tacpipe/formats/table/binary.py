@@ -23,16 +23,21 @@ import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
+from tacpipe.formats.container import Batched, SourceStream, Time
 from tacpipe.formats.table import text
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
-from tacpipe.printable import plain
+from tacpipe.printable import listed, plain
+from tacpipe.video.images import PICTURE, array_format, raw_images
+from tacpipe.video.stream import VideoFormat
 
 BATCH_ROWS = 1 << 18  # maximum number of rows in a batch of a Parquet file
 BLOCK_BYTES = 1 << 24  # size of a block of JSON lines or arrays
 READ_BYTES = 1 << 20  # bytes read at once per Parquet column, whatever the size of row groups
 MAX_COLUMNS = 1 << 20  # maximum number of columns per array
+MAX_PIXELS = 1 << 28  # maximum number of values per decoded image
+STREAM_COLUMNS = 4096  # maximum number of values per row of an array that is guessed to be channels
 MAX_LINE_BYTES = 1 << 26  # maximum size of a JSON object
 _NOT_BLANK = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
@@ -112,6 +117,43 @@ class NumpyArchive:
     def arrays(self) -> Mapping[str, ArrayMember]:
         """Return the arrays with rows by name."""
         return self._arrays
+
+    def frames(self, array: str, clock: str) -> SourceStream:
+        """Return the images of an array as a column of raw pixels, with the array ``clock`` of timestamps if it is given.
+
+        Raises `TacpipeError` if the file lacks an array, or the array is no images.
+        """
+        names = [array, *([clock] if clock else [])]
+        missing = [name for name in names if name not in self._arrays]
+        if missing:
+            raise TacpipeError(
+                f"{self.path} has no array {plain(missing[0])}; it has {listed(self._arrays, 6)}. Correct the layout."
+            )
+        arrays = {name: self._arrays[name] for name in names}
+        images = arrays[array]
+        video_format = images.video_format
+        if video_format is None:
+            shape = " x ".join(map(str, images.shape))
+            raise TacpipeError(
+                f"{self.path}: {plain(array)} ({shape}, {images.dtype}) is no images: uint8 (frame, row, column, rgb) or "
+                f"(frame, row, column), or uint16 (frame, row, column)."
+            )
+        self._expect_same_length(arrays)
+        clocks = [] if not clock else [pa.field(clock, pa.from_numpy_dtype(arrays[clock].dtype.newbyteorder("=")))]
+        schema = pa.schema([*clocks, pa.field(PICTURE, pa.binary(), metadata=video_format.to_metadata())])
+        rows = max(1, BLOCK_BYTES // max(1, images.row_bytes))
+
+        def read() -> Iterator[pa.Table]:
+            with contextlib.ExitStack() as stack, self._reading():
+                archive = stack.enter_context(self._archive())
+                readers = {name: stack.enter_context(member.reading(archive)) for name, member in arrays.items()}
+                for start in range(0, images.rows, rows):
+                    blocks = {name: read_rows(min(rows, images.rows - start)) for name, read_rows in readers.items()}
+                    pixels = raw_images(blocks[array].reshape(-1, *images.row_shape))
+                    stamps = [_column(blocks, clock, None)] if clock else []
+                    yield pa.table([*stamps, pa.array(pixels, pa.binary())], schema)
+
+        return SourceStream(array, array, Time(column=clock), Batched(schema, images.rows, read), images.rows)
 
     @functools.cached_property
     def _arrays(self) -> dict[str, ArrayMember]:
@@ -198,8 +240,10 @@ class ArrayMember:
         if shape and time_axis >= len(shape):
             raise ValueError(f"{member.filename} has the shape {shape}, without a dimension {time_axis} (time_axis)")
         width = math.prod(size for axis, size in enumerate(shape) if axis != time_axis)
-        if width > MAX_COLUMNS:
-            raise ValueError(f"{member.filename} has {width:,} values a row, {MAX_COLUMNS:,} are allowed")
+        row_shape = (*shape[:time_axis], *shape[time_axis + 1 :])
+        limit = MAX_COLUMNS if array_format((1, *row_shape), dtype) is None else MAX_PIXELS
+        if width > limit:
+            raise ValueError(f"{member.filename} has {width:,} values a row, {limit:,} are allowed")
         name = member.filename.removesuffix(".npy")
         return cls(name, member.filename, shape, columnwise and len(shape) > 1, dtype, time_axis)
 
@@ -222,6 +266,16 @@ class ArrayMember:
     def row_bytes(self) -> int:
         """The size of a row in bytes."""
         return math.prod(self.row_shape) * self.dtype.itemsize
+
+    @property
+    def video_format(self) -> VideoFormat | None:
+        """The format of decoded images, or None if the array cannot be images."""
+        return array_format((self.rows, *self.row_shape), self.dtype)
+
+    @property
+    def is_pictures(self) -> bool:
+        """Whether the array is images with more values than a table has columns."""
+        return self.video_format is not None and (self.width or 0) > STREAM_COLUMNS
 
     @contextlib.contextmanager
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:

@@ -201,13 +201,17 @@ def read_sample(path: Path) -> FileSample:
     file = binary.open_table(path, kind)
     if isinstance(file, binary.NumpyArchive):
         file = replace(file, time_axis=_time_axis(file.arrays()))
-        return replace(_first_rows(file), arrays=file.arrays())
+        arrays = file.arrays()
+        pictures = tuple(name for name, array in arrays.items() if array.is_pictures)
+        return replace(_first_rows(file, pictures), arrays=arrays)
     return _first_rows(file)
 
 
-def _first_rows(file: binary.ParquetFile | binary.NumpyArchive | binary.JsonLines | Workbook) -> FileSample:
-    """Return the columns and first rows of a file that is not text."""
-    names = file.names()
+def _first_rows(
+    file: binary.ParquetFile | binary.NumpyArchive | binary.JsonLines | Workbook, pictures: Sequence[str] = ()
+) -> FileSample:
+    """Return the columns and first rows of a file that is not text, without the arrays ``pictures``."""
+    names = [name for name in file.names() if not any(belongs_to(name, array) for array in pictures)]
     if isinstance(file, binary.JsonLines):
         columns = {name: file.head().column(name) for name in file.head().column_names}
     elif isinstance(file, binary.NumpyArchive):  # its arrays may differ in length

@@ -167,6 +167,15 @@ def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
 
 def _by_length(group: _FileGroup) -> list[_FileGroup]:
     """Return one stream per length of the arrays in a file; files without arrays are one stream."""
+    pictures = [name for name, array in group.first.arrays.items() if array.is_pictures]
+    if pictures:
+        others = [name for name in group.first.arrays if name not in pictures]
+        clock = file_sample.time_column(group.first.only(others)) if others else None
+        streams = [_picture_group(group, name, clock) for name in pictures]
+        if set(others) - {clock}:
+            rest = replace(group, first=group.first.only(others), skipped=tuple(pictures))
+            streams += _by_length(rest)
+        return streams
     by_length: dict[int, list[str]] = {}
     for name, array in group.first.arrays.items():
         by_length.setdefault(array.rows, []).append(name)
@@ -179,6 +188,17 @@ def _by_length(group: _FileGroup) -> list[_FileGroup]:
         stream = re.sub(r"\W", "_", widest) if widest.isascii() and not widest[0].isdigit() else group.stream
         groups.append(replace(group, stream=stream, first=group.first.only(names), skipped=skipped))
     return groups
+
+
+def _picture_group(group: _FileGroup, array: str, clock: str | None) -> _FileGroup:
+    """Return the stream of an array of decoded images, with the timestamps of the array ``clock`` in the same file."""
+    video_format = group.first.arrays[array].video_format
+    assert video_format is not None
+    time = f'{{ rate_hz = "{UNKNOWN}" }}' if clock is None else file_sample.time_entry(group.first, clock)
+    entries = (f"array = {quoted(array)}  # {video_format.describe()}", f"time = {time}")
+    stream = re.sub(r"\W", "_", array) if array.isascii() and not array[0].isdigit() else group.stream
+    sample = FileSample((), {}, frames=group.first.arrays[array].rows)
+    return replace(group, stream=stream, first=sample, camera=entries)
 
 
 def _with_stamps(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:

@@ -124,6 +124,7 @@ class StreamLayout:
     encoding: str = "utf-8"  # text files only
     sheet: str = ""  # workbooks only; empty for the first sheet
     time_axis: NonNegativeInt = 0  # arrays only: axis of the rows
+    array: str = ""  # NPZ and NPY only: name of an array of decoded images, each of which is a row
     skip_lines: NonNegativeInt = 0  # number of lines above the header
     missing: tuple[str, ...] = ()  # cells that mean a missing value (NaN)
     recording: str = ""  # column with the recording's name, if a file contains several recordings
@@ -373,6 +374,8 @@ def _expect_required(values: Values, place: str, container: Format | None) -> No
             raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{values["format"]}".')
         return
     camera = camera_format(values.get("format"), values.get("files"))
+    if values.get("array"):
+        _expect_images(values, place)
     if values.get("source"):
         raise UsageError(f"{place}: source is for containers ({', '.join(KINDS)}). Set format to one of them.")
     if "files" not in values:
@@ -385,7 +388,7 @@ def _expect_required(values: Values, place: str, container: Format | None) -> No
             f'{place}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
             "{ rate_hz = 100 }."
         )
-    if not values.get("columns"):
+    if not values.get("columns") and not values.get("array"):
         raise UsageError(f'{place}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
 
 
@@ -398,6 +401,19 @@ def camera_format(kind: object, files: object) -> str:
     if kind is None and isinstance(files, str):
         kind = "video" if extension(Path(files)) in DEMUXERS else None
     return str(kind) if kind in CAMERA else ""
+
+
+def _expect_images(values: Values, place: str) -> None:
+    """Raise `UsageError` for an array of images in a file that is not NPZ or NPY, or with entries of tables."""
+    files = values.get("files")
+    kind = values.get("format") or (EXTENSIONS.get(extension(Path(files))) if isinstance(files, str) else None)
+    if kind not in ("npz", "npy"):
+        raise UsageError(f"{place}: array is for npz and npy. Use source for HDF5 and Zarr, and format for images.")
+    table_entries = [name for name in ("columns", "recording", "long") if values.get(name)]
+    if table_entries:
+        raise UsageError(
+            f"{place}: {table_entries[0]} is for tables. A stream of images has a row per frame; remove it."
+        )
 
 
 def _expect_camera(values: Values, place: str, camera: str) -> None:

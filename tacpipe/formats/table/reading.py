@@ -19,7 +19,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.container import SourceStream
-from tacpipe.formats.table import columns, rows, stamps
+from tacpipe.formats.table import binary, columns, rows, stamps
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout
 from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
@@ -378,6 +378,23 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
     if frames is None:
         return video_files.read_images(images, t_ns, origin)
     return video_files.read_stream(path, frames, t_ns, origin)
+
+
+def image_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = None) -> pa.RecordBatchReader:
+    """Return the images of an array in an NPZ or NPY file as frames with ``t_ns``, read on demand.
+
+    Timestamps come from ``stamps_path`` if the layout names a timestamp file, else from another array or the rate.
+    Raises `TacpipeError` if the array is no images, or if the number of timestamps differs.
+    """
+    file = binary.open_table(path, stream.format_of(path), stream.time_axis)
+    assert isinstance(file, binary.NumpyArchive)
+    source = file.frames(stream.array, "" if stamps_path else stream.time.column)
+    if stamps_path is None:
+        return read_contained_stream(path, source, stream)
+    stamps_ns = rows.stamps_of_file(stamps_path, stream)
+    rows_of_file = ContainedRows(path, source)
+    frames = _batches(rows_of_file, stream, None, {field.name: field for field in source.schema}, {}, None, stamps_ns)
+    return frames_from_images(frames, f"{path}, {plain(source.source)}")
 
 
 def image_paths(folder: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from tacpipe.formats.container import (
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
 from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout, extension
-from tacpipe.formats.table.reading import camera_batches, read_contained_stream, stream_batches
+from tacpipe.formats.table.reading import camera_batches, image_batches, read_contained_stream, stream_batches
 from tacpipe.io import files as file_system
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
@@ -274,6 +274,8 @@ def read_streams(
             continue
         if stream.camera:
             tables[stream.name] = camera_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"))
+        elif stream.array:
+            tables[stream.name] = image_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"))
         elif stream.contained:
             contained_streams.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
