@@ -27,7 +27,7 @@ SYNCHRONIZE = "synchronize"
 ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these quantities belongs to a robot
 TARGETS = "target_"  # prefix of the quantities of a robot's commands
 CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are not signals
-TACTILE, LATENT = "tactile", "latent"
+TACTILE, LATENT, IMAGE = "tactile", "latent", "image"
 _NO_FRAMES = "it has no value in each frame, as images, text and single rows have none"
 
 
@@ -107,19 +107,28 @@ def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Cont
     return list(stream.shared), replace(described, losses={**described.losses, sentence: list(stream.recordings)})
 
 
-def add_frame_losses(described: Contents, recordings: Dataset, originals: Dataset, retained: str = "") -> Contents:
+def add_frame_losses(
+    described: Contents,
+    recordings: Dataset,
+    originals: Dataset,
+    retained: str = "",
+    videos: Sequence[str] = (),
+) -> Contents:
     """Return ``described`` with the streams and columns that the frames lack added to its losses.
 
-    ``originals`` are the recordings before this export synchronized them; ``retained`` ends each sentence.
+    ``originals`` are the recordings before this export synchronized them; ``retained`` ends each sentence. Streams of
+    ``videos`` are not in the frames, but in the export.
     """
     losses = []
     for recording in recordings:
         original = originals[recording.name]
         if set(original.streams) == {""}:  # the user synchronized it
             names = str(recording.attributes.get(LEFT_OUT) or "").split(", ")
+            names += [channel.stream for channel in channels(recording.columns()) if channel.quantity == IMAGE]
             losses += [(recording.name, Loss(_NO_FRAMES, stream)) for stream in names if stream]
             continue
-        columns = [(stream, name) for stream in original.streams for name in original.columns(stream).schema.names]
+        streams = [stream for stream in original.streams if stream not in videos]
+        columns = [(stream, name) for stream in streams for name in original.columns(stream).schema.names]
         carried = [(channel.stream, channel.short) for channel in channels(recording.columns())]
         carried += [(stream, TIME) for stream in original.streams]
         losses += [

@@ -29,12 +29,14 @@ from tacpipe.exports.lerobot_features import (
     STATISTICS_TABLE,
     FrameFeature,
     Params,
+    Stats,
     column_statistics,
     dataset_statistics,
     episode_statistics,
     features_of_frames,
     index_statistics,
 )
+from tacpipe.exports.lerobot_videos import Camera, CameraJson, EpisodeVideo, combine_statistics, find_cameras
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Result, stage
 from tacpipe.printable import listed, plain
 
@@ -51,6 +53,7 @@ VERSION = "v3.0"
 RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the attributes are JSON
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns with indices of frames
 GROUP_FRAMES = 1 << 17  # maximum number of frames of an episode in memory; a longer episode has several row groups
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's limits
 _PLACE = re.compile(r"\{([^{}]+)\}")
 _OPENING = """
@@ -62,7 +65,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 dataset = LeRobotDataset("tacpipe/export", root="EXPORT")
 ```
 
-`observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit. `tacpipe.t_ns` is the time of a
+`observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit, `observation.images.STREAM` a
+camera: the nearest frame in time. `tacpipe.t_ns` is the time of a
 frame in nanoseconds of UTC, `tacpipe.held.STREAM` and `tacpipe.gap.STREAM` mark frames in which a sensor repeated its last
 value or sent nothing, `tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has unit and
 quantity of each column.
@@ -81,7 +85,7 @@ def shards(params: Params) -> str:
     return ORIGINALS if params.originals else ""
 
 
-@stage(version=2, reads=("grid", "grid_rate_hz"))
+@stage(version=3, reads=("grid", "grid_rate_hz"))
 def part(params: Params, recording: Recording) -> RecordingOutput:
     """Return the statistics of each feature of one recording."""
     import pyarrow as pa
@@ -104,7 +108,7 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 
-@stage(version=2, part=part, first=first, originals=shards)
+@stage(version=3, part=part, first=first, originals=shards)
 def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
     """Write recordings as a LeRobot dataset (v3.0).
 
@@ -118,10 +122,22 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     all_recordings = list(recordings)
     fps = frames.common_rate_hz(all_recordings)
     columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
-    described = frames.add_frame_losses(described, recordings, originals, _shards_note(params))
+    cameras, losses = find_cameras(originals)
+    described = frames.add_frame_losses(
+        described, recordings, originals, _shards_note(params), [camera.stream for camera in cameras]
+    )
     frame_features = features_of_frames(params, frames.synchronized_columns(all_recordings[0]).select(columns))
     tasks = _tasks(params, all_recordings)
     lengths = {recording.name: _row_count(parts, recording.name) for recording in all_recordings}
+    videos = {
+        recording.name: {
+            camera.name: EpisodeVideo.from_recordings(
+                camera, originals[recording.name], frames.synchronized_columns(recording), params.video_codec, fps
+            )
+            for camera in cameras
+        }
+        for recording in all_recordings
+    }
     bundles = list(_group_by_size(all_recordings, lengths, sum(feature.frame_bytes for feature in frame_features)))
     files: dict[str, Content] = {}
     written: dict[str, Callable[[Any], object]] = {}
@@ -136,14 +152,26 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
         episodes = _Episodes(columns, frame_features, bundle, number, starts, tasks, fps)
         written[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = episodes.write
         number += len(bundle)
+    for episode, recording in enumerate(all_recordings):
+        for camera in cameras:
+            video = videos[recording.name][camera.name]
+            chunk, file = divmod(episode, CHUNK_FILES)
+            place = VIDEO_PATH.format(video_key=camera.name, chunk_index=chunk, file_index=file)
+            written[place] = video.write
+            losses += [(recording.name, loss) for loss in video.losses(camera.stream, _shards_note(params))]
+    described = replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
+    colours = {name: {key: video.statistics() for key, video in by_key.items()} for name, by_key in videos.items()}
     files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
-        frame_features, all_recordings, parts, originals, starts, places, lengths, tasks, fps
+        frame_features, all_recordings, parts, originals, starts, places, lengths, tasks, fps, colours
     )
     files["meta/tasks.parquet"] = _task_table(tasks)
-    files["meta/info.json"] = _json_bytes(_info(params, frame_features, lengths, tasks, fps))
+    files["meta/info.json"] = _json_bytes(_info(params, frame_features, cameras, lengths, tasks, fps))
     order = _task_order(tasks)
     indices = {name: order[task] for name, task in tasks.items()}
-    files["meta/stats.json"] = _json_bytes(dataset_statistics(parts, frame_features, starts, lengths, indices, fps))
+    statistics = dataset_statistics(parts, frame_features, starts, lengths, indices, fps)
+    for camera in cameras:
+        statistics[camera.name] = combine_statistics([by_key[camera.name] for by_key in colours.values()])
+    files["meta/stats.json"] = _json_bytes(statistics)
     files["meta/tacpipe.json"] = _json_bytes(_feature_metadata(frame_features, described))
     files[README_NAME] = readme_text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
     return Result(files=Files(files), notes=loss_notes(recordings, described), written=written)
@@ -165,6 +193,8 @@ def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
     for stream in dict.fromkeys(channel.stream for channel in lossy):
         yield Loss(f"digits beyond float32{place}", stream)
     for channel in _without_feature(channels):
+        if channel.quantity == frames.IMAGE:
+            continue  # packets are in the videos
         yield Loss(f"features have no type for {channel.type}{place}", channel.stream, channel.short)
 
 
@@ -303,6 +333,7 @@ def _episodes(
     lengths: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
+    colours: Mapping[str, Stats],
 ) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -315,6 +346,10 @@ def _episodes(
         stats |= index_statistics(
             lengths[recording.name], episode, starts[recording.name], order[tasks[recording.name]], fps
         )
+        stats |= colours[recording.name]
+        video_chunk, video_file = divmod(episode, CHUNK_FILES)
+        video_places = {"chunk_index": video_chunk, "file_index": video_file, "from_timestamp": 0.0}
+        video_places["to_timestamp"] = lengths[recording.name] / fps
         row = {
             "episode_index": episode,
             "tasks": [tasks[recording.name]],
@@ -327,6 +362,9 @@ def _episodes(
             "meta/episodes/file_index": 0,
             RECORDING: recording.name,
             ATTRIBUTES: json.dumps(dict(originals[recording.name].attributes), sort_keys=True),
+            **{
+                f"videos/{name}/{key}": value for name in colours[recording.name] for key, value in video_places.items()
+            },
             **{f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()},
         }
         rows.append(row)
@@ -357,18 +395,19 @@ class InfoJson(TypedDict):
     fps: float
     splits: dict[str, str]
     data_path: str
-    video_path: None
-    features: dict[str, FeatureJson]
+    video_path: str | None
+    features: dict[str, FeatureJson | CameraJson]
 
 
 def _info(
     params: Params,
     frame_features: Sequence[FrameFeature],
+    cameras: Sequence[Camera],
     lengths: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
 ) -> InfoJson:
-    described: dict[str, FeatureJson] = {
+    described: dict[str, FeatureJson | CameraJson] = {
         feature.name: {
             "dtype": feature.dtype,
             "shape": feature.shape,
@@ -376,6 +415,7 @@ def _info(
         }
         for feature in frame_features
     }
+    described |= {camera.name: camera.feature(params.video_codec, fps) for camera in cameras}
     described["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     for name in INDICES[1:]:
         described[name] = {"dtype": "int64", "shape": [1], "names": None}
@@ -391,7 +431,7 @@ def _info(
         "fps": int(fps) if fps.is_integer() else fps,
         "splits": {"train": f"0:{len(lengths)}"},
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
+        "video_path": VIDEO_PATH if cameras else None,
         "features": described,
     }
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.exports.contents import TIME
 from tacpipe.plugins.constraints import Names, Rate
+from tacpipe.plugins.params import added
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,6 +36,8 @@ class Params:
     task: str = "touch"  # text of the task, with labels in braces
     robot_type: str = ""  # name of the robot in info.json
     originals: bool = True  # store the original shards under tacpipe/
+    # codec of videos: h264 copies frames of H.264 cameras that match the rows, and encodes others; av1 as in LeRobot
+    video_codec: Literal["h264", "av1"] = added("h264")
 
 
 @dataclass(frozen=True)
