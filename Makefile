@@ -136,6 +136,7 @@ test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant op
 	@if [ ! -e .cache/exports/bin/.made ]; then \
 	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
 	fi
+	@if ! command -v ffmpeg > /dev/null; then $(call debian,ffmpeg); fi
 	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
 
 test-viewer: $(VENV)/.dev ## have Rerun's own reader open what `tacpipe view` writes, in an environment of its own (0.5 GB)

@@ -1,8 +1,9 @@
 """An environment with the readers that are too heavy for the tests' own: LeRobot's loader, `datasets`, `mlcroissant`.
 
 ``python -m tests.exports.environment FOLDER`` makes it in some two minutes and 0.5 GB: what lerobot 0.4.4, the last release
-for Python 3.11, needs to read a dataset without pictures, next to torch and pandas of the environment that runs this. The
-whole of lerobot would be 8 GB. torchvision, of which its loader uses one class for pictures, is replaced by that name.
+for Python 3.11, needs to read a dataset, next to torch and pandas of the environment that runs this. The whole of lerobot
+would be 8 GB. torchvision, of which its loader uses one class for pictures, is replaced by that name. torchcodec decodes
+videos, with the shared libraries of Debian's ffmpeg; its later releases need CUDA.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ ALONE = (
     "accelerate==1.15.0",
     "gymnasium==1.4.0",
     "farama-notifications==0.0.6",
+    "torchcodec==0.13.0",
 )  # without what they need
 NEEDED = (
     *("datasets>=4,<5", "huggingface_hub>=0.34.2,<0.36", "packaging<26", "numpy<2.3", "mlcroissant>=1.0,<2"),

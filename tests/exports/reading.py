@@ -42,6 +42,16 @@ def lerobot(folder: str) -> dict[str, Any]:
     }
 
 
+def lerobot_video(folder: str) -> dict[str, Any]:
+    """Decode some frames of a video feature with LeRobot's loader."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("tacpipe/export", root=folder)
+    rows = [0, 1, 17, 39, 40, 63, 79]
+    images = [dataset[row]["observation.images.gel"].tolist() for row in rows]
+    return {"frames": len(dataset), "rows": rows, "images": images}
+
+
 def add_frame(folder: str) -> dict[str, Any]:
     """Write the frames of an export again with LeRobot's own writer; return its seconds and bytes."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -116,7 +126,12 @@ def croissant(folder: str) -> dict[str, Any]:
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
-    result = {"lerobot": lerobot, "add_frame": add_frame, "hub": hub, "parquet": parquet, "croissant": croissant}[
-        sys.argv[1]
-    ](sys.argv[2])
+    result = {
+        "lerobot": lerobot,
+        "lerobot_video": lerobot_video,
+        "add_frame": add_frame,
+        "hub": hub,
+        "parquet": parquet,
+        "croissant": croissant,
+    }[sys.argv[1]](sys.argv[2])
     sys.stdout.write(json.dumps(result, default=float))

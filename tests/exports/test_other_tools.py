@@ -17,6 +17,8 @@ import pytest
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.stages.test_extract import frames_of
+from tests.video import videos
 
 PYTHON = os.environ.get("TACPIPE_EXPORTS_PYTHON", "")
 pytestmark = [
@@ -65,6 +67,22 @@ def test_lerobot_s_loader_gives_values_names_tasks_and_windows_back(rig: Lab) ->
     np.testing.assert_array_equal(np.array(result["window"]), state[[first, first, first + 1]])
     assert result["padded"] == [True, False, False]
     np.testing.assert_allclose(result["mean"], np.mean(result["values"]["observation.tactile.skin"], axis=0))
+
+
+def test_lerobot_s_loader_decodes_the_nearest_frame_of_each_row(lab: Lab) -> None:
+    frames = {}
+    for name, encoder, ending in (("a", "mpeg4", "avi"), ("b", "mjpeg", "avi")):
+        path = videos.write(lab.folder / f"{name}.{ending}", encoder, 40)
+        frames[name] = np.array(videos.decoded(path), int)
+    recordings.write(
+        lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in frames}
+    )
+    lab.run("export lerobot rec -o lr --rate-hz 25 --master gel --no-originals --common")
+    result = read("lerobot_video", "lr")
+    assert result["frames"] == 80
+    for row, pixels in zip(result["rows"], result["images"], strict=True):
+        expected = frames["ab"[row // 40]][row % 40]
+        assert np.abs(np.array(pixels) * 255 - np.moveaxis(expected, 2, 0)).mean() < 6
 
 
 def test_the_hub_s_library_opens_each_configuration_of_a_card_in_its_own_types(rig: Lab) -> None:

@@ -1,7 +1,8 @@
-"""Streams of frames in MCAP and HDF5: what viewers decode is what was recorded, and packets come back bit for bit."""
+"""Streams of frames in exports: what viewers decode is what was recorded, and packets come back bit for bit."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -101,3 +102,59 @@ def test_h5py_reads_decoded_frames(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
     refused = lab.call("export hdf5 rec -o demos --images --structure robomimic")
     assert refused.code == 2
     assert "images belongs to --structure streams" in refused.err
+
+
+LEROBOT = "export lerobot rec -o lr --rate-hz 25 --master gel"
+VIDEO = "lr/videos/observation.images.gel/chunk-000/file-000.mp4"
+
+
+@pytest.mark.parametrize("b_frames", [0, 3])
+def test_packets_of_h264_are_copied_to_a_lerobot_dataset_and_come_back(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, b_frames: int
+) -> None:
+    path = write(lab, "libx264", "mp4", monkeypatch, b_frames=b_frames)
+    ran = lab.run(f"{LEROBOT} --no-originals")
+    assert "encoded" not in ran.err
+    assert videos.packets(lab.folder / VIDEO) == videos.packets(path)
+    lab.run("ingest lerobot lr -o back")
+    original, back = (tacpipe.open(name)["a"].table("gel") for name in ("rec", "back"))
+    assert back.column("packet").to_pylist() == original.column("packet").to_pylist()
+    assert np.array_equal(videos.decoded(lab.folder / VIDEO), videos.decoded(path))
+
+
+@pytest.mark.parametrize(("codec", "option"), [("h264", ""), ("av1", " --video-codec av1")])
+def test_other_frames_are_encoded_for_lerobot_and_the_loss_is_stated(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, codec: str, option: str
+) -> None:
+    path = write(lab, "mpeg4", "avi", monkeypatch, b_frames=2)
+    ran = lab.run(f"{LEROBOT} --no-originals{option}")
+    assert f"stream gel: its packets: frames are encoded as {codec.upper()}, with some loss" in ran.err
+    with av.open(str(lab.folder / VIDEO)) as container:
+        assert container.streams.video[0].codec_context.codec.canonical_name == codec
+        stamps = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    assert stamps == pytest.approx([number / 25 for number in range(COUNT)], abs=1e-4)
+    images = np.array(videos.decoded(lab.folder / VIDEO), int)
+    assert np.abs(images - videos.decoded(path)).mean() < 6
+    info = json.loads((lab.folder / "lr/meta/info.json").read_text())
+    assert info["features"]["observation.images.gel"]["info"]["video.codec"] == codec
+    colours = json.loads((lab.folder / "lr/meta/stats.json").read_text())["observation.images.gel"]["mean"]
+    assert np.ravel(colours) == pytest.approx(np.mean(videos.decoded(path), axis=(0, 1, 2)) / 255, abs=0.03)
+
+
+def test_with_the_shards_in_a_lerobot_dataset_packets_come_back_bit_for_bit(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(lab, "mpeg4", "avi", monkeypatch, b_frames=2)
+    lab.run(LEROBOT)
+    lab.run("ingest lerobot lr -o back")
+    original, back = (tacpipe.open(name)["a"].table("gel") for name in ("rec", "back"))
+    assert back.equals(original) and read_format(back) == read_format(original)
+
+
+def test_a_row_of_a_lerobot_dataset_has_the_nearest_frame(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(lab, "libx264", "mp4", monkeypatch, b_frames=0)
+    lab.run(f"{LEROBOT.replace('25', '10')} --no-originals")
+    images = np.array(videos.decoded(lab.folder / VIDEO), int)
+    rows = [round(number * 2.5 - 1e-9) for number in range(len(images))]
+    assert len(images) == 16
+    assert np.abs(images - np.array(videos.decoded(path), int)[rows]).mean() < 4
