@@ -129,7 +129,7 @@ def test_the_guessed_layout_of_an_npz_file_reads_its_images_and_columns(lab: Lab
     assert column("rec", "a", "force") == list(range(COUNT))
 
 
-@pytest.mark.parametrize(("array", "problem"), [("force", "is no images"), ("cam", "has no array cam")])
+@pytest.mark.parametrize(("array", "problem"), [("force", "Images must be uint8"), ("cam", "has no array cam")])
 def test_a_layout_that_names_another_array_is_refused(lab: Lab, array: str, problem: str) -> None:
     Path("in").mkdir()
     np.savez("in/a.npz", rgb=IMAGES, force=np.arange(COUNT))

@@ -135,8 +135,8 @@ class NumpyArchive:
         if video_format is None:
             shape = " x ".join(map(str, images.shape))
             raise TacpipeError(
-                f"{self.path}: {plain(array)} ({shape}, {images.dtype}) is no images: uint8 (frame, row, column, rgb) or "
-                f"(frame, row, column), or uint16 (frame, row, column)."
+                f"{self.path}: {plain(array)} has the shape {shape} and the type {images.dtype}. Images must be uint8 "
+                f"(frame, row, column, rgb), or uint8 or uint16 (frame, row, column)."
             )
         self._expect_same_length(arrays)
         clocks = [] if not clock else [pa.field(clock, pa.from_numpy_dtype(arrays[clock].dtype.newbyteorder("=")))]
