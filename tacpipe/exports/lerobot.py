@@ -36,7 +36,13 @@ from tacpipe.exports.lerobot_features import (
     features_of_frames,
     index_statistics,
 )
-from tacpipe.exports.lerobot_videos import Camera, CameraJson, EpisodeVideo, combine_statistics, find_cameras
+from tacpipe.exports.lerobot_videos import (
+    EpisodeVideo,
+    VideoFeature,
+    VideoFeatureJson,
+    combine_statistics,
+    find_cameras,
+)
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Result, stage
 from tacpipe.printable import listed, plain
 
@@ -396,18 +402,18 @@ class InfoJson(TypedDict):
     splits: dict[str, str]
     data_path: str
     video_path: str | None
-    features: dict[str, FeatureJson | CameraJson]
+    features: dict[str, FeatureJson | VideoFeatureJson]
 
 
 def _info(
     params: Params,
     frame_features: Sequence[FrameFeature],
-    cameras: Sequence[Camera],
+    cameras: Sequence[VideoFeature],
     lengths: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
 ) -> InfoJson:
-    described: dict[str, FeatureJson | CameraJson] = {
+    described: dict[str, FeatureJson | VideoFeatureJson] = {
         feature.name: {
             "dtype": feature.dtype,
             "shape": feature.shape,

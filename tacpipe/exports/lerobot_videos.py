@@ -46,7 +46,7 @@ SAMPLED = 10  # maximum number of frames per episode for the statistics
 COLOUR_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
-class CameraJson(TypedDict):
+class VideoFeatureJson(TypedDict):
     """A video feature in LeRobot's format."""
 
     dtype: str
@@ -56,7 +56,7 @@ class CameraJson(TypedDict):
 
 
 @dataclass(frozen=True)
-class Camera:
+class VideoFeature:
     """A stream of frames that all recordings have with the same size."""
 
     stream: str
@@ -68,7 +68,7 @@ class Camera:
         """The name of the feature."""
         return PREFIX + self.stream
 
-    def feature(self, codec: Codec, fps: float) -> CameraJson:
+    def feature(self, codec: Codec, fps: float) -> VideoFeatureJson:
         """Return the description in info.json."""
         return {
             "dtype": "video",
@@ -87,7 +87,7 @@ class Camera:
         }
 
 
-def find_cameras(originals: Dataset) -> tuple[list[Camera], list[tuple[str, Loss]]]:
+def find_cameras(originals: Dataset) -> tuple[list[VideoFeature], list[tuple[str, Loss]]]:
     """Return the cameras of a dataset, and a loss for each stream of frames that cannot be a feature of all episodes."""
     sizes: dict[str, dict[str, tuple[int, int]]] = {}  # size by recording, by stream
     for recording in originals:
@@ -96,7 +96,7 @@ def find_cameras(originals: Dataset) -> tuple[list[Camera], list[tuple[str, Loss
             video_format = read_format(columns)
             if video_format is not None and columns.num_rows:
                 sizes.setdefault(stream, {})[recording.name] = (video_format.width_px, video_format.height_px)
-    cameras: list[Camera] = []
+    cameras: list[VideoFeature] = []
     losses: list[tuple[str, Loss]] = []
     for stream, by_recording in sizes.items():
         if len(by_recording) < len(originals):
@@ -104,7 +104,7 @@ def find_cameras(originals: Dataset) -> tuple[list[Camera], list[tuple[str, Loss
         elif len(set(by_recording.values())) > 1:
             reason = "a video has one size in all recordings, and this one has several"
         else:
-            cameras.append(Camera(stream, *next(iter(by_recording.values()))))
+            cameras.append(VideoFeature(stream, *next(iter(by_recording.values()))))
             continue
         losses += [(recording, Loss(reason, stream)) for recording in by_recording]
     return cameras, losses
@@ -122,7 +122,7 @@ class EpisodeVideo:
 
     @classmethod
     def from_recordings(
-        cls, camera: Camera, original: Recording, synchronized: Columns, codec: Codec, fps: float
+        cls, camera: VideoFeature, original: Recording, synchronized: Columns, codec: Codec, fps: float
     ) -> EpisodeVideo:
         """Return the video with the nearest frame to each row of the ``synchronized`` recording."""
         columns = original.columns(camera.stream)
