@@ -1,4 +1,4 @@
-"""How results of a third party's task, the weights of things, are compared and reported."""
+"""Compare and report results of a task of another package: the weights of things."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def error(sums: AnyFloats) -> AnyFloats:
-    """Return the mean absolute error (draw,) of sums (draw, 2): errors in grams, and how many there are."""
-    found: AnyFloats = sums[:, 0] / sums[:, 1]
-    return found
+    """Return the mean absolute error (draw,) from sums (draw, 2): sum of errors in grams, number of errors."""
+    mean: AnyFloats = sums[:, 0] / sums[:, 1]
+    return mean
 
 
 WEIGHT = Measure(
@@ -29,7 +29,7 @@ WEIGHT = Measure(
     name="skill",
     cluster="things",
     error=error,
-    gain=lambda one, other: 1 - one / other,
+    gain=lambda model_error, baseline_error: 1 - model_error / baseline_error,
     values=lambda sums: (float(sums[0] / sums[1]),),
     scored="MAE (g)",
 )
@@ -41,7 +41,7 @@ class WeighingReport(TaskReport):
     title = "weights of things"
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
-        """Return a run a result: the errors of the model and of each baseline on each thing."""
+        """Return one run per result: the errors of the model and of each baseline on each thing."""
         runs = []
         for result in results:
             config, errors = (json.loads(result.files[name]) for name in ("config.json", "errors.json"))
