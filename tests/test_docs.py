@@ -249,7 +249,7 @@ def test_the_commands_in_all_pages_exist(lab: Lab) -> None:
 
 
 def test_the_file_tree_of_contributing_names_what_is_there_and_every_package() -> None:
-    (tree,) = blocks(section((ROOT / "CONTRIBUTING.md").read_text(), "What lies where"), "text")
+    (tree,) = blocks(section((ROOT / "CONTRIBUTING.md").read_text(), "Files and folders"), "text")
     paths = {path for line in tree.splitlines() for path in re.split(r", ", re.split(r"\s{2,}", line)[0])}
     packages = {f"tacpipe/{path.parent.name}/" for path in (ROOT / "tacpipe").glob("*/__init__.py")}
 
