@@ -50,27 +50,27 @@ def limits(
     if output is not None:
         replacing.refuse_foreign(output, HEADER.encode())
     from tacpipe.engine import pipeline
-    from tacpipe.tasks.touch import grasps as grasps_of
-    from tacpipe.tasks.touch import limits as limits_of
+    from tacpipe.tasks.touch import grasps as touch_grasps
+    from tacpipe.tasks.touch import limits as touch_limits
 
     dataset = pipeline.open_dataset(grasps)
-    with terminal.progress_bar("limits", limits_of.steps(training_sizes, draws)) as advance:
-        measured = limits_of.limits(
-            grasps_of.read(dataset), sizes=training_sizes, draws=draws, trees=trees, seed=seed, advance=advance
+    with terminal.progress_bar("limits", touch_limits.steps(training_sizes, draws)) as advance:
+        measured = touch_limits.limits(
+            touch_grasps.read(dataset), sizes=training_sizes, draws=draws, trees=trees, seed=seed, advance=advance
         )
     value = {"schema_version": 1, "limits": measured.to_json()}
     if output is not None:
         _write(output, json.dumps(value) + "\n")
-    terminal.result_json(value) if as_json else terminal.result(text(measured))
+    terminal.result_json(value) if as_json else terminal.result(format_limits(measured))
 
 
-def text(found: Limits) -> str:
+def format_limits(measured: Limits) -> str:
     """Return the limits as three tables of text."""
-    grasps = sum(found.counts.values())
-    lines = [f"{grasps} grasps of {len(found.counts)} objects"]
+    grasps = sum(measured.counts.values())
+    lines = [f"{grasps} grasps of {len(measured.counts)} objects"]
     for title, measure in (
-        ("skill of a predictor that errs as pairs differ", "pair_skill"),
-        ("likeness of readings within an object", "likeness"),
+        ("skill of a predictor whose error equals their difference", "pair_skill"),
+        ("similarity of the readings of one object", "likeness"),
     ):
         rows = [
             [
@@ -78,21 +78,21 @@ def text(found: Limits) -> str:
                 str(max(estimates.pairs for estimates in by_target.values())),
                 *(_cell(getattr(by_target[name], measure)) for name in TARGETS),
             ]
-            for low, high, by_target in found.near
+            for low, high, by_target in measured.near
         ]
         lines += ["", f"pairs of grasps: {title}", *_table(["distance (mm)", "pairs", *TARGETS], rows)]
     lines += ["", "learning curve: skill on known objects"]
     rows = [
         [str(point.grasps), f"{point.trained:.0f}", *(_cell(point.skill[name]) for name in TARGETS)]
-        for point in found.curve
+        for point in measured.curve
     ]
-    rows.append(["other finger given", "", *(_cell(found.other_finger[name]) for name in TARGETS)])
-    lines += _table(["grasps an object", "trained on", *TARGETS], rows)
+    rows.append(["with other finger", "", *(_cell(measured.other_finger[name]) for name in TARGETS)])
+    lines += _table(["grasps per object", "trained on", *TARGETS], rows)
     lines += [
         "",
-        "Pairs differ in pose too: the skill of near pairs is a lower bound on what can be reached, not an upper bound.",
-        "Skill: 1 - RMSE / RMSE of the constant. Likeness: 1 where readings are equal and 0 where they differ as any two",
-        f"of the object. In brackets: 95 % interval over resampled grasps. {found.draws} draws of 5 folds.",
+        "Pairs also differ in pose, so the skill of near pairs is a lower bound on the skill that a model can reach.",
+        "Skill: 1 - RMSE / RMSE of the constant. Similarity: 1 for equal readings, 0 for the mean difference of two grasps",
+        f"of the object. Brackets: 95 % interval over grasps. {measured.draws} draws of 5 folds.",
     ]
     return "\n".join(lines)
 

@@ -239,7 +239,7 @@ class _Trial:
 
     def point(self, size: int) -> Point:
         """Return the learning-curve point for ``size`` training grasps per object."""
-        skill, trained = self._skills(size, dict.fromkeys(self.grasps.readings, self.rows), f"{size} grasps an object")
+        skill, trained = self._skills(size, dict.fromkeys(self.grasps.readings, self.rows), f"{size} grasps per object")
         return Point(size, trained, skill)
 
     def skills_with_other_finger(self) -> Skills:

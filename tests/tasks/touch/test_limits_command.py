@@ -15,11 +15,11 @@ from tacpipe.tasks.touch.limits import NOTHING, Limits, Point, Repeatability
 SKILL = dict.fromkeys(command.TARGETS, Estimate(0.31, 0.25, 0.38))
 NEAR = dict.fromkeys(command.TARGETS, Repeatability(19, Estimate(0.6, -0.24, 0.93), Estimate(0.55, 0.22, 0.82)))
 FAR = dict.fromkeys(command.TARGETS, Repeatability(0, NOTHING, NOTHING))
-FOUND = Limits({"cup": 9, "jar": 8}, [(0, 6, NEAR), (6, math.inf, FAR)], [Point(4, 8.0, SKILL)], SKILL, 2, 100)
+MEASURED = Limits({"cup": 9, "jar": 8}, [(0, 6, NEAR), (6, math.inf, FAR)], [Point(4, 8.0, SKILL)], SKILL, 2, 100)
 
 
 def test_tables_hold_every_number_that_was_measured() -> None:
-    lines = command.text(FOUND).splitlines()
+    lines = command.format_limits(MEASURED).splitlines()
     near = [line for line in lines if line.startswith("0 to 6")]
     assert [line.count("0.55 (0.22 to 0.82)") for line in near] == [4, 0]
     assert [line.count("0.60 (-0.24 to 0.93)") for line in near] == [0, 4]
@@ -29,11 +29,11 @@ def test_tables_hold_every_number_that_was_measured() -> None:
 
 
 def test_json_has_null_where_nothing_was_measured() -> None:
-    tree = json.loads(json.dumps(FOUND.to_json(), allow_nan=False))
+    tree = json.loads(json.dumps(MEASURED.to_json(), allow_nan=False))
     assert [row["high_mm"] for row in tree["repeatability"]] == [6, None]
     assert tree["repeatability"][1]["pair_skill"]["e_mf"] == {"mean": None, "low": None, "high": None}
     assert tree["learning_curve"] == [
-        {"grasps": 4, "trained": 8.0, "skill": {name: one._asdict() for name, one in SKILL.items()}}
+        {"grasps": 4, "trained": 8.0, "skill": {name: estimate._asdict() for name, estimate in SKILL.items()}}
     ]
 
 
