@@ -74,7 +74,7 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.codecs import pca, training_rows
     from tacpipe.plugins.stage import Result
 
-    rows = training_rows.stored(train.recordings, params.representation)
+    rows = training_rows.stored_rows(train.recordings, params.representation)
     latents, notes = _latent_count(params.components, len(rows.channels))
     codec = pca.fit_and_measure(
         rows, components=latents, variance=params.variance, representation=params.representation
@@ -89,7 +89,7 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
     from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
 
-    tried = autoencoder_fit.networks(
+    tried = autoencoder_fit.candidate_networks(
         params.frames, params.hidden, params.search, params.learning_rate, params.weight_decay
     )
     schedule = Schedule(
@@ -100,7 +100,7 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
         gradient_clip=autoencoder_fit.GRADIENT_CLIP,
         seed=params.seed,
     )
-    rows = training_rows.read(train.recordings, params.representation, params.frames)
+    rows = training_rows.read_rows(train.recordings, params.representation, params.frames)
     latents, notes = _latent_count(params.components, len(rows.channels))
     codec = autoencoder_fit.fit(
         rows, tried, schedule, workspace, components=latents, representation=params.representation
@@ -119,7 +119,7 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     """
     from tacpipe.codecs import tactile
 
-    return tactile.added(recording, codec)
+    return tactile.add_latents(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
@@ -133,7 +133,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     """
     from tacpipe.codecs import tactile
 
-    return tactile.added(recording, codec)
+    return tactile.add_latents(recording, codec)
 
 
 def _latent_count(components: int, channels: int) -> tuple[int, list[str]]:

@@ -306,7 +306,7 @@ def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[i
 
 def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]:
     """Return about ``count`` downscaled images from all streams of frames, by recording (image, row, column, rgb)."""
-    from tacpipe.codecs.frame_autoencoder import shrink
+    from tacpipe.codecs.frame_autoencoder import reduce_image
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import read_format
 
@@ -325,7 +325,7 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
     return [
         np.array(
             [
-                shrink(image)
+                reduce_image(image)
                 for columns, video_format in parts
                 for row, image in decode_frames(video_format, read_batches(columns))
                 if row % step == 0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.calibration import conformal_quantile, most_promised
+from tacpipe.metrics.calibration import conformal_quantile, highest_promised_level
 
 SCORES = st.floats(-1e6, 1e6, allow_nan=False)
 GROUPS = st.lists(st.lists(SCORES, min_size=1, max_size=6), min_size=2, max_size=8)
@@ -56,7 +56,7 @@ def test_a_long_recording_weighs_as_much_as_a_short_one() -> None:
 
 def test_four_recordings_promise_eighty_percent_and_no_more() -> None:
     scores, groups = join_groups([[1.0], [2.0], [3.0], [4.0]])
-    assert most_promised(4) == 0.8
+    assert highest_promised_level(4) == 0.8
     assert conformal_quantile(scores, groups, 0.8, promised=True) == 4.0
     assert conformal_quantile(scores, groups, 0.81, promised=True) == math.inf
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import pytest
 
 from tacpipe.clouds.geometry import NORMALISATIONS
-from tacpipe.codecs.autoencoder_fit import FRAMES, MAX_TENSORS
+from tacpipe.codecs.autoencoder_fit import FRAMES, MAX_SEARCH
 from tacpipe.datasets.splits import SCHEMES
 from tacpipe.errors import UsageError
 from tacpipe.models.point_networks import BACKBONES, HEADS
@@ -278,7 +278,7 @@ def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
     families = fields.constraints(params_of.fields(registry.load("simulate.touch"))["families"])[0]
     assert isinstance(families, CommaList) and set(get_args(families.item_type)) == {"all", *FAMILIES}
     search = fields.constraints(params_of.fields(registry.load("compress.autoencoder"))["search"])[0]
-    assert isinstance(search, Range) and search.maximum == MAX_TENSORS
+    assert isinstance(search, Range) and search.maximum == MAX_SEARCH
 
 
 UNITS = {  # the end of a name and the unit that help must show

@@ -45,7 +45,7 @@ def test_pinball_is_that_of_scikit_learn() -> None:
 def test_coverage_and_width_are_those_counted_by_hand() -> None:
     truth = np.array([[0.0], [1.0], [5.0], [-3.0]])
     predicted = np.broadcast_to([-1.0, 0.0, 1.0], (4, 1, 3))
-    tree = calibration.tree([calibration.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
+    tree = calibration.measures_by_step([calibration.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
     assert tree["coverage"] == {"t1": 0.5, "mean": 0.5}
     assert tree["width"]["t1"] == 2.0
     assert [tree[f"below_q{level}"]["t1"] for level in (10, 50, 90)] == [0.25, 0.5, 0.75]
@@ -59,7 +59,10 @@ def test_sums_of_two_parts_are_those_of_the_whole() -> None:
     parts = [
         calibration.Sums.from_predictions(truth[rows], predicted[rows], LEVELS) for rows in (slice(0, 7), slice(7, 20))
     ]
-    total_tree, two = calibration.tree([total], (10, 50, 90)), calibration.tree([parts[0] + parts[1]], (10, 50, 90))
+    total_tree, two = (
+        calibration.measures_by_step([total], (10, 50, 90)),
+        calibration.measures_by_step([parts[0] + parts[1]], (10, 50, 90)),
+    )
     assert total_tree == two
 
 
@@ -104,5 +107,5 @@ def test_too_few_values_are_refused() -> None:
 
 @pytest.mark.parametrize("percents", [(10, 90), (10, 50, 80), (50,), (90, 50, 10), (0, 50, 100)])
 def test_levels_that_are_not_symmetric_about_the_median_are_refused(percents: tuple[int, ...]) -> None:
-    with pytest.raises(TacpipeError, match="symmetrically about 50"):
+    with pytest.raises(TacpipeError, match="symmetric about 50"):
         calibration.check_levels(percents)

@@ -150,7 +150,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
         quantities = {column.name: column.quantity for column in _columns(stream, stored.schema)}
         gaps += spans.masked_gaps(_select(stored, [name for name in quantities if name.endswith(GAP)]))
         if stream != streams.EVENTS:
-            label_spans += spans.of_labels(
+            label_spans += spans.label_spans(
                 _select(stored, [name for name in quantities if quantities[name] == "label"])
             )
     events = spans.events(recording.table(streams.EVENTS)) if streams.EVENTS in recording.streams else []
@@ -179,9 +179,9 @@ def _open(dataset: Path) -> Dataset:
 
 
 def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
-    from tacpipe.traces.curves import described
+    from tacpipe.traces.curves import field_metadata
 
-    about = {field.name: described(field) for field in schema}
+    about = {field.name: field_metadata(field) for field in schema}
     return [
         StreamColumn(
             stream or about[field.name].get("stream", ""),

@@ -143,8 +143,8 @@ def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iter
             table, row = predicted(predictions, recording.name)
             if table is None and row is None:
                 terminal.note(f"There are no predictions of {recording.name} in {predictions.path}.")
-        recording_contents = contents.of(recording, table, row, chain=recording.alone.source.chain)
-        if recording_contents.empty:
+        recording_contents = contents.collect(recording, table, row, chain=recording.alone.source.chain)
+        if recording_contents.is_empty:
             raise UsageError(
                 f"Recording {recording.name} has no stream with times and no cloud, so there is nothing to draw; "
                 f"its streams are {', '.join(map(repr, recording.streams))}. Give a dataset of recordings."
@@ -203,11 +203,11 @@ def _in_browser(files: Sequence[Path], port: int | None) -> None:
     import time
     import webbrowser
 
-    from tacpipe.viewer.session import served
+    from tacpipe.viewer.session import serve
 
-    with served(files, port) as address:
+    with serve(files, port) as address:
         terminal.result(address)
         webbrowser.open(address)
-        terminal.note("The viewer is served on this computer; press Ctrl-C to end.")
+        terminal.note("The viewer is serve on this computer; press Ctrl-C to end.")
         while True:
             time.sleep(1)

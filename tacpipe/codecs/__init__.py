@@ -1,1 +1,1 @@
-"""Turn tactile channels into latents and back."""
+"""Encode tactile channels as latents, and decode them."""

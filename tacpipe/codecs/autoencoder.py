@@ -1,8 +1,8 @@
-"""An autoencoder of standardised tactile channels, as it is once it is trained: layers of numbers, without torch.
+"""Apply a trained autoencoder of standardised tactile channels with numpy, without torch.
 
-Every layer is weight @ x + bias, an ELU (Clevert 2016: x above 0, exp(x) - 1 below) behind all but the last of encoder
-and decoder. It reads one frame or some in a row, newest last, and gives the newest back. numpy suffices for it, so that
-whoever applies a codec starts without torch.
+Every layer is weight @ x + bias, followed by an ELU (Clevert 2016: x above 0, exp(x) - 1 below) except in the last
+layers of encoder and decoder. It reads one or several successive frames, newest last, and decodes the newest. numpy
+suffices, so applying a codec does not import torch.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from tacpipe.datasets import model_files
 if TYPE_CHECKING:
     Layers = tuple[tuple[AnyFloats, AnyFloats], ...]  # weight (out, in) and bias (out,) of each
 
-CHUNK = 16384  # rows worked on at once, so that the widths of hidden layers do not count in memory
+CHUNK = 16384  # rows per chunk, which bounds the memory of hidden layers
 
 
 @dataclass(frozen=True)
 class Autoencoder:
-    """A fitted codec. Mean and scale are float64 in counts, layers float32 without unit."""
+    """A fitted autoencoder. Mean and scale are float64 in counts; layers are float32 without unit."""
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
@@ -43,39 +43,39 @@ class Autoencoder:
     scale_count: AnyFloats  # (channel,)
     encoder: Layers
     decoder: Layers
-    frames: int = 1  # rows in a row that it reads
+    frames: int = 1  # number of successive rows that it reads
     representation: str = codec.LEVELS
     measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "autoencoder"
 
     @property
     def latents(self) -> tuple[str, ...]:
-        """The names of the latents, which are in no order."""
+        """The names of the latents; their order has no meaning."""
         return latent_names(len(self.encoder[-1][1]))
 
     def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
-        """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
+        """Return the latents (time, latent), float32, of counts above rest (time, channel).
 
-        Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
+        Raises `TacpipeError` unless ``channels`` are those of the fit, in the same order.
         """
         check_channels(self.channels, channels)
-        inputs = codec.inputs(values, begins, self.representation, self.frames)
+        inputs = codec.codec_inputs(values, begins, self.representation, self.frames)
         return encode_finite(self.project, inputs, len(self.latents))
 
     def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent), float32, of finite rows (row, frames * channel), newest frame last."""
-        return _through(self.encoder, scaled(inputs, self.mean_count, self.scale_count))
+        return _apply_layers(self.encoder, standardise(inputs, self.mean_count, self.scale_count))
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Return the newest frame's counts that latents decode to as float64, (…, latent) to (…, channel)."""
+        """Decode latents (…, latent) to the newest frame's counts (…, channel), float64."""
         *first, (weight, bias) = self.decoder
         newest = (*first, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
-        decoded = _through(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))
+        decoded = _apply_layers(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))
         counts: AnyFloats = decoded * self.scale_count + self.mean_count
         return counts.reshape(*latents.shape[:-1], len(self.channels))
 
     def to_files(self) -> dict[str, bytes]:
-        """Return the codec as the content of ``codec.safetensors`` and ``codec.json``."""
+        """Return the content of ``codec.safetensors`` and ``codec.json``."""
         content = {
             **self.measured,
             "kind": self.kind,
@@ -95,7 +95,7 @@ class Autoencoder:
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Autoencoder:
-        """Return the codec that `to_files` wrote."""
+        """Return the codec that `to_files` stored."""
         content, tensors = json.loads(files[DESCRIPTION]), model_files.arrays(files[TENSORS], TENSORS)
         encoder, decoder = (
             tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(content["layers"][part]))
@@ -110,12 +110,12 @@ class Autoencoder:
             decoder,
             content["frames"],
             content["of"],
-            measures.stored(content),
+            measures.measures_from(content),
         )
 
 
-def scaled(inputs: AnyFloats, mean_count: AnyFloats, scale_count: AnyFloats) -> AnyFloats:
-    """Return rows (row, frames * channel) as float32 with every frame's channels in units of their scale."""
+def standardise(inputs: AnyFloats, mean_count: AnyFloats, scale_count: AnyFloats) -> AnyFloats:
+    """Standardise rows (row, frames * channel) by the mean and scale of each channel; float32."""
     frames = inputs.shape[1] // len(mean_count)
     inputs_scaled: AnyFloats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(
         np.float32
@@ -123,8 +123,8 @@ def scaled(inputs: AnyFloats, mean_count: AnyFloats, scale_count: AnyFloats) -> 
     return inputs_scaled
 
 
-def _through(layers: Layers, rows: AnyFloats) -> AnyFloats:
-    """Return what ``layers`` make of ``rows`` (row, in), shape (row, out)."""
+def _apply_layers(layers: Layers, rows: AnyFloats) -> AnyFloats:
+    """Apply ``layers`` to ``rows`` (row, in) and return (row, out)."""
     outputs = np.empty((len(rows), len(layers[-1][1])), dtype=np.float32)
     for first in range(0, len(rows), CHUNK):
         hidden = rows[first : first + CHUNK]

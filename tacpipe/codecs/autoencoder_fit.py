@@ -1,11 +1,11 @@
-"""The training of an autoencoder, and the search for the best of some networks under one budget.
+"""Train an autoencoder, or search for the best of several networks with the same budget.
 
-Rows of all but the held-out training recordings are learned, and the mean squared error of giving the held-out ones
-back, all frames of them, in units of each channel's scale, decides when to stop and which network is best. Recordings of
-the role val are not touched, so that they can evaluate a forecaster trained behind the codec.
+The training recordings are split into learned and held-out ones. The mean squared error of reconstructing the held-out
+rows, all their frames, in units of each channel's scale, determines when to stop and which network is best. Recordings
+of the role val are not used, so that they can evaluate a forecaster that reads the codec's latents.
 
-Networks of increments have no biases: a row that does not move has latents 0 and comes back as 0, so that increments
-that are added up do not drift.
+Networks for increments have no biases: an increment of 0 has latents 0 and is decoded as 0, so that the sum of decoded
+increments does not drift.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from torch import Tensor, nn
 from tacpipe.arrays import AnyFloats
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import measures
-from tacpipe.codecs.autoencoder import Autoencoder, scaled
-from tacpipe.codecs.measures import standard
+from tacpipe.codecs.autoencoder import Autoencoder, standardise
+from tacpipe.codecs.measures import mean_and_scale
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
 from tacpipe.training import devices, loop
 
-FRAMES = (1, 2, 3)  # widths for the classes C1, C2 and C3
-HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # layers between input and latent, by frames
-SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # widths that a search tries, times the frames
+FRAMES = (1, 2, 3)  # frames of the classes C1, C2 and C3
+HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # frames -> hidden layers between input and latents
+SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # hidden layers that a search tries, to be multiplied by the frames
 STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # factors of learning rate and weight decay that a search tries
-MAX_TENSORS = len(SHAPES) * len(STEPS)
-GRADIENT_CLIP = 1.0  # largest norm of the gradient, without unit, as of the forecasters
+MAX_SEARCH = len(SHAPES) * len(STEPS)
+GRADIENT_CLIP = 1.0  # maximum norm of the gradient, as for the forecasters
 
 
 @dataclass(frozen=True)
 class NetworkShape:
-    """One of the networks to try: hidden layers of the encoder, mirrored in the decoder, and how Adam steps."""
+    """A candidate network: hidden layers of the encoder, mirrored in the decoder, and the settings of Adam."""
 
     hidden: tuple[int, ...]
     learning_rate: float
-    weight_decay: float  # Adam: this fraction of a weight is added to its gradient
+    weight_decay: float  # of Adam: this fraction of a weight is added to its gradient
 
 
-def networks(
+def candidate_networks(
     frames: int, hidden: str, search: int, learning_rate: float = 1e-3, weight_decay: float = 1e-5
 ) -> list[NetworkShape]:
-    """Return the networks to try: the first ``search`` of those that there are or, where it is 0, that of ``hidden``.
+    """Return the candidate networks: the first ``search`` of the search space, or the one with ``hidden`` layers.
 
-    ``hidden`` is text such as ``64,32``; empty, it is that of the class of ``frames``. Raises `TacpipeError`
-    for what makes no network.
+    A ``search`` of 0 selects the latter. ``hidden`` is text such as ``64,32``, or empty for the default of ``frames``.
+    Raises `TacpipeError` if a value is out of range.
 
-    >>> [one.hidden for one in networks(2, "", search=3)]
+    >>> [shape.hidden for shape in candidate_networks(2, "", search=3)]
     [(128, 64), (256, 128, 64), (256, 128)]
     """
     if frames not in FRAMES:
         raise TacpipeError(f"frames is {frames}; an autoencoder reads 1, 2 or 3 frames in a row.")
-    if not 0 <= search <= MAX_TENSORS:
+    if not 0 <= search <= MAX_SEARCH:
         raise TacpipeError(
-            f"search is {search}; it must be the number of networks to try, 1 to {MAX_TENSORS}, or 0 for no search."
+            f"search is {search}; it must be the number of networks to try, 1 to {MAX_SEARCH}, or 0 for no search."
         )
     if not weight_decay >= 0:
         raise TacpipeError(f"weight_decay is {weight_decay}; it must be 0 or above.")
@@ -70,24 +70,24 @@ def networks(
         )
     if not search:
         return [NetworkShape(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
-    tried = [
+    candidates = [
         NetworkShape(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
         for fast, decay in STEPS
         for shape in SHAPES
     ]
-    return tried[:search]
+    return candidates[:search]
 
 
 def fit(
     rows: TrainingRows,
-    tried: Sequence[NetworkShape],
+    candidates: Sequence[NetworkShape],
     schedule: loop.Schedule,
     workspace: Path,
     *,
     components: int,
     representation: str = codecs.LEVELS,
 ) -> Autoencoder:
-    """Fit the networks in ``tried`` and return the codec that reconstructs held-out rows best, with ``components`` latents.
+    """Fit the ``candidates`` and return the codec with ``components`` latents that reconstructs held-out rows best.
 
     Its ``measured["search"]`` contains each network's lowest validation error, its epochs and whether it was selected.
     Networks trained before an interruption are read from ``workspace``. Raises `TacpipeError` if there are too few
@@ -98,8 +98,8 @@ def fit(
         raise TacpipeError(f"components is {components}; {width} channels give 1 to {width}.")
     if len(rows.inputs) < 2:
         raise TacpipeError(
-            "An autoencoder is stopped by recordings that it does not learn, so it needs at least 2 training "
-            "recordings and there is 1. Make a split with more."
+            "An autoencoder needs at least 2 training recordings, one of which determines when to stop, and there is "
+            "1. Make a split with more."
         )
     train, val = rows.parts
     if len(train) < 2 or not len(val):
@@ -107,20 +107,24 @@ def fit(
             f"An autoencoder cannot be fitted to {len(train)} rows and stopped by {len(val)}. Give it longer training "
             "recordings with contact."
         )
-    mean, scale = standard(train[:, -width:], representation)
-    learned, watched = (torch.from_numpy(scaled(part, mean, scale)).to(devices.kind()) for part in (train, val))
+    mean, scale = mean_and_scale(train[:, -width:], representation)
+    train_tensor, val_tensor = (
+        torch.from_numpy(standardise(part, mean, scale)).to(devices.kind()) for part in (train, val)
+    )
     results = [
-        _trained(learned, watched, network, schedule, workspace, (index, len(tried)), components, representation)
-        for index, network in enumerate(tried)
+        _train_network(
+            train_tensor, val_tensor, network, schedule, workspace, (index, len(candidates)), components, representation
+        )
+        for index, network in enumerate(candidates)
     ]
-    best = min(range(len(results)), key=lambda index: _lowest(results[index]))
+    best = min(range(len(results)), key=lambda index: _lowest_loss(results[index]))
     encoder, decoder = (_layers(results[best].weights, part) for part in ("encoder", "decoder"))
     codec = Autoencoder(
         rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
     )
     described = [
         _record(network, trained, kept=at == best)
-        for at, (network, trained) in enumerate(zip(tried, results, strict=True))
+        for at, (network, trained) in enumerate(zip(candidates, results, strict=True))
     ]
     measured: measures.CodecMeasures = {
         "reconstruction": measures.reconstructions(codec, {"train": [train], "val": [val]}),
@@ -130,38 +134,38 @@ def fit(
     return replace(codec, measured=measured)
 
 
-class _Mirrored(nn.Module):
-    """Encoder and decoder whose layers mirror each other."""
+class _MirroredNetwork(nn.Module):
+    """An encoder, and a decoder with the same layers in reverse."""
 
     def __init__(self, widths: Sequence[int], *, bias: bool) -> None:
         super().__init__()
         self.encoder, self.decoder = _stack(widths, bias), _stack(widths[::-1], bias)
 
     def forward(self, rows: Tensor) -> Tensor:
-        """Return ``rows`` (row, frames * channel) as they come back."""
-        back: Tensor = self.decoder(self.encoder(rows))
-        return back
+        """Return the reconstructions of ``rows`` (row, frames * channel)."""
+        reconstruction: Tensor = self.decoder(self.encoder(rows))
+        return reconstruction
 
 
 def _stack(widths: Sequence[int], bias: bool) -> nn.Sequential:
-    """Return linear layers between the widths, an ELU behind all but the last."""
+    """Return linear layers between the widths, with ELUs between them."""
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(widths):
         layers += [nn.Linear(before, after, bias=bias), nn.ELU()]
     return nn.Sequential(*layers[:-1])
 
 
-def _trained(
-    learned: Tensor,
-    watched: Tensor,
+def _train_network(
+    train_tensor: Tensor,
+    val_tensor: Tensor,
     network: NetworkShape,
     schedule: loop.Schedule,
     workspace: Path,
-    place: tuple[int, int],  # index and number among the networks that are tried
+    position: tuple[int, int],  # index and number of the candidates
     components: int,
     representation: str,
-) -> loop.Trained:
-    widths, (index, count) = (learned.shape[1], *network.hidden, components), place
+) -> loop.TrainingResult:
+    widths, (index, count) = (train_tensor.shape[1], *network.hidden, components), position
 
     def part(rows: Tensor) -> loop.WindowSet:
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
@@ -171,8 +175,8 @@ def _trained(
         return loop.WindowSet(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=representation == codecs.LEVELS).to(learned.device),
-        loop.WindowTraining(part(learned), part(watched), schedule.batch),
+        lambda: _MirroredNetwork(widths, bias=representation == codecs.LEVELS).to(train_tensor.device),
+        loop.WindowTraining(part(train_tensor), part(val_tensor), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace / f"{index:02d}",
         weight_decay=network.weight_decay,
@@ -182,37 +186,37 @@ def _trained(
     )
 
 
-def _lowest(trained: loop.Trained) -> float:
+def _lowest_loss(trained: loop.TrainingResult) -> float:
     return min(float(line["val_loss"]) for line in trained.history)
 
 
-def _record(network: NetworkShape, trained: loop.Trained, *, kept: bool) -> measures.SearchedNetwork:
-    """Return the record of a network in the search; no seconds, which are never the same."""
+def _record(network: NetworkShape, trained: loop.TrainingResult, *, kept: bool) -> measures.SearchedNetwork:
+    """Return the record of a network in the search, without its training time, which is not reproducible."""
     return {
         "hidden": list(network.hidden),
         "learning_rate": measures.rounded(network.learning_rate),
         "weight_decay": measures.rounded(network.weight_decay),
         "parameters": sum(value.numel() for value in trained.weights.values()),
         "epochs": len(trained.history),
-        "val_loss": measures.rounded(_lowest(trained)),
+        "val_loss": measures.rounded(_lowest_loss(trained)),
         "kept": kept,
     }
 
 
 def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
-    """Return weight and bias of each layer of ``encoder`` or ``decoder``; a layer without bias has zeros."""
+    """Return weight and bias of each layer of the ``encoder`` or ``decoder``; missing biases are zeros."""
     tensors = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
-    places = sorted({int(name.split(".")[1]) for name in tensors})
-    pairs = ((tensors[f"{part}.{at}.weight"], tensors.get(f"{part}.{at}.bias")) for at in places)
+    indices = sorted({int(name.split(".")[1]) for name in tensors})
+    pairs = ((tensors[f"{part}.{at}.weight"], tensors.get(f"{part}.{at}.bias")) for at in indices)
     return tuple((w, np.zeros(len(w), dtype=np.float32) if b is None else b) for w, b in pairs)
 
 
 def _widths(text: str) -> tuple[int, ...]:
-    """Return the widths that text such as ``64,32`` names."""
+    """Parse widths such as ``64,32``."""
     pieces = [piece.strip() for piece in text.split(",")]
     if not all(piece.isascii() and piece.isdecimal() and int(piece) > 0 for piece in pieces):
         raise TacpipeError(
-            f"hidden is {text!r}; it is the widths of the hidden layers, whole numbers above 0 with commas between, as "
-            "64,32. Leave it empty for those of the class."
+            f"hidden is {text!r}; it must be the widths of the hidden layers, positive integers separated by commas, "
+            "such as 64,32. Leave it empty for the default."
         )
     return tuple(int(piece) for piece in pieces)

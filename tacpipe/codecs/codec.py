@@ -1,4 +1,4 @@
-"""Define the interface of codecs, and read stored ones back."""
+"""Define the interface of codecs, and load stored ones."""
 
 from __future__ import annotations
 
@@ -25,23 +25,21 @@ def check_representation(representation: str) -> None:
         raise TacpipeError(f"representation is {representation!r}; a codec is fitted on {LEVELS} or {INCREMENTS}.")
 
 
-def inputs(values: AnyFloats, begins: Bools | None, representation: str, frames: int) -> AnyFloats:
-    """Return what a codec reads of each row of ``values`` (time, channel): (time, frames * channel), newest frame last.
+def codec_inputs(values: AnyFloats, begins: Bools | None, representation: str, frames: int) -> AnyFloats:
+    """Return the inputs of a codec for rows of ``values`` (time, channel): (time, frames * channel), newest frame last.
 
-    ``representation`` is levels, ``values`` as they are, or increments, what was added since the row before. ``begins``
-    (time,) marks where a stretch begins; None: at the first row alone. Rows at the start of a stretch repeat its first
-    frame, and the increment there is 0. Raises `TacpipeError` for another ``representation``.
+    ``representation`` is levels, the ``values`` themselves, or increments, the differences from the previous row.
+    ``begins`` (time,) marks the first row of each run; None: only the first row. Rows at the start of a run repeat its
+    first frame, and the increment there is 0. Raises `TacpipeError` for another ``representation``.
 
-    >>> inputs(np.array([[1.0], [4.0], [9.0]]), None, "increments", 2).tolist()
+    >>> codec_inputs(np.array([[1.0], [4.0], [9.0]]), None, "increments", 2).tolist()
     [[0.0, 0.0], [0.0, 3.0], [3.0, 5.0]]
     """
     check_representation(representation)
     rows = np.arange(len(values))
     first = np.zeros_like(rows) if begins is None else np.maximum.accumulate(np.where(begins, rows, 0))
     if representation == INCREMENTS:
-        with np.errstate(
-            invalid="ignore"
-        ):  # a row that is not finite has no increment, at the start of a stretch either
+        with np.errstate(invalid="ignore"):  # a row that is not finite has no increment, not even at the start of a run
             values = values - values[np.maximum(rows - 1, first)]
     if frames == 1:
         return values
@@ -49,10 +47,10 @@ def inputs(values: AnyFloats, begins: Bools | None, representation: str, frames:
 
 
 class Stacking:
-    """Stack rows that come in pieces as `inputs` does; it keeps the last rows of a piece, which the next one reads.
+    """Compute `codec_inputs` of rows that arrive in chunks; the last rows of a chunk are kept for the next one.
 
-    A stretch is a run of rows without a gap in time. Nothing here looks ahead, and nothing looks across the start of a
-    stretch: its first row stands in for the rows before it.
+    A run is a sequence of rows without a gap in time. Inputs depend neither on later rows nor on rows of an earlier
+    run: the first row of a run replaces the rows before it.
     """
 
     def __init__(self, representation: str, frames: int = 1) -> None:
@@ -62,19 +60,22 @@ class Stacking:
         self._begins = np.zeros(0, dtype=bool)
 
     def next(self, values: AnyFloats, begins: Bools) -> AnyFloats:
-        """Return what a codec reads of the next rows; ``values`` (time, channel) and ``begins`` (time,) as for `inputs`."""
+        """Return the inputs of the next rows.
+
+        ``values`` (time, channel) and ``begins`` (time,) are those of `codec_inputs`.
+        """
         before = len(self._begins)
         if self._values is not None:
             values, begins = np.concatenate([self._values, values]), np.concatenate([self._begins, begins])
         self._values, self._begins = values[-self._frames :], begins[-self._frames :]
-        return inputs(values, begins, self._representation, self._frames)[before:]
+        return codec_inputs(values, begins, self._representation, self._frames)[before:]
 
 
 DESCRIPTION, TENSORS = "codec.json", "codec.safetensors"
 
 
 class Codec(Protocol):
-    """Turns counts above rest into latents and back."""
+    """Encodes counts above rest as latents, and decodes them."""
 
     @property
     def kind(self) -> str:
@@ -105,26 +106,26 @@ class Codec(Protocol):
         """
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Return decoded counts, (…, latent) to (…, channel): levels or increments, whichever ``representation`` is."""
+        """Decode latents (…, latent) to counts (…, channel): levels or increments, according to ``representation``."""
 
 
 class FittedCodec(Codec, Protocol):
-    """A codec that was fitted: a class that an entry point of the group ``tacpipe.codecs`` names by its kind.
+    """A fitted codec. Its class is an entry point of the group ``tacpipe.codecs``, named by its kind.
 
-    A stage fits it, stores what `tacpipe.codecs.codec.to_files` returns of it, and adds its latents to each recording
-    (`tacpipe.codecs.tactile`). Models of the task ``forward`` keep a copy of its files and decode what they predict.
+    A stage fits it, stores the result of `tacpipe.codecs.codec.to_files`, and adds its latents to each recording
+    (`tacpipe.codecs.tactile`). Models of the task ``forward`` contain a copy of its files and decode their predictions.
     """
 
     def to_files(self) -> Mapping[str, bytes]:
-        """Return ``codec.json`` and ``codec.safetensors``: what `from_files` needs, and no pickle.
+        """Return ``codec.json`` and ``codec.safetensors``, which `from_files` reads. Pickles are not allowed.
 
         `codec.json` is a mapping (`description`) with at least ``kind``, ``of`` (the representation), ``channels`` and
-        ``layout`` (a mapping of texts each); the same codec gives the same bytes.
+        ``layout`` (a list of mappings of strings); equal codecs have equal bytes.
         """
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> FittedCodec:
-        """Return the codec that `to_files` wrote; the files may be untrusted (`tacpipe.datasets.model_files` reads them)."""
+        """Return the codec that `to_files` stored. The files may be untrusted; `tacpipe.datasets.model_files` reads them."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +148,22 @@ class Raw:
         return values.astype(np.float32)
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Return ``latents`` as they are, shape (…, channel)."""
+        """Return ``latents`` unchanged, shape (…, channel)."""
         return latents
 
 
 def decode_ahead(codec: Codec, latents: AnyFloats, last: AnyFloats) -> AnyFloats:
-    """Return the counts above rest that latents of future rows decode to, shape (window, step, channel).
+    """Decode the latents of future rows to counts above rest, shape (window, step, channel).
 
-    ``latents`` is (window, step, latent), its first step the row after ``last``, which is (window, channel) in counts
-    above rest. A codec of increments adds them up onto ``last``; one of levels does not look at it.
+    ``latents`` is (window, step, latent), its first step the row after ``last`` (window, channel), which is in counts
+    above rest. A codec of increments adds them to ``last``; a codec of levels ignores it.
     """
     decoded = codec.decode(latents)
     return last[:, None] + np.cumsum(decoded, axis=1) if codec.representation == INCREMENTS else decoded
 
 
 def encode_finite(project: Callable[[AnyFloats], AnyFloats], inputs: AnyFloats, width: int) -> AnyFloats:
-    """Return what ``project`` makes of the rows of ``inputs`` that are finite, (time, ``width``), float32; others NaN."""
+    """Apply ``project`` to the finite rows of ``inputs``, and return (time, ``width``), float32; other rows are NaN."""
     finite = np.isfinite(inputs).all(axis=1)
     latents = np.full((len(inputs), width), np.nan, dtype=np.float32)
     latents[finite] = project(inputs[finite])
@@ -170,7 +171,7 @@ def encode_finite(project: Callable[[AnyFloats], AnyFloats], inputs: AnyFloats, 
 
 
 def check_channels(expected: Sequence[str], channels: Sequence[str]) -> None:
-    """Raise `TacpipeError` unless ``channels`` names the channels a codec was fitted on, in their order."""
+    """Raise `TacpipeError` unless ``channels`` are those that the codec was fitted on, in the same order."""
     if tuple(expected) == tuple(channels):
         return
     at = next((i for i, pair in enumerate(zip(expected, channels, strict=False)) if pair[0] != pair[1]), None)
@@ -191,23 +192,23 @@ def latent_names(count: int) -> tuple[str, ...]:
 
 
 def description(content: Json) -> bytes:
-    """Return the bytes of ``codec.json``: keys sorted, so that one codec has one content."""
+    """Return the content of ``codec.json``, with sorted keys, so that equal codecs have equal bytes."""
     return model_files.to_json(content)
 
 
 NEEDED = {"of": str, "channels": list, "layout": list}
-PLUGIN = "plugin"  # field of `codec.json`: the package and version of a codec that is not tacpipe's own
+PLUGIN = "plugin"  # field of `codec.json`: the package and version of a codec from another package
 
 
 def load(files: Mapping[str, bytes]) -> FittedCodec:
-    """Return the codec that `codec.json` and `codec.safetensors` among ``files`` hold.
+    """Load the codec from `codec.json` and `codec.safetensors` in ``files``.
 
-    Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` if a file is missing, where the
-    kind is not installed, and where its parts do not fit one another.
+    Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` if a file is missing, the kind is
+    not installed, or the parts do not match.
     """
     missing = [name for name in (DESCRIPTION, TENSORS) if name not in files]
     if missing:
-        raise TacpipeError(f"There is no {' and no '.join(missing)} here. Give the output of `tacpipe compress`.")
+        raise TacpipeError(f"{missing[0]} does not exist here. Give the output of `tacpipe compress`.")
     content = model_files.tree(files, DESCRIPTION, {"kind": str})
     kind = content["kind"]
     if kind not in registry.codecs():
@@ -221,13 +222,13 @@ def load(files: Mapping[str, bytes]) -> FittedCodec:
         raise TacpipeError(f"A codec of kind {excerpt(kind)} is not installed here; {installed}.")
     model_files.tree(files, DESCRIPTION, NEEDED)
     codec_class = registry.load_codec(kind)
-    return _tried(lambda: codec_class.from_files(files))
+    return _load_checked(lambda: codec_class.from_files(files))
 
 
 def to_files(codec: FittedCodec) -> dict[str, bytes]:
-    """Return the files of a fitted codec, with the package that brings it, once they were read back.
+    """Return the files of a fitted codec, with the package that provides it, after checking that they can be loaded.
 
-    Raises `TacpipeError` if its kind is not that of an entry point, or its parts do not fit one another.
+    Raises `TacpipeError` if its kind is not its entry point, or its parts do not match.
     """
     files = dict(codec.to_files())
     read = load(files)
@@ -244,7 +245,7 @@ def to_files(codec: FittedCodec) -> dict[str, bytes]:
 
 
 def check_latents(codec: Codec, latents: AnyFloats, rows: int) -> None:
-    """Raise `TacpipeError` unless ``latents`` are as many as the codec names, of each of so many ``rows``."""
+    """Raise `TacpipeError` unless ``latents`` has the shape (``rows``, number of latents)."""
     expected = (rows, len(codec.latents))
     if latents.shape != expected:
         raise TacpipeError(
@@ -252,22 +253,22 @@ def check_latents(codec: Codec, latents: AnyFloats, rows: int) -> None:
         )
 
 
-def _tried(read: Callable[[], FittedCodec]) -> FittedCodec:
-    """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` if they do not."""
+def _load_checked(read: Callable[[], FittedCodec]) -> FittedCodec:
+    """Load a codec and apply it to a row of zeros. Raises `TacpipeError` if its parts do not match."""
     with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()
         if codec.representation not in (LEVELS, INCREMENTS) or not all(
             isinstance(name, str) for name in codec.channels
         ):
-            raise ValueError(f"it is of {codec.representation} and of {len(codec.channels)} channels")
+            raise ValueError(f"its representation is {codec.representation} and it has {len(codec.channels)} channels")
         if len(codec.layout) != len(codec.channels) or not all(
             isinstance(channel, Mapping) for channel in codec.layout
         ):
-            raise ValueError(f"{len(codec.channels)} channels lie in {len(codec.layout)} places")
+            raise ValueError(f"{len(codec.channels)} channels have a layout of {len(codec.layout)}")
         row = np.zeros((1, len(codec.channels)))
         latents = codec.encode(row, codec.channels)
         if latents.shape != (1, len(codec.latents)) or codec.decode(latents).shape != row.shape:
-            raise ValueError(f"{row.shape[1]} channels become {latents.shape[1]} latents and others")
+            raise ValueError(f"the shapes of {row.shape[1]} channels and {latents.shape[1]} latents do not match")
         if not np.isfinite(latents).all():
             raise ValueError("its numbers are so large that latents are not finite")
     return codec

@@ -1,7 +1,7 @@
-"""A small convolutional autoencoder of camera images, which is trained on images of the training recordings.
+"""Train a small convolutional autoencoder of camera images on the training recordings.
 
-Images are shrunk to the means of a coarse grid. Three convolutions with stride 2 and a linear layer lead to the features,
-and their mirror images back; the mean squared error of held-out recordings stops the training.
+Images are reduced to the means of a coarse grid. Three convolutions with stride 2 and a linear layer compute the
+features, and their mirror image decodes them. The mean squared error of held-out recordings stops the training.
 """
 
 from __future__ import annotations
@@ -23,38 +23,42 @@ from tacpipe.printable import plain
 from tacpipe.training import devices, loop
 from tacpipe.video.decoding import cell_means
 
-ROWS, COLUMNS = 48, 64  # grid to which an image is shrunk
+ROWS, COLUMNS = 48, 64  # grid to which an image is reduced
 CHANNELS = (3, 16, 32, 32)  # colours, and channels after each convolution
 INNER = (CHANNELS[-1], ROWS // 8, COLUMNS // 8)  # shape after the convolutions
-GRADIENT_CLIP = 1.0  # largest norm of the gradient
+GRADIENT_CLIP = 1.0  # maximum norm of the gradient
 WEIGHTS = "encoder.safetensors"
 Encode = Callable[[Bytes], Float32s]  # images, uint8 (frame, height, width, rgb), to features (frame, feature)
 
 
 class _Network(nn.Module):
-    """Convolutions that encode images as features, and their mirror image that decodes them."""
+    """Convolutions that encode images as features, and a decoder that mirrors them."""
 
     def __init__(self, components: int) -> None:
         super().__init__()
-        inward: list[nn.Module] = []
-        outward: list[nn.Module] = []
+        encoder_layers: list[nn.Module] = []
+        decoder_layers: list[nn.Module] = []
         for number, (before, after) in enumerate(itertools.pairwise(CHANNELS)):
-            inward += [nn.Conv2d(before, after, 4, 2, 1), nn.ELU()]
-            outward = [nn.ConvTranspose2d(after, before, 4, 2, 1), *([nn.ELU()] if number else []), *outward]
+            encoder_layers += [nn.Conv2d(before, after, 4, 2, 1), nn.ELU()]
+            decoder_layers = [
+                nn.ConvTranspose2d(after, before, 4, 2, 1),
+                *([nn.ELU()] if number else []),
+                *decoder_layers,
+            ]
         width = int(np.prod(INNER))
-        self.encoder = nn.Sequential(*inward, nn.Flatten(), nn.Linear(width, components))
-        self.decoder = nn.Sequential(nn.Linear(components, width), nn.ELU(), nn.Unflatten(1, INNER), *outward)
+        self.encoder = nn.Sequential(*encoder_layers, nn.Flatten(), nn.Linear(width, components))
+        self.decoder = nn.Sequential(nn.Linear(components, width), nn.ELU(), nn.Unflatten(1, INNER), *decoder_layers)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the reconstructed images (image, colour, row, column)."""
-        back: Tensor = self.decoder(self.encoder(images))
-        return back
+        reconstruction: Tensor = self.decoder(self.encoder(images))
+        return reconstruction
 
 
-def shrink(image: Bytes) -> Bytes:
-    """Return the means of the grid's cells, uint8 (row, column, rgb), of an image (height, width, rgb).
+def reduce_image(image: Bytes) -> Bytes:
+    """Return the means of the grid cells, uint8 (row, column, rgb), of an image (height, width, rgb).
 
-    Raises `TacpipeError` for an image with fewer pixels than cells.
+    Raises `TacpipeError` if the image has fewer pixels than cells along an axis.
     """
     height, width, _ = image.shape
     if height < ROWS or width < COLUMNS:
@@ -66,16 +70,16 @@ def shrink(image: Bytes) -> Bytes:
 
 
 def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path, components: int) -> bytes:
-    """Return the weights of an encoder with ``components`` features, as a safetensors file.
+    """Train an encoder with ``components`` features and return its weights as a safetensors file.
 
-    ``train`` and ``held_out`` are shrunk images, uint8 (image, row, column, rgb).
+    ``train`` and ``held_out`` are reduced images, uint8 (image, row, column, rgb).
     """
 
     def part(images: Bytes) -> loop.WindowSet:
         pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))).to(devices.kind())
 
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
-            batch = _scaled(pixels[indices])
+            batch = _to_unit_range(pixels[indices])
             return nn.functional.mse_loss(model(batch), batch)
 
         return loop.WindowSet(len(pixels), loss)
@@ -97,28 +101,30 @@ def read_encoder(weights: bytes) -> Encode:
         network = _Network(components)
         network.load_state_dict({**network.state_dict(), **tensors})
     except (SafetensorError, ValueError, IndexError, RuntimeError) as error:
-        raise TacpipeError(f"The weights are none of this autoencoder: {plain(str(error), 200)}.") from error
+        raise TacpipeError(f"The weights do not fit this autoencoder: {plain(str(error), 200)}.") from error
     network.eval()
 
     def encode(images: Bytes) -> Float32s:
-        shrunk = np.stack([shrink(image) for image in images]).transpose(0, 3, 1, 2)
+        reduced = np.stack([reduce_image(image) for image in images]).transpose(0, 3, 1, 2)
         with torch.inference_mode():
-            features: Float32s = network.encoder(_scaled(torch.from_numpy(np.ascontiguousarray(shrunk)))).numpy()
+            features: Float32s = network.encoder(
+                _to_unit_range(torch.from_numpy(np.ascontiguousarray(reduced)))
+            ).numpy()
         return features
 
     return encode
 
 
 def load_encoder(path: Path) -> Encode:
-    """Return the encoder of the file `WEIGHTS` that `tacpipe extract autoencoder` wrote next to its result."""
+    """Load the encoder from the file `WEIGHTS` that `tacpipe extract autoencoder` wrote next to its result."""
     return read_encoder(regular.content(path))
 
 
-def _scaled(pixels: Tensor) -> Tensor:
+def _to_unit_range(pixels: Tensor) -> Tensor:
     return pixels.float() / 127.5 - 1
 
 
 def select_images(images: Sequence[Bytes], held_out: float) -> tuple[Bytes, Bytes]:
-    """Return the images of all recordings but the last, and of the last ``held_out`` of them, at least one."""
+    """Split the images of recordings into those for training and those of the last ``held_out`` recordings, at least one."""
     count = max(1, round(held_out * len(images)))
     return np.concatenate(images[:-count]), np.concatenate(images[-count:])

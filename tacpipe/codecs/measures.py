@@ -1,14 +1,14 @@
-"""Measure a fitted codec, as ``codec.json`` holds it.
+"""Measure a fitted codec for ``codec.json``.
 
 ==================  ==============================================================================================
-reconstruction      of ``train`` rows and of ``val``, training recordings that were held out: mean squared error of
-                    encoding and decoding in units of each channel's scale, where 1 is what a codec without latents
-                    gives, and mean absolute error in counts
-latent_covariance   of the latents of the training rows, (latent, latent)
-search              the networks that were tried; see `tacpipe.codecs.autoencoder_fit`
+reconstruction      errors on ``train`` rows and on ``val``, held-out training recordings: mean squared error of
+                    encoding and decoding in units of each channel's scale, which is 1 for a codec without latents,
+                    and mean absolute error in counts
+latent_covariance   covariance (latent, latent) of the training rows' latents
+search              the candidate networks; see `tacpipe.codecs.autoencoder_fit`
 ==================  ==============================================================================================
 
-Errors are those of the newest frame and, of a codec of increments, those of the increments.
+Errors are those of the newest frame, or of its increments.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.codecs.codec import LEVELS
 from tacpipe.errors import TacpipeError
 
-DIGITS = 6  # stored digits; beyond them the order of additions matters, which the number of threads changes
+DIGITS = 6  # stored digits; further digits depend on the order of additions, so on the number of threads
 
 
 class Reconstruction(TypedDict):
@@ -34,7 +34,7 @@ class Reconstruction(TypedDict):
 
 
 class SearchedNetwork(TypedDict):
-    """A network that was tried for a codec."""
+    """A candidate network of a search."""
 
     hidden: list[int]
     learning_rate: float
@@ -48,7 +48,7 @@ class SearchedNetwork(TypedDict):
 class CodecMeasures(TypedDict, total=False):
     """The measures of a fitted codec."""
 
-    reconstruction: dict[str, Reconstruction]  # of ``train`` and ``val``
+    reconstruction: dict[str, Reconstruction]  # keyed by ``train`` and ``val``
     latent_covariance: list[list[float]]
     search: list[SearchedNetwork]
 
@@ -67,7 +67,7 @@ class StoredCodec(CodecMeasures):
 
 
 class RowCodec(Protocol):
-    """A codec that reads rows as `tacpipe.codecs.codec.inputs` makes them."""
+    """A codec that reads rows of `tacpipe.codecs.codec.codec_inputs`."""
 
     @property
     def scale_count(self) -> AnyFloats:
@@ -77,17 +77,17 @@ class RowCodec(Protocol):
         """Return the latents (row, latent) of finite rows (row, frames * channel)."""
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Return the counts that latents decode to."""
+        """Decode latents to counts."""
 
 
 def reconstructions(codec: RowCodec, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, Reconstruction]:
-    """Return the errors on each part, of rows (row, frames * channel) in pieces; a part without rows is left out."""
+    """Return the errors on each part, given as chunks of rows (row, frames * channel). Parts without rows are omitted."""
     errors_by_part = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
     return {name: errors for name, errors in errors_by_part.items() if errors}
 
 
 def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> Reconstruction | None:
-    """Return the errors of encoding and decoding rows (row, frames * channel), and their number; None of no rows."""
+    """Return the errors of encoding and decoding rows (row, frames * channel), and their number; None without rows."""
     rows, squares, deviations, width = 0, 0.0, 0.0, len(codec.scale_count)
     for inputs in pieces:
         newest = inputs[:, -width:]
@@ -105,27 +105,23 @@ def reconstruction(codec: RowCodec, pieces: Iterable[AnyFloats]) -> Reconstructi
 
 
 def covariance(latents: AnyFloats) -> list[list[float]]:
-    """Return the covariance of latents (row, latent), (latent, latent)."""
+    """Return the covariance (latent, latent) of latents (row, latent)."""
     return rounded_matrix(np.atleast_2d(np.cov(latents.astype(np.float64), rowvar=False)))
 
 
 def rounded_matrix(matrix: AnyFloats) -> list[list[float]]:
-    """Return a matrix rounded to the stored digits of its largest entry."""
+    """Round a matrix to the stored digits of its largest entry."""
     digits = DIGITS - 1 - int(np.floor(np.log10(max(float(np.abs(matrix).max()), 1e-30))))
-    return (matrix.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
+    return (matrix.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no -0
 
 
 def rounded(value: float) -> float:
-    """Return ``value`` rounded to the stored digits.
-
-    >>> rounded(0.123456789)
-    0.123457
-    """
+    """Round ``value`` to the stored digits."""
     return float(f"{value:.{DIGITS}g}")
 
 
-def stored(content: StoredCodec) -> CodecMeasures:
-    """Return what ``codec.json`` holds of measures."""
+def measures_from(content: StoredCodec) -> CodecMeasures:
+    """Return the measures in ``codec.json``."""
     measures: CodecMeasures = {}
     if "reconstruction" in content:
         measures["reconstruction"] = content["reconstruction"]
@@ -136,34 +132,34 @@ def stored(content: StoredCodec) -> CodecMeasures:
     return measures
 
 
-def unmoving_channels(values: AnyFloats, channels: Sequence[str]) -> list[str]:
-    """Return the names of the channels that have one value in all rows of ``values`` (time, channel)."""
-    return [name for name, moves in zip(channels, _moves(values), strict=True) if not moves]
+def constant_channels(values: AnyFloats, channels: Sequence[str]) -> list[str]:
+    """Return the names of the channels that are constant in ``values`` (time, channel)."""
+    return [name for name, moves in zip(channels, _varies(values), strict=True) if not moves]
 
 
-def standard(values: AnyFloats, representation: str) -> tuple[AnyFloats, AnyFloats]:
-    """Return mean and scale of each channel in counts, (channel,) each, of training rows ``values`` (time, channel).
+def mean_and_scale(values: AnyFloats, representation: str) -> tuple[AnyFloats, AnyFloats]:
+    """Return mean and scale of each channel in counts, both (channel,), of training rows ``values`` (time, channel).
 
-    The scale is the standard deviation, and 1 for a channel that never moves. Increments keep the mean 0, so that rows
-    that do not move have latents 0. Raises `TacpipeError` if no channel moves.
+    The scale is the standard deviation, or 1 for a constant channel. The mean of increments is set to 0, so that rows
+    without change have latents 0. Raises `TacpipeError` if all channels are constant.
     """
-    moves = _moves(values)
+    moves = _varies(values)
     if not moves.any():
-        raise none_moves(values.shape[1], len(values))
+        raise no_moving_channel_error(values.shape[1], len(values))
     mean = values.mean(axis=0) if representation == LEVELS else np.zeros(values.shape[1])
     return mean, np.where(moves, values.std(axis=0), 1.0)
 
 
-def none_moves(channels: int, rows: int) -> TacpipeError:
-    """Return the error of training rows in which no channel moves."""
+def no_moving_channel_error(channels: int, rows: int) -> TacpipeError:
+    """Return the error for training rows in which all channels are constant."""
     return TacpipeError(
-        f"None of the {channels} tactile channels moves in {rows} training rows, so there is nothing to compress. Give "
+        f"None of the {channels} tactile channels changes in {rows} training rows, so there is nothing to compress. Give "
         "training recordings with contact."
     )
 
 
-def _moves(values: AnyFloats) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return whether a channel has more than one value: exact, where a standard deviation would leave rounding."""
+def _varies(values: AnyFloats) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return whether each channel has more than one value; exact, in contrast to a standard deviation."""
     if not len(values):
         return np.zeros(values.shape[1], dtype=bool)
     moves: np.ndarray[Any, np.dtype[np.bool_]] = values.max(axis=0) > values.min(axis=0)
@@ -171,21 +167,21 @@ def _moves(values: AnyFloats) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 class Moments:
-    """Number, range and triangle of rows (row, channel).
+    """The number, range and triangular factor of rows (row, channel).
 
-    Covariances are kept as the triangle R of a QR decomposition of all rows, [1 | x] = Q R, which has as many rows as
-    columns. The triangle of more rows is that of R and the new rows below it (Golub, Van Loan, Matrix Computations, 4th
-    ed., 6.5), so no product of rows is ever summed, and no digits are lost to the means.
+    Covariances are stored as the triangular factor R of a QR decomposition of all rows, [1 | x] = Q R, which has as
+    many rows as columns. Adding rows updates it to the factor of R with the new rows below (Golub, Van Loan, Matrix
+    Computations, 4th ed., 6.5), so products of rows are never summed, and the means cost no precision.
     """
 
     def __init__(self, width: int) -> None:
-        self.count = 0  # rows
+        self.count = 0  # number of rows
         self._low, self._high = np.full(width, np.inf), np.full(width, -np.inf)
         self._triangle: AnyFloats = np.zeros((width + 1, width + 1))
 
     @classmethod
     def from_pieces(cls, pieces: Iterable[AnyFloats], width: int) -> Moments:
-        """Return the moments of rows that come in pieces."""
+        """Return the moments of chunks of rows."""
         moments = cls(width)
         for piece in pieces:
             moments.add(piece)
@@ -198,7 +194,7 @@ class Moments:
             self._low, self._high = np.minimum(self._low, rows.min(axis=0)), np.maximum(self._high, rows.max(axis=0))
             self._extend(np.column_stack([np.ones(len(rows)), rows]))
 
-    def merged(self, further: Moments) -> Moments:
+    def merge(self, further: Moments) -> Moments:
         """Return the moments of both sets of rows."""
         merged = Moments(len(self._low))
         merged.count = self.count + further.count
@@ -208,29 +204,29 @@ class Moments:
         return merged
 
     @property
-    def moves(self) -> Bools:
-        """Channels with more than one value: exact, where a standard deviation would leave rounding."""
+    def varies(self) -> Bools:
+        """Whether each channel has more than one value; exact, in contrast to a standard deviation."""
         return self._high > self._low
 
     @property
-    def centred(self) -> AnyFloats:
-        """The triangle of the rows without their means (channel, channel)."""
-        triangle: AnyFloats = self._triangle[1:, 1:] * self.moves
+    def centred_triangle(self) -> AnyFloats:
+        """The triangular factor (channel, channel) of the centred rows."""
+        triangle: AnyFloats = self._triangle[1:, 1:] * self.varies
         return triangle
 
-    def standard(self, representation: str) -> tuple[AnyFloats, AnyFloats]:
-        """Return mean and scale of each channel, (channel,) each, as `tacpipe.codecs.measures.standard` does of the rows."""
-        if not self.moves.any():
-            raise none_moves(len(self._low), self.count)
-        spread = np.sqrt(np.square(self.centred).sum(axis=0) / self.count)
+    def mean_and_scale(self, representation: str) -> tuple[AnyFloats, AnyFloats]:
+        """Return mean and scale of each channel, both (channel,), as `tacpipe.codecs.measures.mean_and_scale`."""
+        if not self.varies.any():
+            raise no_moving_channel_error(len(self._low), self.count)
+        spread = np.sqrt(np.square(self.centred_triangle).sum(axis=0) / self.count)
         mean = self._triangle[0, 1:] / self._triangle[0, 0] if representation == LEVELS else np.zeros(len(spread))
-        return mean, np.where(self.moves, spread, 1.0)
+        return mean, np.where(self.varies, spread, 1.0)
 
-    def standardised(self, representation: str) -> AnyFloats:
-        """Return the triangle of the rows (channel, channel) as `standard` makes channels alike."""
-        _, scale = self.standard(representation)
+    def standardised_triangle(self, representation: str) -> AnyFloats:
+        """Return the triangular factor (channel, channel) of the standardised rows."""
+        _, scale = self.mean_and_scale(representation)
         if representation == LEVELS:
-            return self.centred / scale
+            return self.centred_triangle / scale
         return _triangle(self._triangle[:, 1:] / scale)
 
     def _extend(self, rows: AnyFloats) -> None:

@@ -1,8 +1,8 @@
-"""Principal components of standardised tactile channels.
+"""Fit and apply principal components of standardised tactile channels.
 
-The equations are those of any textbook (Pearson 1901): with the training rows' mean and standard deviation s of each
-channel, latent = W ((counts - mean) / s) with orthonormal rows in W, and counts = mean + s (latent W). Of increments the
-mean is 0.
+The equations are standard (Pearson 1901): with the mean and standard deviation s of each channel on training rows,
+latent = W ((counts - mean) / s) with orthonormal rows in W, and counts = mean + s (latent W). For increments, the mean
+is 0.
 """
 
 from __future__ import annotations
@@ -27,53 +27,55 @@ from tacpipe.codecs.codec import (
     latent_names,
 )
 from tacpipe.codecs.measures import Moments
-from tacpipe.codecs.training_rows import CodecRows, held_out, warn_of_still
+from tacpipe.codecs.training_rows import CodecRows, held_out, warn_of_constant_channels
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
 
 @dataclass(frozen=True)
 class PCA:
-    """A fitted codec. Arrays are float64: mean and scale in counts, ``components`` without unit."""
+    """A fitted PCA. Arrays are float64: mean and scale in counts, ``components`` without unit."""
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
     mean_count: AnyFloats  # (channel,)
     scale_count: AnyFloats  # (channel,)
     components: AnyFloats  # (latent, channel)
-    explained_ratio: AnyFloats  # (component,), of all components, kept or not
+    explained_ratio: AnyFloats  # (component,), of all components, including those that are dropped
     representation: str = codecs.LEVELS
     measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "pca"
 
     @property
     def latents(self) -> tuple[str, ...]:
-        """The names of the latents: ``z00`` holds the most variance."""
+        """The names of the latents; ``z00`` has the most variance."""
         return latent_names(len(self.components))
 
     @property
     def reads(self) -> int:
-        """How many rows up to each its latents depend on."""
+        """The number of rows that the latents of a row depend on."""
         return 2 if self.representation == codecs.INCREMENTS else 1
 
     def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
-        """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
+        """Return the latents (time, latent), float32, of counts above rest (time, channel).
 
-        Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
+        Raises `TacpipeError` unless ``channels`` are those of the fit, in the same order.
         """
         check_channels(self.channels, channels)
-        return encode_finite(self.project, codecs.inputs(values, begins, self.representation, 1), len(self.components))
+        return encode_finite(
+            self.project, codecs.codec_inputs(values, begins, self.representation, 1), len(self.components)
+        )
 
     def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent) of finite rows (row, channel) of the codec's ``representation``."""
         return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Return the counts that latents decode to as float64, (…, latent) to (…, channel)."""
+        """Decode latents (…, latent) to counts (…, channel), float64."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
     def to_files(self) -> dict[str, bytes]:
-        """Return the codec as the content of ``codec.safetensors`` and ``codec.json``."""
+        """Return the content of ``codec.safetensors`` and ``codec.json``."""
         content = {
             **self.measured,
             "kind": self.kind,
@@ -93,7 +95,7 @@ class PCA:
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> PCA:
-        """Return the codec that `to_files` wrote."""
+        """Return the codec that `to_files` stored."""
         content, tensors = json.loads(files[DESCRIPTION]), model_files.arrays(files[TENSORS], TENSORS)
         return cls(
             tuple(content["channels"]),
@@ -103,7 +105,7 @@ class PCA:
             tensors["components"],
             tensors["explained_ratio"],
             content["of"],
-            measures.stored(content),
+            measures.measures_from(content),
         )
 
 
@@ -116,11 +118,11 @@ def fit(
     variance: float = 0.0,
     representation: str = codecs.LEVELS,
 ) -> PCA:
-    """Return the codec fitted on training rows, counts above rest or their increments (``representation``).
+    """Fit the codec on training rows, which are counts above rest or their increments (``representation``).
 
-    It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this fraction of the variance.
-    A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
-    Raises `TacpipeError` for a count or fraction that the data cannot give.
+    It has ``components`` latents or, if ``variance`` is above 0, enough for this fraction of the variance. A constant
+    channel gets the scale 1. The sign of each component is chosen so that its largest weight is positive. Raises
+    `TacpipeError` if the count or fraction is out of range, or all channels are constant.
     """
     width = len(channels)
     limit = min(rows.count - 1, width)
@@ -132,10 +134,11 @@ def fit(
         )
     if variance == 0 and not 1 <= components <= limit:
         raise TacpipeError(f"components is {components}; {rows.count} rows of {width} channels give 1 to {limit}.")
-    mean, scale = rows.standard(representation)
-    # scikit-learn's PCA always takes the mean off, which increments keep; the triangle of a QR has the same singular
-    # values and right vectors as all the rows, and as few rows as there are channels.
-    _, singular, weights = np.linalg.svd(rows.standardised(representation))
+    mean, scale = rows.mean_and_scale(representation)
+    # scikit-learn's PCA always subtracts the mean, which increments must keep. The triangular factor of a QR
+    # decomposition has the same singular values and right vectors as all rows, and only as many rows as there are
+    # channels.
+    _, singular, weights = np.linalg.svd(rows.standardised_triangle(representation))
     power = singular**2
     ratio = power / power.sum()
     count = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
@@ -156,20 +159,20 @@ def fit(
 def fit_and_measure(
     rows: CodecRows, *, components: int = 20, variance: float = 0.0, representation: str = codecs.LEVELS
 ) -> PCA:
-    """Return the codec fitted on ``rows`` of all recordings, with its measures; they are read twice, in pieces.
+    """Fit the codec on ``rows`` of all recordings and measure it; the rows are read twice, in chunks.
 
-    The errors are those of as many components fitted without the recordings that are held out, as an autoencoder of
-    the same recordings is, so that the two compare. Without any held out, ``val`` is left out. Warns of channels that
-    never move while others do.
+    The errors are those of a PCA with as many components, fitted without the held-out recordings, so that they compare
+    with those of an autoencoder. If no recordings are held out, ``val`` is omitted. Warns of constant channels, unless
+    all are.
     """
     validation = held_out(rows.names)
     parts: dict[str, Collection[str]] = {"train": set(rows.names) - validation, "val": validation}
     width = len(rows.channels)
     train, val = (Moments.from_pieces(rows.pieces(names), width) for names in parts.values())
-    all_rows = train.merged(val)
+    all_rows = train.merge(val)
     if all_rows.count > 1:
-        unmoving = [name for name, moves in zip(rows.channels, all_rows.moves, strict=True) if not moves]
-        warn_of_still(unmoving, width)
+        constant = [name for name, moves in zip(rows.channels, all_rows.varies, strict=True) if not moves]
+        warn_of_constant_channels(constant, width)
     fit_rows = functools.partial(fit, channels=rows.channels, layout=rows.layout, representation=representation)
     codec = fit_rows(all_rows, components=components, variance=variance)
     evaluated = codec
@@ -187,6 +190,6 @@ def fit_and_measure(
 
 
 def _covariance(codec: PCA, rows: Moments) -> list[list[float]]:
-    """Return the covariance of the latents of all rows, (latent, latent)."""
-    spread = rows.centred / codec.scale_count @ codec.components.T
+    """Return the covariance (latent, latent) of the latents of all rows."""
+    spread = rows.centred_triangle / codec.scale_count @ codec.components.T
     return measures.rounded_matrix(spread.T @ spread / (rows.count - 1))

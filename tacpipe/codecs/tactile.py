@@ -1,4 +1,4 @@
-"""The tactile channels of a table: which they are, where they sit, and their counts above rest."""
+"""Select the tactile channels of a table, with their layout and their counts above rest."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Fitted
 
 
-LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes where a channel lies
+LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes the position of a channel
 
 
 def metadata(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a column as text, or empty if it has none."""
+    """Return the metadata of a column as strings; empty if it has none."""
     return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
 
 
 def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
-    """Return the names of the columns whose field metadata has this ``quantity``, in the order of the table."""
+    """Return the names of the columns with this ``quantity`` in their metadata, in the order of the table."""
     return tuple(field.name for field in schema if metadata(field).get("quantity") == quantity)
 
 
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
-    """Return stream, taxel and axis of each channel, as far as its metadata names them."""
+    """Return stream, taxel and axis of each channel, if its metadata contains them."""
     described = [metadata(schema.field(name)) for name in channels]
     return [
         {key: metadata_of_channel[key] for key in LAYOUT if key in metadata_of_channel}
@@ -47,9 +47,9 @@ def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
 
 
 def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
-    """Return each channel's level without load in counts, shape (channel,), from its field metadata ``levels``.
+    """Return each channel's level without load in counts, shape (channel,), from its field metadata ``rest``.
 
-    Raises `TacpipeError` if a channel has none.
+    Raises `TacpipeError` if a channel has no such level.
     """
     levels = []
     for name in channels:
@@ -64,7 +64,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
 
 
 def matrix(table: pa.Table, names: Sequence[str]) -> AnyFloats:
-    """Return the named columns side by side as float64, shape (time, column)."""
+    """Return the named columns as a float64 matrix (time, column)."""
     values = np.empty((table.num_rows, len(names)))
     for index, name in enumerate(names):
         values[:, index] = table.column(name).to_numpy()
@@ -76,37 +76,37 @@ def above_rest(table: pa.Table, channels: Sequence[str]) -> AnyFloats:
     return matrix(table, channels) - rest_counts(table.schema, channels)
 
 
-def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchReader:
-    """Return the recording's table with its latents, float32 columns, by the codec whose files were ``fitted``.
+def add_latents(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchReader:
+    """Return the recording's table with its latents as float32 columns, encoded by the codec whose files are ``fitted``.
 
-    A codec with ``reads``, the number of rows up to each that its latents depend on, encodes a long recording in pieces,
-    and these are returned as they are made; any other encodes it as a whole. Raises `TacpipeError` if the recording's
-    channels are not those the codec was fitted on.
+    If a codec has the attribute ``reads``, the number of rows that the latents of a row depend on, a long recording is
+    encoded in chunks, which are returned one by one. Otherwise it is encoded at once. Raises `TacpipeError` if the
+    recording's channels are not those that the codec was fitted on.
     """
     codec, stored_columns = codecs.load(fitted), recording.columns()
     channels = columns(stored_columns.schema, "tactile")
-    with _errors_naming(recording.name):
+    with _prefix_errors(recording.name):
         codecs.check_channels(codec.channels, channels)
         begins = codecs.run_starts(times(stored_columns))
         stored_columns.forget()
         if getattr(codec, "reads", 0) and stored_columns.num_rows > SOME_ROWS:
-            return _in_pieces(recording.name, stored_columns, codec, begins)
+            return _encode_in_chunks(recording.name, stored_columns, codec, begins)
         table = recording.table()
         latents = codec.encode(above_rest(table, channels), channels, begins)  # (time, latent)
-        return _with(table, codec, latents)
+        return _append_latents(table, codec, latents)
 
 
 @contextmanager
-def _errors_naming(name: str) -> Iterator[None]:
-    """Have an error of encoding name the recording."""
+def _prefix_errors(name: str) -> Iterator[None]:
+    """Prefix errors in the block with the recording's name."""
     try:
         yield
     except TacpipeError as error:
         raise TacpipeError(f"{name}: {error}") from error
 
 
-def _in_pieces(name: str, stored_columns: Columns, codec: Any, begins: Bools) -> pa.RecordBatchReader:
-    """Return the rows of a recording with their latents, each piece encoded behind the rows before it that it reads."""
+def _encode_in_chunks(name: str, stored_columns: Columns, codec: Any, begins: Bools) -> pa.RecordBatchReader:
+    """Return the rows of a recording with their latents; each chunk is encoded with the previous rows that it depends on."""
     before = codec.reads - 1
 
     def batches() -> Iterator[pa.RecordBatch]:
@@ -115,17 +115,19 @@ def _in_pieces(name: str, stored_columns: Columns, codec: Any, begins: Bools) ->
         for table in stored_columns.batches():
             lead = min(row, before)
             counts = np.concatenate([counts[len(counts) - lead :], above_rest(table, codec.channels)])
-            with _errors_naming(name):
+            with _prefix_errors(name):
                 latents = codec.encode(counts, codec.channels, begins[row - lead : row + table.num_rows])[lead:]
-                piece = _with(table, codec, latents)
+                piece = _append_latents(table, codec, latents)
             yield from piece.combine_chunks().to_batches()
             row += table.num_rows
 
-    return pa.RecordBatchReader.from_batches(_with(stored_columns.schema.empty_table(), codec, None).schema, batches())
+    return pa.RecordBatchReader.from_batches(
+        _append_latents(stored_columns.schema.empty_table(), codec, None).schema, batches()
+    )
 
 
-def _with(table: pa.Table, codec: codecs.FittedCodec, latents: AnyFloats | None) -> pa.Table:
-    """Return a table with its latents (time, latent), or with none for a table without rows."""
+def _append_latents(table: pa.Table, codec: codecs.FittedCodec, latents: AnyFloats | None) -> pa.Table:
+    """Append latents (time, latent) to a table; None appends empty columns to an empty table."""
     values = np.zeros((0, len(codec.latents)), np.float32) if latents is None else latents
     codecs.check_latents(codec, values, table.num_rows)
     for index, name in enumerate(codec.latents):

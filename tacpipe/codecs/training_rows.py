@@ -1,4 +1,4 @@
-"""The rows that a codec is fitted on, recording by recording."""
+"""Select the rows of recordings that a codec is fitted on."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 
-HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured on
+HELD_OUT = 0.15  # fraction of the training recordings that measure a codec
 log = logging.getLogger(__name__)
 
 
 class CodecRows(Protocol):
-    """Rows that codecs are fitted on, by recording: finite, in contact, and outside of gaps."""
+    """Rows for fitting a codec, by recording: finite, in contact, and outside of gaps."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -40,7 +40,7 @@ class CodecRows(Protocol):
         """The names of all recordings."""
 
     def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
-        """Yield the rows (row, frames * channel) of some recordings, in the order of their names and of time, in pieces."""
+        """Yield the rows (row, frames * channel) of some recordings in chunks, ordered by name and time."""
 
 
 @dataclass(frozen=True)
@@ -58,27 +58,27 @@ class TrainingRows:
 
     @property
     def held_out(self) -> frozenset[str]:
-        """The recordings to measure a codec on, as `held_out` chooses them."""
+        """The names of the recordings that measure a codec, see `held_out`."""
         return held_out(self.names)
 
     @property
     def parts(self) -> tuple[AnyFloats, AnyFloats]:
         """The rows of the recordings that are not held out, and of those that are."""
-        return self.of(self.inputs.keys() - self.held_out), self.of(self.held_out)
+        return self.select(self.inputs.keys() - self.held_out), self.select(self.held_out)
 
-    def of(self, names: Collection[str]) -> AnyFloats:
-        """Return the rows (row, frames * channel) of some recordings, in the order of their names."""
+    def select(self, names: Collection[str]) -> AnyFloats:
+        """Return the rows (row, frames * channel) of some recordings, ordered by name."""
         width = max(rows.shape[1] for rows in self.inputs.values())
         return np.concatenate([np.zeros((0, width)), *self.pieces(names)])
 
     def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
-        """Yield the rows of each of some recordings, in the order of their names."""
+        """Yield the rows of each of some recordings, ordered by name."""
         return (self.inputs[name] for name in sorted(names))
 
 
 @dataclass(frozen=True)
 class StoredRows:
-    """The rows of all recordings, which are read each time that they are asked for: a piece of one is in memory."""
+    """The rows of all recordings, read again at each access; only a chunk of one recording is in memory."""
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
@@ -92,9 +92,9 @@ class StoredRows:
         return self.recordings.keys()
 
     def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
-        """Yield the rows of some recordings, in the order of their names and of time, in pieces.
+        """Yield the rows of some recordings in chunks, ordered by name and time.
 
-        Raises `TacpipeError` naming the recording whose channels are others.
+        Raises `TacpipeError` with the name of a recording whose channels differ.
         """
         for name in sorted(names):
             try:
@@ -103,20 +103,20 @@ class StoredRows:
                 raise TacpipeError(f"{name}: {error}") from error
 
     def read(self) -> TrainingRows:
-        """Return the rows of all recordings. Warns of channels that never move while others do."""
-        inputs = {name: np.concatenate([self._none, *self.pieces([name])]) for name in sorted(self.names)}
+        """Read the rows of all recordings into memory. Warns of constant channels, unless all are."""
+        inputs = {name: np.concatenate([self._empty, *self.pieces([name])]) for name in sorted(self.names)}
         rows = TrainingRows(self.channels, self.layout, inputs)
-        newest = rows.of(rows.names)[:, -len(self.channels) :]
+        newest = rows.select(rows.names)[:, -len(self.channels) :]
         if len(newest) > 1:
-            warn_of_still(measures.unmoving_channels(newest, self.channels), len(self.channels))
+            warn_of_constant_channels(measures.constant_channels(newest, self.channels), len(self.channels))
         return rows
 
     @property
-    def _none(self) -> AnyFloats:
+    def _empty(self) -> AnyFloats:
         return np.zeros((0, self.frames * len(self.channels)))
 
     def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
-        """Yield the rows of a recording that a codec may be fitted on."""
+        """Yield the rows of a recording that are suitable for fitting a codec."""
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
         begins, gaps = codec.run_starts(tactile.times(stored)), tactile.gap_mask(stored)
         in_contact = np.ones(len(begins), dtype=bool)
@@ -127,16 +127,18 @@ class StoredRows:
         for table in stored.batches(self.channels):
             now = slice(row, row + table.num_rows)
             counts = tactile.above_rest(table, self.channels)
-            counts[gaps[now]] = np.nan  # results of such a row are not finite either
+            counts[gaps[now]] = np.nan  # makes all results of such a row NaN
             stacked = stacking.next(counts, begins[now])
             yield stacked[np.isfinite(stacked).all(axis=1) & in_contact[now]]
             row += table.num_rows
 
 
 def held_out(names: Collection[str]) -> frozenset[str]:
-    """Return the recordings to measure a codec on: always the same ones of the same recordings, so that errors compare.
+    """Return the names of the recordings that measure a codec.
 
-    At least one, and none where there is one recording alone.
+    The same names give the same choice, so that errors compare.
+
+    Returns at least one name, or none if there is only one recording.
     """
     if len(names) < 2:
         return frozenset()
@@ -145,15 +147,15 @@ def held_out(names: Collection[str]) -> frozenset[str]:
     return frozenset(name for (name, _), role in roles.items() if role == "val")
 
 
-def stored(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> StoredRows:
-    """Return the rows of recordings that a codec of a ``representation`` and some ``frames`` is fitted on.
+def stored_rows(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> StoredRows:
+    """Return the rows of recordings for fitting a codec with this ``representation`` and number of ``frames``.
 
-    A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Raises
-    `TacpipeError` if there is no recording or no tactile channel.
+    A row is used if it is in contact and all its frames are finite and outside of gaps. Raises `TacpipeError` if there
+    are no recordings or no tactile channels.
     """
     codec.check_representation(representation)
     if not recordings:
-        raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
+        raise TacpipeError("There is no training recording to fit a codec on. Make a split with some.")
     schema = recordings[min(recordings)].columns().schema
     channels = tactile.columns(schema, "tactile")
     if not channels:
@@ -161,21 +163,21 @@ def stored(recordings: Mapping[str, Recording], representation: str, frames: int
     return StoredRows(channels, tuple(tactile.layout(schema, channels)), recordings, representation, frames)
 
 
-def read(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
-    """Return the rows that `stored` returns, read: all are in memory.
+def read_rows(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
+    """Read the rows of `stored_rows` into memory.
 
-    Warns of channels that never move while others do. Raises `TacpipeError` as `stored`, and naming the recording whose
-    channels are others.
+    Warns of constant channels, unless all are. Raises `TacpipeError` as `stored_rows`, and with the name of a recording
+    whose channels differ.
     """
-    return stored(recordings, representation, frames).read()
+    return stored_rows(recordings, representation, frames).read()
 
 
-def warn_of_still(names: Sequence[str], channels: int) -> None:
-    """Log the names of channels, of so many, that have one value in all training rows, unless all do."""
+def warn_of_constant_channels(names: Sequence[str], channels: int) -> None:
+    """Log the names of constant channels, unless all ``channels`` are constant."""
     if 0 < len(names) < channels:
         log.warning(
             "%d of %d tactile channels never move in the training recordings: %s. Their taxels may be dead; a codec "
-            "gives them back as they were here.",
+            "reconstructs them as constants.",
             len(names),
             channels,
             ", ".join(names),

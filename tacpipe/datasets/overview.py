@@ -126,7 +126,9 @@ def recording_html(recording: Recording) -> str:
         tables = (
             {} if recording.streams == ("",) and "t_ns" not in recording.table().column_names else streams_of(recording)
         )
-        picture = drawing.svg(drawing.rows(curves.curves_of_streams(tables), taxels.of_streams(tables)))
+        picture = drawing.svg(
+            drawing.picture_rows(curves.curves_of_streams(tables), taxels.taxels_from_streams(tables))
+        )
         picture = picture or f"<pre>{escape(repr(recording))}</pre>"
     except TacpipeError as error:  # damaged
         picture = f"<pre>{escape(printable.lines([str(error)]))}</pre>"

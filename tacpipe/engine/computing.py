@@ -106,7 +106,7 @@ def _begin(task: WorkerTask, store: Store) -> Callable[[], Done]:
     key = digest(task.identity)
     try:
         with ExitStack() as leases:
-            with devices.chosen(task.device):
+            with devices.use_device(task.device):
                 outcome = _computed(task, store, key, leases)
             if isinstance(outcome, _Made):
                 return _Sending(task, store, outcome, leases.pop_all())

@@ -341,7 +341,7 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
         yield
         return
     with (
-        display.on_stderr(registry.stage_name(name), workspace) as displays,
+        display.followers_on_stderr(registry.stage_name(name), workspace) as displays,
         following.in_workspace(workspace, *displays),
     ):
         yield
@@ -357,7 +357,7 @@ def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
     local_workspace = (
         None if store.distant else workspace(store, digest(task.identity))
     )  # the workspace of a remote store is in the worker's folder
-    with display.on_stderr(registry.stage_name(task.name), local_workspace) as displays:
+    with display.followers_on_stderr(registry.stage_name(task.name), local_workspace) as displays:
         yield (*following.trackers(), *displays)
 
 

@@ -105,7 +105,7 @@ class DurationEstimate:
         noun = "model" if self.models == 1 else "models"
         return (
             f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
-            f"{display.duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, "
+            f"{display.format_duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, "
             f"here and now."
         )
 
@@ -147,7 +147,7 @@ def _is_missing(request: Request) -> bool:
 def _timed(request: Request) -> float | None:
     stopwatch = _Stopwatch()
     try:
-        with following.tracked([stopwatch]):
+        with following.track_with([stopwatch]):
             pipeline.run(replace(request, executor="local", track=()))
     except _TimedError:
         return stopwatch.all_s

@@ -111,7 +111,7 @@ def _tracked(
         outcome.notes += tracked.failures if terminal.is_quiet() else []
 
     try:
-        with following.tracked([tracked]):
+        with following.track_with([tracked]):
             yield end
     except BaseException:
         tracked.abandon()

@@ -1,13 +1,13 @@
-"""Measure how well probabilities and quantiles match frequencies: temperature, reliability, pinball loss and coverage.
+"""Measure the calibration of probabilities and quantiles: temperature, reliability, pinball loss and coverage.
 
-Temperature scaling divides scores by one number before the softmax, which changes no name (Guo, Pleiss, Sun and Weinberger,
-On calibration of modern neural networks, ICML 2017). It is fitted by the likelihood of labels that hedge as Platt's do
-(Probabilistic outputs for support vector machines, 1999): with n slides a label counts 1 - 1 / (n + 2), so that no error
-among few slides does not become certainty.
+Temperature scaling divides scores by one number before the softmax, which does not change the predicted class (Guo,
+Pleiss, Sun and Weinberger, On calibration of modern neural networks, ICML 2017). It is fitted to the likelihood of
+labels smoothed as by Platt (Probabilistic outputs for support vector machines, 1999): with n slides a label has the
+weight 1 - 1 / (n + 2), so that a few slides without errors do not imply certainty.
 
 The pinball loss (Koenker and Bassett, Regression quantiles, 1978) of a quantile ``q`` at a level ``p`` is ``p (y - q)``
-where the true value ``y`` lies above, else ``(1 - p) (q - y)``: least, on average, for the true quantile. Coverage is the
-fraction of true values in the band between the lowest and the highest quantile; a band is only good if it is narrow too.
+if the true value ``y`` is above it, else ``(1 - p) (q - y)``; its mean is minimal for the true quantile. Coverage is
+the fraction of true values between the lowest and the highest quantile; a good band is also narrow.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from tacpipe.metrics.intervals import Estimate
 if TYPE_CHECKING:
     import pandas as pd
 
-BINS = 10  # equally wide bins of confidence
-MIN_PROBABILITY = 1e-12  # probability
-RANGE = 8.0  # natural logarithm of a temperature, about that of the spread of scores
+BINS = 10  # bins of confidence, equally wide
+MIN_PROBABILITY = 1e-12
+RANGE = 8.0  # range of the logarithm of a temperature, relative to the spread of scores
 
 
 def probabilities(scores: AnyFloats, temperature: float = 1.0) -> Floats:
@@ -39,9 +39,9 @@ def probabilities(scores: AnyFloats, temperature: float = 1.0) -> Floats:
 
 
 def temperature(scores: AnyFloats, labels: Ints) -> float:
-    """Return the temperature of the highest likelihood of hedged labels (slide,), columns of ``scores`` (slide, class).
+    """Return the maximum-likelihood temperature for smoothed labels (slide,), the columns of ``scores`` (slide, class).
 
-    Raises `TacpipeError` without slides.
+    Raises `TacpipeError` if there are no slides.
     """
     if not len(labels):
         raise TacpipeError("There is no slide to fit a temperature on. Make a split with slides of the role val.")
@@ -52,7 +52,7 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
     targets = np.where(finite, (1 - hedge) * targets + hedge / finite.sum(axis=1, keepdims=True), 0)
     spread = float(np.std(scores[finite])) or 1.0
 
-    from scipy.optimize import minimize_scalar  # slow to import, and quantiles do not need it
+    from scipy.optimize import minimize_scalar  # slow to import, and not needed for quantiles
 
     def loss(log: float) -> float:
         logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), MIN_PROBABILITY))
@@ -63,13 +63,13 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
 
 
 def log_loss(class_probabilities: AnyFloats, labels: Ints) -> float:
-    """Return the mean negative log-likelihood of labels (slide,), columns of probabilities (slide, class)."""
+    """Return the mean negative log-likelihood of labels (slide,), the columns of probabilities (slide, class)."""
     likelihoods = np.maximum(class_probabilities[np.arange(len(labels)), labels], MIN_PROBABILITY)
     return float(-np.log(likelihoods).mean())
 
 
 class ConfidenceBin(TypedDict):
-    """The slides of a bin of confidence: how many, their mean confidence and their accuracy."""
+    """The slides in a bin of confidence: their number, mean confidence and accuracy."""
 
     n: int
     confidence: float
@@ -77,7 +77,7 @@ class ConfidenceBin(TypedDict):
 
 
 def reliability(confidence: AnyFloats, right: Bools) -> list[ConfidenceBin]:
-    """Return for each bin of confidence that holds slides how many, their mean confidence and their accuracy."""
+    """Return the number of slides, mean confidence and accuracy of each nonempty bin of confidence."""
     bins = np.minimum((confidence * BINS).astype(int), BINS - 1)
     rows: list[ConfidenceBin] = []
     for number in np.unique(bins):
@@ -93,18 +93,20 @@ def reliability(confidence: AnyFloats, right: Bools) -> list[ConfidenceBin]:
 
 
 def calibration_error(confidence: AnyFloats, right: Bools) -> float:
-    """Return the expected calibration error: the mean distance of confidence and accuracy over bins, by their slides.
+    """Return the expected calibration error: the mean of |confidence - accuracy| over bins, weighted by slides.
 
-    With n slides it is above 0 by chance alone, by about sqrt(accuracy (1 - accuracy) / n) and more with several bins.
+    With n slides it is above 0 by chance, by about sqrt(accuracy (1 - accuracy) / n), and more with several bins.
     """
     rows = reliability(confidence, right)
     return sum(row["n"] * abs(row["confidence"] - row["accuracy"]) for row in rows) / max(1, len(right))
 
 
 def auroc(known_scores: AnyFloats, unknown_scores: AnyFloats) -> float:
-    """Return the probability that a slide of a known class has a higher score than one of an unknown class, ties half.
+    """Return the probability that a slide of a known class has a higher score than one of an unknown class.
 
-    It is the area under the receiver operating characteristic (Hanley and McNeil, 1982); NaN without slides of both.
+    Ties count half.
+
+    This is the area under the receiver operating characteristic (Hanley and McNeil, 1982). NaN if either has no slides.
 
     >>> auroc(np.array([2.0, 3.0]), np.array([1.0, 2.0]))
     0.875
@@ -120,7 +122,7 @@ def auroc(known_scores: AnyFloats, unknown_scores: AnyFloats) -> float:
 
 
 def check_levels(percents: tuple[int, ...]) -> None:
-    """Raise `TacpipeError` unless levels are whole percentages that lie symmetrically about 50 and include it.
+    """Raise `TacpipeError` unless levels are ascending integer percentages, symmetric about 50, that include 50.
 
     >>> check_levels((10, 50, 90))
     """
@@ -129,20 +131,20 @@ def check_levels(percents: tuple[int, ...]) -> None:
     if ordered != percents or ordered != mirrored or 50 not in ordered or len(ordered) < 3 or ordered[0] < 1:
         listed_percents = ",".join(map(str, percents))
         raise TacpipeError(
-            f"The quantiles {listed_percents} are not levels that lie symmetrically about 50. Give percentages "
+            f"The quantiles {listed_percents} are not levels symmetric about 50. Give percentages "
             f"from 1 to 99 in "
             f"ascending order with 50 in the middle, as 10,50,90."
         )
 
 
 def pinball(above: AnyFloats, levels: AnyFloats) -> AnyFloats:
-    """Return the loss by value and level (..., level) where the true value lies ``above`` (..., level) the quantile."""
+    """Return the pinball loss (..., level); ``above`` (..., level) is the true value minus the quantile."""
     return np.maximum(levels * above, (levels - 1) * above)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Sums over the values of one recording: what adds up."""
+    """Sums over the values of one recording, which can be added."""
 
     pinball: AnyFloats  # (step, level), counts
     below: AnyFloats  # (step, level), true values at or below the quantile
@@ -152,7 +154,7 @@ class Sums:
 
     @classmethod
     def from_predictions(cls, truth: AnyFloats, predicted: AnyFloats, levels: AnyFloats) -> Sums:
-        """Return the sums over true values (value, step) of predicted quantiles (value, step, level).
+        """Return the sums over true values (value, step) and predicted quantiles (value, step, level).
 
         ``levels`` (level,) are fractions in ascending order.
         """
@@ -171,28 +173,28 @@ class Sums:
         return Sums(*(getattr(self, name) + getattr(further, name) for name in self.__dataclass_fields__))
 
 
-def tree(
+def measures_by_step(
     recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None
 ) -> dict[str, dict[str, float]]:
     """Return the measures over recordings by step, ``t1`` …, and over all steps, ``mean``.
 
-    ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with the 95 % interval of it over
-    recordings as ``coverage_low`` and ``coverage_high``; ``width`` the band's mean; ``below_q10`` … the fraction
-    of true values at or below each quantile. ``pinball_skill`` is 1 - pinball / pinball of ``baseline``, sums of the same
-    recordings.
+    ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with its 95 % interval over
+    recordings as ``coverage_low`` and ``coverage_high``; ``width`` the mean width of the band; ``below_q10`` … the
+    fraction of true values at or below each quantile. ``pinball_skill`` is 1 - pinball / pinball of ``baseline``, sums
+    over the same recordings.
     """
     total = recordings[0]
     for recording in recordings[1:]:
         total = total + recording
     measures = {
-        "pinball": _steps(total.pinball.mean(axis=1), total.values),
-        "coverage": _steps(total.covered, total.values),
-        "width": _steps(total.width, total.values),
+        "pinball": _means_by_step(total.pinball.mean(axis=1), total.values),
+        "coverage": _means_by_step(total.covered, total.values),
+        "width": _means_by_step(total.width, total.values),
     }
     for at, percent in enumerate(percents):
-        measures[f"below_q{percent}"] = _steps(total.below[:, at], total.values)
+        measures[f"below_q{percent}"] = _means_by_step(total.below[:, at], total.values)
     if len(recordings) > 1:
-        low, high = _interval(recordings)
+        low, high = _coverage_interval(recordings)
         measures["coverage_low"], measures["coverage_high"] = low, high
     if baseline is not None:
         baseline_pinball = np.sum([recording.pinball.sum(axis=1) for recording in baseline], axis=0)
@@ -204,13 +206,13 @@ def tree(
     return measures
 
 
-def _steps(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
-    """Return sums (step,) divided by how many values each is of, by step and over all."""
+def _means_by_step(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
+    """Return sums (step,) divided by their number of values, by step and over all steps."""
     return _by_step(np.append(sums / values, sums.sum() / values.sum()))
 
 
-def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the ends of the 95 % interval of coverage over recordings, by step and over all."""
+def _coverage_interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the bounds of the 95 % interval of coverage over recordings, by step and over all steps."""
     covered, values = (
         np.stack([np.append(getattr(recording, name), getattr(recording, name).sum()) for recording in recordings])
         for name in ("covered", "values")
@@ -220,14 +222,14 @@ def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float
 
 
 def _by_step(values: AnyFloats) -> dict[str, float]:
-    """Return values (step + 1,) by their names, to 9 digits; what is not defined is left out."""
+    """Return values (step + 1,) by name, rounded to 9 digits, without undefined ones."""
     names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
     return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}
 
 
 @dataclass(frozen=True)
 class Band:
-    """The worth of a predictor's band, which reaches from its lowest to its highest quantile."""
+    """Quality of a predictor's band, from its lowest to its highest quantile."""
 
     values: int
     clusters: int
@@ -238,10 +240,10 @@ class Band:
 
 
 def measure_bands(rows: pd.DataFrame, group: str, cluster: str, baseline: str) -> dict[tuple[Any, str], Band]:
-    """Return the worth of each predictor's band on each ``group``, a column with targets or steps.
+    """Return the quality of each predictor's band for each ``group``, a column of targets or steps.
 
-    ``rows`` are those of ``coverage.parquet``: ``covered``, ``width`` and ``pinball`` of single values, or their sums over
-    ``values``. Intervals are over what the column ``cluster`` names.
+    ``rows`` are those of ``coverage.parquet``: ``covered``, ``width`` and ``pinball`` of single values, or their sums
+    over ``values``. Intervals are over the groups in the column ``cluster``.
     """
     columns = ["covered", "width", "pinball", "values"]
     counted = rows.assign(values=rows.get("values", 1.0)).astype(dict.fromkeys(columns, float))
@@ -264,46 +266,46 @@ def measure_bands(rows: pd.DataFrame, group: str, cluster: str, baseline: str) -
 
 
 def promised_quantile(scores: AnyFloats, groups: Ints, level: float, noun: str) -> float:
-    """Return the promised `conformal_quantile`. Raises `TacpipeError` if ``groups``, each a ``noun``, are too few."""
+    """Return the promised `conformal_quantile`. Raises `TacpipeError` if there are too few ``groups``, each a ``noun``."""
     bound = conformal_quantile(scores, groups, level, promised=True)
     if not np.isfinite(bound):
         count = len(np.unique(groups))
         raise TacpipeError(
-            f"{count} calibration {noun} can guarantee a band with a coverage of {100 * most_promised(count):.0f} % "
-            f"at most, not "
+            f"{count} calibration {noun} can guarantee a band with a coverage of "
+            f"{100 * highest_promised_level(count):.0f} % at most, not "
             f"{100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave "
             f"out --promise."
         )
     return bound
 
 
-def most_promised(groups: int) -> float:
+def highest_promised_level(groups: int) -> float:
     """Return the highest level that can be promised with this number of calibration groups.
 
-    >>> most_promised(4)
+    >>> highest_promised_level(4)
     0.8
     """
     return groups / (groups + 1)
 
 
 def conformal_quantile(scores: AnyFloats, groups: Ints, level: float, *, promised: bool = False) -> float:
-    """Return the smallest score at or below which ``level`` of the weight lies, each group weighing the same.
+    """Return the smallest score at or below which the fraction ``level`` of the weight is; groups weigh the same.
 
-    Windows of a recording depend on each other, so recordings are what is exchangeable, and each counts the same however
-    long it is. Two answers are given for the quantile of scores of calibration recordings:
+    Windows of a recording depend on each other, so recordings are exchangeable, and each has the same weight whatever
+    its length. There are two quantiles of the scores of calibration recordings:
 
     - **pooled** (Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA
-      2022, section 3.1, pooling CDFs): the quantile of all scores, each weighted by one over the number of scores of its
-      group. Coverage tends to the level as groups become many; with few it has no guarantee.
+      2022, section 3.1, pooling CDFs): the quantile of all scores, each weighted by one over the number of scores of
+      its group. Coverage approaches the level with the number of groups; with few groups it has no guarantee.
     - **promised** (Lee, Barber and Willett, Distribution-free inference with hierarchical data, 2023, HCP; with one
-      score a group it is split conformal prediction, Vovk et al., Algorithmic Learning in a Random World, 2005): as many
-      groups and one more, whose scores are infinite. A score of a new exchangeable group lies at or below it with a
-      probability of at least the level, averaged over draws of all groups. With K groups no level above K / (K + 1) can
-      be promised.
+      score per group it is split conformal prediction, Vovk et al., Algorithmic Learning in a Random World, 2005): the
+      same with one more group, whose scores are infinite. A score of a new exchangeable group is at or below it with a
+      probability of at least the level, averaged over draws of all groups. With K groups, no level above K / (K + 1)
+      can be promised.
 
-    ``scores`` and ``groups`` (score,) are of calibration recordings. With ``promised`` one more group of infinite scores is
-    among them; the result is infinite where the level cannot be promised. Raises `TacpipeError` without scores, for other
-    shapes, and for a level that is not between 0 and 1.
+    ``scores`` and ``groups`` (score,) are those of calibration recordings. With ``promised``, the result is infinite if
+    the level cannot be promised. Raises `TacpipeError` if there are no scores, shapes do not match, or the level is not
+    between 0 and 1.
 
     >>> conformal_quantile(np.array([1.0, 2.0, 3.0, 9.0]), np.array([0, 0, 0, 1]), 0.5)
     3.0
@@ -314,11 +316,11 @@ def conformal_quantile(scores: AnyFloats, groups: Ints, level: float, *, promise
         raise TacpipeError(f"The level {level:g} is not between 0 and 1. Give one like 0.9.")
     if scores.ndim != 1 or scores.shape != groups.shape or not len(scores):
         raise TacpipeError(
-            f"Scores of {scores.shape} and groups of {groups.shape} have no quantile; both must be (score,), one or more."
+            f"Scores of {scores.shape} and groups of {groups.shape} have no quantile; both must be (score,), not empty."
         )
     _, codes = np.unique(groups, return_inverse=True)
     sizes = np.bincount(codes)
     order = np.argsort(scores, kind="stable")
     weights = 1 / (sizes[codes[order]] * (len(sizes) + promised))
-    reached = np.cumsum(weights) >= level - 1e-9  # sums of as many as there are scores round
-    return float(scores[order[int(np.argmax(reached))]]) if reached.any() else float("inf")
+    reaches_level = np.cumsum(weights) >= level - 1e-9  # tolerates the rounding of the sum
+    return float(scores[order[int(np.argmax(reaches_level))]]) if reaches_level.any() else float("inf")

@@ -1,7 +1,8 @@
-"""Compare a model with the best of its baselines, with the certainty of their difference.
+"""Define headlines, which compare a model with its best baseline, with the uncertainty of the difference.
 
-Tasks compute headlines (`tacpipe.headlines`), ``tacpipe evaluate`` writes them to ``headline.json`` and prints them, pages
-and ``tacpipe show`` show them. This module imports neither numpy nor anything else that a cache hit must not wait for.
+Tasks compute headlines (`tacpipe.headlines`), ``tacpipe evaluate`` writes them to ``headline.json`` and prints them,
+and reports and ``tacpipe show`` display them. This module imports neither numpy nor any other package that slows a
+cache hit.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from tacpipe.io import Json
 
 FILE = "headline.json"
 MIN_CLUSTERS = (
-    6  # clusters for a verdict: of 5 that all favour one side, chance alone gives 1 in 16, which is more than 5 %
+    6  # minimum for a verdict: 5 clusters all favour the same side with probability 1/16, which is more than 5 %
 )
 BETTER, WORSE, UNCLEAR, NO_VERDICT = "better", "worse", "unclear", ""
 NONE = "–"
@@ -26,7 +27,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class HeadlineRow:
-    """The errors of one predictor, one value a column of the headline, or NaN if one is not defined."""
+    """The errors of one predictor, one value per column of the headline; NaN if undefined."""
 
     name: str
     values: tuple[float, ...]
@@ -34,29 +35,29 @@ class HeadlineRow:
 
 @dataclass(frozen=True)
 class Headline:
-    """A model and its baselines on one part of the recordings, all on the same ones."""
+    """A model and its baselines on one part of the recordings, all evaluated on the same recordings."""
 
     task: str
     method: str
-    part: str  # recordings: "unseen objects", "BioTac"; empty: all that the model has not seen
-    target: str  # predicted target, where a part has several; empty: all
+    part: str  # recordings: "unseen objects", "BioTac"; empty: all recordings that the model was not trained on
+    target: str  # predicted target, if there are several in a part; empty: all
     columns: tuple[str, ...]  # names of the errors
-    unit: str  # names of the errors
-    ranked_by: str  # the error that orders the baselines and that the gain is computed from
+    unit: str  # unit of the errors, in words
+    ranked_by: str  # the error that ranks the baselines and determines the gain
     model: HeadlineRow
-    baselines: tuple[HeadlineRow, ...]  # the best first
-    measure: str  # kind of gain: "skill" (1 − error / error of the best baseline) or "points" (of percent)
-    gain: float  # gain of the model over the best baseline, or NaN if it is not defined
+    baselines: tuple[HeadlineRow, ...]  # best first
+    measure: str  # kind of gain: "skill" (1 − error / error of the best baseline) or "points" (percentage points)
+    gain: float  # gain of the model over the best baseline; NaN if undefined
     low: float  # 95 % interval of the gain; NaN with fewer than three clusters
     high: float
-    clusters: int  # units of the interval
-    cluster: str  # the name of the units: "recordings", "slides", "grasps", "objects"
+    clusters: int  # number of units of the interval
+    cluster: str  # plural name of the units: "recordings", "slides", "grasps", "objects"
     runs: int
-    seeds: int  # several are units of the interval too
-    effective: float = float("nan")  # number of equal clusters that are as certain; NaN in older results
-    methods: int = 1  # number of methods from which the model was picked as the best
+    seeds: int  # if several, they are also units of the interval
+    effective: float = float("nan")  # effective number of clusters; NaN in older results
+    methods: int = 1  # number of methods from which the model was selected as the best
     reference: str = ""  # the baseline that tables show next to the best one
-    left_out: int = 0  # recordings on which the reference makes no error, which have no ratio to it
+    left_out: int = 0  # number of recordings without an error of the reference, so without a ratio to it
 
     @property
     def best(self) -> HeadlineRow | None:
@@ -65,12 +66,12 @@ class Headline:
 
     @property
     def table_baselines(self) -> tuple[HeadlineRow, ...]:
-        """Return the baselines that tables show: the best one and the reference."""
+        """The baselines that tables show: the best one and the reference."""
         return tuple(row for row in self.baselines if row is self.best or row.name == self.reference)
 
     @property
     def verdict(self) -> str:
-        """How the model compares with the best baseline (`verdict_of`), or empty if none was evaluated."""
+        """The comparison with the best baseline (`verdict_of`); empty if there is no baseline."""
         return verdict_of(self.low, self.high, self.clusters, self.effective)
 
     @property
@@ -80,7 +81,7 @@ class Headline:
 
     @property
     def interval(self) -> str:
-        """How the interval was made."""
+        """The description of the interval."""
         return (
             f"95 % interval over {counted(self.clusters, self.cluster)}"
             f"{f' and {self.seeds} seeds' if self.seeds > 1 else ''}"
@@ -88,14 +89,14 @@ class Headline:
         )
 
     def to_json(self) -> Json:
-        """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict are next to it."""
+        """Return the headline as JSON, with its best baseline and verdict; undefined values are null."""
         fields = asdict(self)
         best = self.best
         return {**_json(fields), "best_baseline": best.name if best else None, "verdict": self.verdict}
 
     @classmethod
     def from_json(cls, value: Json) -> Headline:
-        """Return the headline that `to_json` wrote."""
+        """Return the headline that `to_json` stored."""
         fields = {name: value[name] for name in cls.__dataclass_fields__ if name in value}
         fields |= {name: _number(fields.get(name)) for name in ("gain", "low", "high", "effective")}
         fields |= {"columns": tuple(value["columns"]), "model": _row(value["model"])}
@@ -109,54 +110,49 @@ def write(headlines: Sequence[Headline]) -> bytes:
 
 
 def read(content: bytes) -> list[Headline]:
-    """Return the headlines that ``headline.json`` holds."""
+    """Parse the headlines in ``headline.json``."""
     return [Headline.from_json(stored) for stored in json.loads(content)["headlines"]]
 
 
 def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
-    """Return ``better`` or ``worse`` where the interval of a gain excludes 0, ``unclear`` where it does not.
+    """Return ``better`` or ``worse`` if the interval of a gain excludes 0, otherwise ``unclear``.
 
-    Empty if an interval is not sure to hold 95 %: with fewer than `MIN_CLUSTERS` clusters, or where these are as certain as
-    fewer equal ones would be (``effective``), and without an interval.
+    Returns the empty string if there is no interval, or its coverage may be below 95 %: fewer than `MIN_CLUSTERS`
+    clusters, or a smaller ``effective`` number.
     """
     if clusters < MIN_CLUSTERS or round(effective, 6) < MIN_CLUSTERS or math.isnan(low) or math.isnan(high):
         return NO_VERDICT
     return BETTER if low > 0 else WORSE if high < 0 else UNCLEAR
 
 
-def too_few(clusters: int, cluster: str, effective: float) -> str:
-    """Return why there is no verdict, as a clause.
-
-    >>> too_few(5, "recordings", 5.0), too_few(23, "recordings", 4.04)
-    ('5 recordings are too few for a verdict', '23 recordings count as 4.0 equal ones, too few for a verdict')
-    """
+def explain_no_verdict(clusters: int, cluster: str, effective: float) -> str:
+    """Return why there is no verdict, as a clause."""
     if clusters >= MIN_CLUSTERS and round(effective, 6) < MIN_CLUSTERS:
         return f"{counted(clusters, cluster)} count as {effective:.1f} equal ones, too few for a verdict"
     return f"{counted(clusters, cluster)} {'is' if clusters == 1 else 'are'} too few for a verdict"
 
 
 def verdict(headlines: Sequence[Headline]) -> str:
-    """Return the verdict on several headlines together: ``better`` only where each is, ``worse`` only where each is."""
+    """Return the common verdict of several headlines: ``better`` or ``worse`` if all agree, otherwise ``unclear``."""
     verdicts = {headline.verdict for headline in headlines}
     return next(iter(verdicts)) if len(verdicts) == 1 else UNCLEAR if verdicts else NO_VERDICT
 
 
 def sentence(headline: Headline) -> str:
-    """Return how the model compares with the best baseline, no more surely than the interval allows."""
-    return f"{_capital(headline.where)}: {headline.method} {clause(headline)}."
+    """Return the comparison with the best baseline as a sentence, as certain as the interval allows."""
+    return f"{_capitalize(headline.where)}: {headline.method} {clause(headline)}."
 
 
 def clause(headline: Headline) -> str:
-    """Return what follows the method's name in a sentence: "is better than ridge, the best of 3 baselines: skill …"."""
+    """Return the predicate of the method in a sentence: "is better than ridge, the best of 3 baselines: skill …"."""
     best = headline.best
     if best is None:
         return f"was evaluated without a baseline, on {counted(headline.clusters, headline.cluster)}"
     name = f"{best.name}, the best of {len(headline.baselines)} baselines" if len(headline.baselines) > 1 else best.name
     gain = f"{amount(headline)}"
     if headline.verdict == NO_VERDICT:
-        return (
-            f"has {gain} over the baseline {name}; {too_few(headline.clusters, headline.cluster, headline.effective)}"
-        )
+        reason = explain_no_verdict(headline.clusters, headline.cluster, headline.effective)
+        return f"has {gain} over the baseline {name}; {reason}"
     interval = f" ({bounds(headline)}, {headline.interval})"
     return {
         BETTER: f"is better than the baseline {name}: {gain}{interval}",
@@ -172,18 +168,14 @@ def amount(headline: Headline) -> str:
 
 
 def bounds(headline: Headline) -> str:
-    """Return the interval of the gain, or empty if it is not defined."""
+    """Return the interval of the gain as text; empty if undefined."""
     if math.isnan(headline.low):
         return ""
     return f"{signed(headline.low, headline.measure)} to {signed(headline.high, headline.measure)}"
 
 
 def signed(value: float, measure: str = "skill") -> str:
-    """Return a gain with its sign.
-
-    >>> signed(0.1234), signed(-0.0245), signed(2.5, "points"), signed(float("nan")), signed(-123.4)
-    ('+0.123', '−0.025', '+2.5', 'not defined', '−123')
-    """
+    """Format a gain with its sign."""
     if math.isnan(value):
         return "not defined"
     digits = 1 if measure == "points" else 3 if abs(value) < 10 else 0
@@ -191,27 +183,19 @@ def signed(value: float, measure: str = "skill") -> str:
 
 
 def number(value: float) -> str:
-    """Return an error with four digits.
-
-    >>> number(12345.6), number(0.012345), number(float("nan")), number(-0.25)
-    ('12,346', '0.01235', '–', '−0.25')
-    """
+    """Format an error with four digits."""
     if math.isnan(value):
         return NONE
     return (f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}").replace("-", "−")
 
 
 def counted(count: int, plural: str) -> str:
-    """Return how many there are of a noun.
-
-    >>> counted(1, "recordings"), counted(1200, "slides")
-    ('1 recording', '1,200 slides')
-    """
+    """Format a count with its noun."""
     return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
 
 
 def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
-    """Return heads and rows of a table of headlines with the same columns: a row the model, one its best baseline."""
+    """Return header and rows of a table of headlines with the same columns: model and best baseline per headline."""
     if not headlines:
         return [], []
     first = headlines[0]
@@ -235,28 +219,28 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
 
 
 def caption(headlines: Sequence[Headline]) -> str:
-    """Return what the columns of `table` mean, in a sentence or two."""
+    """Return a caption that explains the columns of `table`."""
     first = headlines[0]
     skill = f" Skill is 1 − error / error of the best baseline; the error is {first.ranked_by}."
     points = f" Points are percentage points of {first.ranked_by} above the best baseline."
     over = {f"{headline.cluster}{' and seeds' if headline.seeds > 1 else ''}" for headline in headlines}
     return (
         f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: jackknife over "
-        f"{' or '.join(sorted(over))}, model and baseline on the same ones.{_left_out(headlines)}"
+        f"{' or '.join(sorted(over))}, model and baseline on the same ones.{_omission_note(headlines)}"
     )
 
 
-def _left_out(headlines: Sequence[Headline]) -> str:
+def _omission_note(headlines: Sequence[Headline]) -> str:
     count = sum(headline.left_out for headline in headlines)
     return f" Left out: {counted(count, 'recordings')} without an error of {headlines[0].reference}." if count else ""
 
 
-def _capital(words: str) -> str:
+def _capitalize(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
 def _json(value: Any) -> Any:
-    """Return a value with null in place of what is not a number, floats to 9 digits: more would differ between machines."""
+    """Replace undefined numbers by null and round floats to 9 digits; more would differ between machines."""
     if isinstance(value, dict):
         return {name: _json(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -267,7 +251,7 @@ def _json(value: Any) -> Any:
 
 
 class StoredRow(TypedDict):
-    """A `HeadlineRow` in ``headline.json``; an undefined value is null."""
+    """A `HeadlineRow` in ``headline.json``; undefined values are null."""
 
     name: str
     values: list[float | None]
@@ -282,17 +266,17 @@ def _number(value: float | None) -> float:
 
 
 SUMMARY = "summary.json"
-MAX_NUMBERS = 30  # numbers: those of headlines that would be more are left out
+MAX_NUMBERS = 30  # maximum number of entries; further ones are dropped
 Names = Mapping[str, str]
 
 
 def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> dict[str, float | int]:
-    """Return the least gain over the best baseline with its interval and clusters, and an error a part and target.
+    """Return the smallest gain over the best baseline, with its interval and clusters, and one error per part and target.
 
-    ``gain``, ``low``, ``high`` and ``n`` are of the headline whose gain is least: a model is better than its baselines only
-    where each of its headlines is. Errors are of the last column of each, and named by the target where there are several.
-    ``names`` are short names of parts and targets. What is not defined is left out. Where tables show a reference, the mean
-    absolute errors of model and reference follow.
+    ``gain``, ``low``, ``high`` and ``n`` belong to the headline with the smallest gain, because a model is better than
+    its baselines only if all its headlines are. Errors are those of the last column, named by the target if there are
+    several. ``names`` maps parts and targets to short names. Undefined values are omitted. If tables show a reference,
+    the mean absolute errors of model and reference follow.
     """
     if not headlines:
         return {}
@@ -305,17 +289,17 @@ def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})
     }
     targets = (
         len({headline.target for headline in headlines}) > 1
-    )  # their errors are of one measure, which no name repeats
-    for headline, place in zip(headlines, _places(headlines, names), strict=True):
+    )  # all targets have the same measure, so its name is omitted
+    for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
         summary["_".join(place if targets else [*place, _short(headline.columns[-1])])] = headline.model.values[-1]
-    for headline, place in zip(headlines, _places(headlines, names), strict=True):
+    for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
         reference = next((row for row in headline.baselines if row.name == headline.reference), None)
         for at, column in enumerate(headline.columns if reference else ()):
             if reference and column.startswith("MAE"):
                 summary["_".join([*place, _short(column)])] = headline.model.values[at]
                 summary["_".join([*place, reference.name, _short(column)])] = reference.values[at]
     finite = {name: value for name, value in summary.items() if math.isfinite(value)}
-    return {name: _rounded(value) for name, value in list(finite.items())[: MAX_NUMBERS - 1]}
+    return {name: _round_float(value) for name, value in list(finite.items())[: MAX_NUMBERS - 1]}
 
 
 def write_summary(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> bytes:
@@ -323,24 +307,24 @@ def write_summary(headlines: Sequence[Headline], names: Names = MappingProxyType
     return (json.dumps(summarize(headlines, names), indent=1, allow_nan=False) + "\n").encode()
 
 
-def _places(headlines: Sequence[Headline], names: Names) -> list[list[str]]:
-    """Return the short names of target and part of each headline, without what is the same for all."""
-    places: list[list[str]] = [[] for _ in headlines]
+def _distinct_names(headlines: Sequence[Headline], names: Names) -> list[list[str]]:
+    """Return the short names of target and part of each headline, omitting those that all headlines share."""
+    names_by_headline: list[list[str]] = [[] for _ in headlines]
     for texts in ([headline.target for headline in headlines], [headline.part for headline in headlines]):
         if len(set(texts)) > 1:
-            for place, text in zip(places, texts, strict=True):
+            for place, text in zip(names_by_headline, texts, strict=True):
                 place.append(names.get(text) or _short(text))
-    return places
+    return names_by_headline
 
 
 def _short(text: str) -> str:
-    """Return text as a name.
+    """Convert text to an identifier.
 
-    >>> [_short(one) for one in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
+    >>> [_short(text) for text in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
     ['vs_persistence', 'accuracy', 'rmse', 'unseen_objects']
     """
     return "_".join(re.findall(r"[a-z0-9]+", re.sub(r"\(.*?\)", "", text.lower())))
 
 
-def _rounded(value: float | int) -> float | int:
+def _round_float(value: float | int) -> float | int:
     return float(f"{value:.6g}") if isinstance(value, float) else value

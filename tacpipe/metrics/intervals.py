@@ -1,11 +1,12 @@
-"""95 % intervals of values that are computed from sums over recordings.
+"""Compute 95 % intervals of values that depend on sums over recordings.
 
-Windows overlap, and those of one recording share object, grasp and drift, so recordings (or objects, grasps, slides: here
-clusters) are what chance draws. An interval follows from how much a value changes when one cluster is left out (jackknife;
-Tukey, Bias and confidence in not-quite large samples, 1958), and from Student's t. Ratios of errors are compared by their
-logarithm. Of clusters that count differently, the degrees of freedom follow from their effective number, because a value
-that rests on four clusters is as uncertain as if there were four. Several seeds are a second factor that is left out one
-by one; the freedom of both is combined by Satterthwaite's formula (Biometrics Bulletin, 1946).
+Windows overlap, and windows of a recording share object, grasp and drift. So recordings (or objects, grasps, slides;
+here clusters) are the independent samples. An interval is computed from the change of a value when one cluster is
+omitted (jackknife; Tukey, Bias and confidence in not-quite large samples, 1958) and Student's t. Ratios of errors are
+compared by their logarithm. If clusters have different weights, the degrees of freedom are based on their effective
+number, because a value that depends on four clusters is as uncertain as with four clusters. Several seeds are a second
+factor, also omitted one by one; the degrees of freedom of both are combined by Satterthwaite's formula (Biometrics
+Bulletin, 1946).
 
 ``docs/benchmarks/intervals.md`` has the coverage in simulations, next to that of bootstrap intervals.
 """
@@ -24,17 +25,17 @@ from tacpipe.arrays import AnyArray, AnyFloats, Bools
 from tacpipe.errors import TacpipeError
 
 COVERAGE = 0.95
-MIN_INTERVAL_CLUSTERS = 3  # clusters of an interval; two show nothing of how much they vary
-DRAWS = 20_000  # simulated values of the largest of several statistics
+MIN_INTERVAL_CLUSTERS = 3  # two clusters do not determine a variance well enough
+DRAWS = 20_000  # simulated values of the maximum of several statistics
 NODES, BISECTIONS = 64, 50  # nodes to integrate Student's density, and steps to invert it
-MIN_RATIO = 1e-12  # ratio of errors whose logarithm is taken
-Statistic = Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to values (draw, value)
+MIN_RATIO = 1e-12  # smallest ratio of errors whose logarithm is computed
+Statistic = Callable[[AnyFloats], AnyFloats]  # maps sums (draw, part) to values (draw, value)
 
 
 class Estimate(NamedTuple):
     """A value and its 95 % interval.
 
-    All are NaN if the value is not defined; the ends are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
+    All are NaN if the value is undefined; the bounds are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
     """
 
     mean: float
@@ -44,7 +45,7 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Interval:
-    """Values with the ends of their 95 % intervals, each (value,); ends are NaN if they are not defined."""
+    """Values with the bounds of their 95 % intervals, each (value,); undefined bounds are NaN."""
 
     mean: AnyFloats
     low: AnyFloats
@@ -52,33 +53,33 @@ class Interval:
 
     @property
     def first(self) -> Estimate:
-        """The first value."""
+        """The first value with its interval."""
         return Estimate(*(float(ends[0]) for ends in (self.mean, self.low, self.high)))
 
 
 @dataclass(frozen=True)
 class Jackknife:
-    """Values of all clusters and how uncertain they are, each (value,)."""
+    """Values over all clusters and their uncertainty, each (value,)."""
 
     mean: AnyFloats
     error: AnyFloats  # standard error
     freedom: AnyFloats  # degrees of freedom of the standard error
-    influence: AnyFloats  # (cluster, value): by how much each cluster moves the value
+    influence: AnyFloats  # (cluster, value): the contribution of each cluster to the value
 
     def interval(self) -> Interval:
         """Return the values with their intervals."""
-        reach = (
+        half_width = (
             np.array([student_quantile(freedom, (1 + COVERAGE) / 2) for freedom in self.freedom.tolist()]) * self.error
         )
-        return Interval(self.mean, self.mean - reach, self.mean + reach)
+        return Interval(self.mean, self.mean - half_width, self.mean + half_width)
 
 
 @functools.lru_cache(maxsize=1024)
 def student_quantile(freedom: float, level: float) -> float:
-    """Return a quantile above the median of Student's t with so many degrees of freedom, NaN for NaN.
+    """Return a quantile above the median of Student's t with ``freedom`` degrees of freedom; NaN for NaN.
 
-    scipy has it too, but its import takes longer than those of an evaluation. With t = sqrt(freedom) tan(angle) the density
-    is a power of the cosine, which Gauss' rule integrates and bisection inverts.
+    scipy's function is not used because its import takes longer than the evaluation. With t = sqrt(freedom) tan(angle),
+    the density is a power of the cosine, which Gaussian quadrature integrates and bisection inverts.
 
     >>> round(student_quantile(5.0, 0.975), 4)
     2.5706
@@ -87,7 +88,10 @@ def student_quantile(freedom: float, level: float) -> float:
         return math.nan
     scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(math.pi)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    low, high = 0.0, math.atan((10 if freedom > 30 else 200) / math.sqrt(freedom))  # wider would miss a narrow peak
+    low, high = (
+        0.0,
+        math.atan((10 if freedom > 30 else 200) / math.sqrt(freedom)),
+    )  # a wider range would miss a narrow peak
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         powers = np.exp((freedom - 1) * np.log(np.cos(middle * (nodes + 1) / 2)))
@@ -97,22 +101,18 @@ def student_quantile(freedom: float, level: float) -> float:
 
 
 def effective_number(weights: AnyFloats) -> AnyFloats:
-    """Return the effective number of clusters, shape (value,), for weights of shape (cluster, value).
-
-    >>> effective_number(np.array([[1.0, 9.0], [1.0, 1.0]])).round(2).tolist()
-    [2.0, 1.22]
-    """
+    """Return the effective number of clusters, shape (value,), for weights of shape (cluster, value)."""
     squares = np.square(weights).sum(axis=0)
     number: AnyFloats = np.square(weights.sum(axis=0)) / np.where(squares > 0, squares, 1)
     return number
 
 
 def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None = None) -> Jackknife:
-    """Return values of sums (seed, cluster, part) with their standard errors.
+    """Return the values of sums (seed, cluster, part) with their standard errors.
 
     ``weights`` (cluster, value) are the weights of clusters, equal by default. Errors are NaN with fewer than
-    `MIN_INTERVAL_CLUSTERS` clusters, and the degrees of freedom are NaN with a smaller effective number. Both are
-    NaN for a value that is undefined if a cluster is left out.
+    `MIN_INTERVAL_CLUSTERS` clusters, and the degrees of freedom are NaN with a smaller effective number. Both are NaN
+    for a value that is undefined if a cluster is omitted.
     """
     seeds, clusters, _ = sums.shape
     total = sums.sum(axis=(0, 1))
@@ -121,23 +121,25 @@ def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None =
         undefined = np.full(len(mean), np.nan)
         return Jackknife(mean, undefined, undefined, np.full((clusters, len(mean)), np.nan))
     number = np.full(len(mean), float(clusters)) if weights is None else effective_number(weights)
-    influence = _influence(statistic, total, sums.sum(axis=0))
+    influence = _influences(statistic, total, sums.sum(axis=0))
     variance, freedom = _variance(influence), np.where(number < MIN_INTERVAL_CLUSTERS, np.nan, number - 1)
     if seeds > 1:
-        of_seeds = _variance(_influence(statistic, total, sums.sum(axis=1)))
-        of_seeds = 2 * of_seeds if seeds == 2 else of_seeds  # a single difference: else intervals hold less than 92 %
-        of_seeds = np.maximum(of_seeds - _variance_of_cells(statistic, total, sums), 0)  # both variances hold it
-        total_variance = variance + of_seeds
-        shares = np.square(variance) / freedom + np.square(of_seeds) / (seeds - 1)
+        seed_variance = _variance(_influences(statistic, total, sums.sum(axis=1)))
+        seed_variance = 2 * seed_variance if seeds == 2 else seed_variance  # else intervals cover less than 92 %
+        seed_variance = np.maximum(
+            seed_variance - _variance_of_cells(statistic, total, sums), 0
+        )  # it is part of both variances
+        total_variance = variance + seed_variance
+        shares = np.square(variance) / freedom + np.square(seed_variance) / (seeds - 1)
         freedom = np.where(shares > 0, np.square(total_variance) / np.where(shares > 0, shares, 1), freedom)
         variance = total_variance
     return Jackknife(mean, np.sqrt(variance), freedom, influence)
 
 
 def largest_quantile(influences: Sequence[AnyFloats], freedom: float) -> float:
-    """Return the value that the largest of several t statistics exceeds in 2.5 % of cases where all true values are 0.
+    """Return the value that the largest of several t statistics exceeds with probability 2.5 % if all true values are 0.
 
-    ``influences`` are the influences of the same clusters (cluster,) on each value: their correlations are those of the
+    ``influences`` are those of the same clusters (cluster,) on each value; their correlations are those of the
     statistics (Hothorn, Bretz and Westfall, Simultaneous inference in general parametric models, 2008).
 
     >>> round(largest_quantile([np.array([1.0, -1.0, 0.5])], 1e6), 2)
@@ -159,25 +161,21 @@ def largest_quantile(influences: Sequence[AnyFloats], freedom: float) -> float:
 
 
 def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-    """Return 1 - model / baseline: 1 is perfect, 0 no better than the baseline, below 0 worse. NaN if it never errs.
-
-    >>> skill(np.array([1.0, 3.0]), np.array([2.0, 2.0])).tolist()
-    [0.5, -0.5]
-    """
-    errs = baseline > 0
-    return np.where(errs, 1 - model / np.where(errs, baseline, 1), np.nan)
+    """Return 1 - model / baseline: 1 is perfect, 0 equals the baseline, negative is worse; NaN if the baseline is 0."""
+    has_error = baseline > 0
+    return np.where(has_error, 1 - model / np.where(has_error, baseline, 1), np.nan)
 
 
 def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-    """Return the logarithm of a ratio of errors, 1 - `skill`, bounded below, or NaN if the baseline never errs."""
+    """Return the logarithm of the ratio of errors, 1 - `skill`, bounded below; NaN if the baseline's error is 0."""
     ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), MIN_RATIO))
     return ratio
 
 
-def log_ratios(model: AnyFloats, baseline: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
-    """Return `log_ratio`, and how many ratios that is: 1, or 0 and a logarithm of 0 where the baseline never errs.
+def weighted_log_ratios(model: AnyFloats, baseline: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
+    """Return `log_ratio` and its weight: 1, or both 0 if the baseline's error is 0.
 
-    Both add up over recordings, to the logarithm of the geometric mean of their ratios.
+    Both can be summed over recordings, to the logarithm of the geometric mean of their ratios.
     """
     ratio = log_ratio(model, baseline)
     counted = np.isfinite(ratio).astype(np.float64)
@@ -187,10 +185,10 @@ def log_ratios(model: AnyFloats, baseline: AnyFloats) -> tuple[AnyFloats, AnyFlo
 def geometric_skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray | None = None) -> Interval:
     """Return 1 - the geometric mean of model / baseline over recordings with its interval, each (value,).
 
-    Errors are (recording, value); a recording on which the baseline never errs is left out. ``clusters`` (recording,) name
-    what chance draws, by default each recording.
+    Errors are (recording, value); recordings on which the baseline's error is 0 are omitted. ``clusters`` (recording,)
+    assigns recordings to clusters, by default one per recording.
     """
-    logs, counted = log_ratios(model, baseline)
+    logs, counted = weighted_log_ratios(model, baseline)
     values = logs.shape[1]
     sums = _by_cluster(np.hstack([logs, counted]), clusters)
 
@@ -209,10 +207,10 @@ def skill_of_log_ratio(log_interval: Interval) -> Interval:
 def skill_interval(
     model: AnyFloats, baseline: AnyFloats, clusters: AnyArray | None = None, *, power: float = 1.0
 ) -> Interval:
-    """Return the skill of sums of errors with its interval, each (value,), from ``model`` and ``baseline`` (item, value).
+    """Return the skill of summed errors with its interval, each (value,), from ``model`` and ``baseline`` (item, value).
 
-    ``clusters`` (item,) name what chance draws, by default each item. ``power`` is 0.5 for the skill of root mean squared
-    errors, from sums of squares. Ends are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
+    ``clusters`` (item,) assigns items to clusters, by default one per item. ``power`` is 0.5 for the skill of root mean
+    squared errors, from sums of squares. Bounds are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
     """
     values = model.shape[1]
     sums = _by_cluster(np.hstack([model, baseline]), clusters)
@@ -224,9 +222,9 @@ def skill_interval(
 
 
 def share_interval(part: AnyFloats, total: AnyFloats, clusters: AnyArray | None = None) -> Interval:
-    """Return the share that sums of ``part`` are of ``total``, both (item, value), with its interval, each (value,).
+    """Return the fraction sum of ``part`` / sum of ``total``, both (item, value), with its interval, each (value,).
 
-    ``clusters`` (item,) name what chance draws, by default each item. Ends are at most 1 and at least 0.
+    ``clusters`` (item,) assigns items to clusters, by default one per item. Bounds are limited to 0 and 1.
     """
     values = part.shape[1]
     sums = _by_cluster(np.hstack([part, total]), clusters)
@@ -245,17 +243,17 @@ def _by_cluster(rows: AnyFloats, clusters: AnyArray | None) -> AnyFloats:
     return sums
 
 
-def _influence(statistic: Statistic, total: AnyFloats, sums: AnyFloats) -> AnyFloats:
-    """Return the value of the total less that without each row of ``sums`` (row, part), about their mean, (row, value)."""
+def _influences(statistic: Statistic, total: AnyFloats, sums: AnyFloats) -> AnyFloats:
+    """Return the values without each row of ``sums`` (row, part), subtracted from their mean: (row, value)."""
     without = statistic(total - sums)
     influence: AnyFloats = without.mean(axis=0) - without
     return influence
 
 
 def _variance_of_cells(statistic: Statistic, total: AnyFloats, sums: AnyFloats) -> AnyFloats:
-    """Return the variance that neither seeds nor clusters alone explain, of sums (seed, cluster, part), (value,)."""
+    """Return the variance (value,) of sums (seed, cluster, part) that neither seeds nor clusters explain separately."""
     seeds, clusters, _ = sums.shape
-    cells = _influence(statistic, total, sums.reshape(seeds * clusters, -1)).reshape(seeds, clusters, -1)
+    cells = _influences(statistic, total, sums.reshape(seeds * clusters, -1)).reshape(seeds, clusters, -1)
     residuals = cells - cells.mean(axis=0) - cells.mean(axis=1, keepdims=True)
     variance: AnyFloats = np.square(residuals).sum(axis=(0, 1)) * seeds * clusters / ((seeds - 1) * (clusters - 1))
     return variance
@@ -268,20 +266,20 @@ def _variance(influence: AnyFloats) -> AnyFloats:
 
 
 class Difference(NamedTuple):
-    """The result of a paired test: second less first."""
+    """The result of a paired test of second minus first."""
 
-    difference: float  # mean over pairs, in the unit of what was given
-    t: float  # infinite where all pairs differ alike, or NaN if none does
+    difference: float  # mean over pairs, in the unit of the values
+    t: float  # infinite if all pairs have the same difference, NaN if it is 0
     p: float  # two-sided, or NaN if no pair differs
 
 
 def wilson(correct: int, n: int) -> tuple[float, float]:
-    """Return the bounds of the 95 % interval of the share ``correct`` of ``n``; both NaN if ``n`` is 0.
+    """Return the bounds of the 95 % interval of the proportion ``correct`` of ``n``; both NaN if ``n`` is 0.
 
-    Wilson, Probable inference, the law of succession, and statistical inference, 1927: all true shares whose own chance
-    would make the observed one no rarer than 1 in 20.
+    Wilson, Probable inference, the law of succession, and statistical inference, 1927: all true proportions for which
+    the observed one has a probability of at least 1 in 20.
 
-    Raises `TacpipeError` for counts that cannot be.
+    Raises `TacpipeError` if ``correct`` is negative or above ``n``.
 
     >>> [round(bound, 4) for bound in wilson(192, 200)]
     [0.9231, 0.9796]
@@ -289,7 +287,7 @@ def wilson(correct: int, n: int) -> tuple[float, float]:
     from scipy.stats import binomtest
 
     if not 0 <= correct <= n:
-        raise TacpipeError(f"{correct} of {n} cannot be correct; give a count between 0 and how many there are.")
+        raise TacpipeError(f"{correct} of {n} cannot be correct; give a count between 0 and {n}.")
     if n == 0:
         return float("nan"), float("nan")
     interval = binomtest(int(correct), int(n)).proportion_ci(COVERAGE, method="wilson")
@@ -297,12 +295,12 @@ def wilson(correct: int, n: int) -> tuple[float, float]:
 
 
 def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
-    """Return the two-sided p of two classifiers that are equally good, from who is right on each slide, both (slide,).
+    """Return the two-sided p that two classifiers are equally accurate, from their correct answers on the same slides.
 
-    McNemar, Note on the sampling error of the difference between correlated proportions or percentages, 1947, exact: of
-    the slides that only one of them gets right, either would have half.
+    McNemar, Note on the sampling error of the difference between correlated proportions or percentages, 1947, exact:
+    under the null hypothesis, each has half of the slides that only one of them classifies correctly.
 
-    It is 1 where they are right on the same slides. Raises `TacpipeError` if the slides are not as many.
+    The p is 1 if they are correct on the same slides. Raises `TacpipeError` if the numbers of slides differ.
 
     >>> right = np.ones(10, bool)
     >>> wrong_on_six = np.arange(10) >= 6
@@ -314,7 +312,7 @@ def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
     first, second = np.asarray(first_correct, bool), np.asarray(second_correct, bool)
     if first.shape != second.shape or first.ndim != 1:
         raise TacpipeError(
-            f"Answers of {first.shape} and {second.shape} cannot be compared; give the correct answers on the same slides."
+            f"Answers of {first.shape} and {second.shape} cannot be compared; give answers on the same slides."
         )
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
     if only_first + only_second == 0:
@@ -323,9 +321,9 @@ def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
 
 
 def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArray) -> Difference:
-    """Return the mean of ``second`` less ``first`` over pairs, its t and the two-sided p, with pairs - 1 freedoms.
+    """Return the mean of ``second`` minus ``first`` over pairs, its t and p (two-sided, pairs - 1 degrees of freedom).
 
-    It compares two ways of training over repeats that share split and seed (Student, The probable error of a mean,
+    It compares two training methods over repeats with the same split and seed (Student, The probable error of a mean,
     1908).
 
     Raises `TacpipeError` if there are fewer than two pairs.
@@ -340,7 +338,7 @@ def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArr
         raise TacpipeError(
             f"Values of {before.shape} and {after.shape} are not two or more pairs; give equally many of both, at least two."
         )
-    differences = np.round(after - before, 12)  # accuracies that differ alike shall not differ by rounding
+    differences = np.round(after - before, 12)  # equal differences of accuracies must not differ by rounding
     mean, error = float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(before)))
     if error <= 1e-12 * abs(mean):
         t = float("nan") if mean == 0 else float(np.copysign(np.inf, mean))

@@ -1,9 +1,9 @@
-"""A model and its baselines on the same recordings: which baseline is best, and the interval of the gain over it.
+"""Compare a model with its baselines on the same recordings: rank the baselines and compute the interval of the gain.
 
-Errors are sums by seed and recording. An interval follows from leaving out clusters of recordings, of model and baseline the
-same ones, and seeds of training where there are several (`tacpipe.metrics.intervals`). Who picks the best of several
-methods or compares with the best of several baselines has chosen by chance too: the end of the interval that the choice
-moves is that of the largest of as many statistics.
+Errors are sums by seed and recording. An interval is computed by omitting clusters of recordings, the same for model
+and baseline, and training seeds if there are several (`tacpipe.metrics.intervals`). Selecting the best of several
+methods, or comparing with the best of several baselines, is also subject to chance: the bound of the interval that the
+selection affects is that of the maximum of as many statistics.
 """
 
 from __future__ import annotations
@@ -20,55 +20,53 @@ from tacpipe.metrics import intervals
 from tacpipe.metrics.headline import Headline, HeadlineRow, verdict_of
 from tacpipe.metrics.intervals import Estimate, Interval, Jackknife
 
-Sums = Mapping[
-    tuple[Hashable, str], AnyFloats
-]  # keyed by seed and recording, (part,): sums that add up over recordings
-ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
+Sums = Mapping[tuple[Hashable, str], AnyFloats]  # (seed, recording) -> sums (part,), which can be added over recordings
+MAX_ENUMERATED, SWAPS = 12, 9_999  # maximum number of clusters for all permutations; number of random ones for more
 Key = TypeVar("Key", bound=Hashable)
 
 
-def _equal(sums: AnyFloats) -> AnyFloats:
+def _equal_weights(sums: AnyFloats) -> AnyFloats:
     return np.ones(len(sums))
 
 
 @dataclass(frozen=True)
 class Measure:
-    """How the sums of one predictor become errors, and how the errors of two become a gain."""
+    """How the sums of a predictor determine its errors, and the errors of two predictors a gain."""
 
     columns: tuple[str, ...]
     unit: str
-    ranked_by: str  # name of ``error``
+    ranked_by: str  # the name of ``error``
     name: str  # kind of gain: "skill" or "points"
-    cluster: str  # name of the clusters of recordings, in the plural
-    error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, or NaN if not defined
-    gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to (draw,)
-    values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to a value a column
-    score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # maps errors (draw,) to the values of charts (draw,)
-    scored: str = "error"  # name of ``score``, with its unit
+    cluster: str  # plural name of the clusters of recordings
+    error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to errors (draw,): lower is better; NaN if undefined
+    gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to gains (draw,)
+    values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to one value per column
+    score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # errors (draw,) to the values of charts (draw,)
+    scored: str = "error"  # the name of ``score``, with its unit
     rises: bool = False  # True if a higher score is better
     weight: Callable[[AnyFloats], AnyFloats] = (
-        _equal  # a baseline's sums (cluster, part) to how much each counts (cluster,)
+        _equal_weights  #  a baseline's sums (cluster, part) to the weights of clusters (cluster,)
     )
     reference: str = ""  # the baseline that tables show next to the best one
 
     def score_of(self, parts: Iterable[AnyFloats]) -> float:
-        """Return the score of sums that are added up, each (part,)."""
+        """Return the score of the total of several sums, each (part,)."""
         return float(self.score(self.error(np.sum(list(parts), axis=0)[None]))[0])
 
 
 @dataclass(frozen=True)
 class Gain:
-    """The gain of a predictor over another, its 95 % interval and the number of clusters, or NaN if undefined."""
+    """The gain of a predictor over another, its 95 % interval and the number of clusters; NaN if undefined."""
 
     mean: float
     low: float
     high: float
-    clusters: int = 0  # units that were left out one by one
-    effective: float = 0.0  # number of equal clusters that would be as certain
+    clusters: int = 0  # units that were omitted one by one
+    effective: float = 0.0  # effective number of clusters
 
     @property
     def verdict(self) -> str:
-        """Return whether the predictor is better or worse, as `tacpipe.metrics.headline.verdict_of` states it."""
+        """Whether the predictor is better or worse, see `tacpipe.metrics.headline.verdict_of`."""
         return verdict_of(self.low, self.high, self.clusters, self.effective)
 
 
@@ -77,13 +75,13 @@ NO_GAIN = Gain(float("nan"), float("nan"), float("nan"))
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """The errors of a predictor and a baseline on the recordings of both, and how certain the gain is."""
+    """The errors of a predictor and a baseline on their common recordings, and the uncertainty of the gain."""
 
     sums: AnyFloats  # (seed, cluster, part): those of the predictor, then those of the baseline
-    names: tuple[str, ...]  # names of clusters
-    jackknife: Jackknife  # its value is the gain, or for skill the negative logarithm of the ratio of errors
+    names: tuple[str, ...]  # names of the clusters
+    jackknife: Jackknife  # of the gain, or for skill of the negative logarithm of the ratio of errors
     effective: float
-    counted: int  # clusters of some weight
+    counted: int  # number of clusters with a positive weight
 
     @property
     def totals(self) -> tuple[AnyFloats, AnyFloats]:
@@ -98,12 +96,12 @@ class Pair:
 
 
 def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, str] | None = None) -> Pair | None:
-    """Return a predictor next to a baseline on the recordings that they share, or None if they share none.
+    """Return a predictor and a baseline on their common recordings, or None if there are none.
 
-    Where the baseline was not evaluated with a seed of the predictor, its mean over its own seeds counts. ``clusters`` maps
-    a recording to what it is left out with, by default itself.
+    If the baseline was not evaluated with a seed of the predictor, its mean over its own seeds is used. ``clusters``
+    maps recordings to clusters, by default one per recording.
     """
-    sums, names = _side_by_side(model, baseline, clusters)
+    sums, names = _paired_sums(model, baseline, clusters)
     if not names:
         return None
     width = sums.shape[2] // 2
@@ -119,30 +117,30 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
 
 
 def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -> Gain:
-    """Return what a predictor gains over the first of its baselines, from its `Pair` with each of them.
+    """Return the gain of a predictor over the first of its baselines, from its `Pair` with each baseline.
 
-    ``rivals`` are those of other predictors among which this one may have been picked: they move the lower end of the
-    interval. Further baselines move the upper end, because the first was picked as the best of them.
+    ``rivals`` are the pairs of other predictors from which this one may have been selected; they affect the lower bound
+    of the interval. Further baselines affect the upper bound, because the first was selected as the best of them.
     """
     if not pairs:
         return NO_GAIN
     first = pairs[0]
     estimate = first.jackknife
     mean, error, freedom = (float(value[0]) for value in (estimate.mean, estimate.error, estimate.freedom))
-    low = mean - _reach([first, *rivals], freedom) * error
-    high = mean + _reach(pairs, freedom) * error
+    low = mean - _bound_distance([first, *rivals], freedom) * error
+    high = mean + _bound_distance(pairs, freedom) * error
     if measure.name == "skill":
         mean, low, high = (float(-np.expm1(-value)) for value in (mean, low, high))
     return Gain(mean, low, high, first.counted, first.effective)
 
 
-def _reach(pairs: Sequence[Pair], freedom: float) -> float:
-    """Return how many standard errors an end lies off where the largest of several gains was picked."""
+def _bound_distance(pairs: Sequence[Pair], freedom: float) -> float:
+    """Return the distance of a bound in standard errors if the largest of several gains was selected."""
     if np.isnan(freedom):
         return float("nan")
     distinct = {id(pair): pair for pair in pairs if not np.isnan(pair.jackknife.influence).any()}.values()
     common = set.intersection(*(set(pair.names) for pair in pairs))
-    if len(common) < 2:  # The correlation is not defined, so Bonferroni applies.
+    if len(common) < 2:  # The correlation is not defined, so Bonferroni's correction applies.
         return intervals.student_quantile(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs))
     chosen = ([at for at, name in enumerate(pair.names) if name in common] for pair in distinct)
     influences = [pair.jackknife.influence[at, 0] for pair, at in zip(distinct, chosen, strict=True)]
@@ -162,15 +160,15 @@ def headline(
     runs: int = 1,
     rivals: Sequence[Pair] = (),
 ) -> Headline | None:
-    """Return how a model compares with the best of its baselines; None without a recording.
+    """Return the comparison of a model with its best baseline, or None if there are no recordings.
 
-    Baselines are compared as `pair` does, ``rivals`` count as in `gain`.
+    Baselines are compared by `pair`; ``rivals`` are those of `gain`.
     """
     own_pair = pair(measure, model, model, clusters)
     if own_pair is None:
         return None
     ranked = rank(measure, model, baselines, clusters)
-    over = gain(measure, list(ranked.values()), rivals)
+    best_gain = gain(measure, list(ranked.values()), rivals)
     return Headline(
         task,
         method,
@@ -182,9 +180,9 @@ def headline(
         HeadlineRow(method, measure.values(own_pair.totals[0])),
         tuple(HeadlineRow(name, measure.values(pair.totals[1])) for name, pair in ranked.items()),
         measure.name,
-        over.mean,
-        over.low,
-        over.high,
+        best_gain.mean,
+        best_gain.low,
+        best_gain.high,
         next(iter(ranked.values()), own_pair).counted,
         measure.cluster,
         runs,
@@ -199,19 +197,19 @@ def headline(
 def rank(
     measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
 ) -> dict[str, Pair]:
-    """Return a model next to each baseline that shares recordings with it, by name, that of least error on them first."""
+    """Return the pairs of a model with each baseline that shares recordings with it, by name, lowest error first."""
     pairs = {name: compared for name, sums in baselines.items() if (compared := pair(measure, model, sums, clusters))}
     errors = {name: float(measure.error(compared.totals[1][None])[0]) for name, compared in pairs.items()}
     return {name: pairs[name] for name in sorted(pairs, key=lambda name: (np.isnan(errors[name]), errors[name]))}
 
 
 def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = None) -> Estimate:
-    """Return the score of one predictor by itself, with the interval over clusters (and seeds where there are several)."""
-    rows, names = _side_by_side(sums, sums, clusters)
+    """Return the score of one predictor, with its interval over clusters (and seeds if there are several)."""
+    rows, names = _paired_sums(sums, sums, clusters)
     if not names:
         return Estimate(float("nan"), float("nan"), float("nan"))
     rows = rows[:, :, : rows.shape[2] // 2]
-    relative = measure.name == "skill"  # errors of which ratios count
+    relative = measure.name == "skill"  # ratios of errors are compared
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         error = measure.error(draws)
@@ -224,18 +222,18 @@ def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = Non
 
 
 def difference(measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None) -> Gain:
-    """Return what the first predictor gains over the second on the recordings of both, or NaN if they share none."""
+    """Return the gain of the first predictor over the second on their common recordings; NaN if there are none."""
     compared = pair(measure, first, second, clusters)
     return gain(measure, [compared] if compared else [])
 
 
 def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
-    """Return the two-sided p of two predictors that are alike, from their sums (cluster, part) on the same clusters.
+    """Return the two-sided p that two predictors are equal, from their sums (cluster, part) on the same clusters.
 
-    If they are, either could have made each cluster's errors: the statistic is the difference of their errors, and its
-    distribution comes from exchanging the two in some clusters, in all ways up to `ENUMERATED` clusters, else in `SWAPS`
-    random ones (paired permutation test; of right and wrong answers, McNemar's exact test). NaN with fewer than two
-    clusters and where an error is not defined.
+    Under the null hypothesis, the errors of the two in each cluster are exchangeable. The statistic is the difference
+    of their errors, and its distribution is computed by exchanging the two in some clusters: in all combinations for up
+    to `MAX_ENUMERATED` clusters, else in `SWAPS` random ones (paired permutation test; for correct and wrong answers,
+    McNemar's exact test). NaN if there are fewer than two clusters or an error is undefined.
     """
     clusters = len(first)
     if clusters < 2:
@@ -251,50 +249,49 @@ def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
         return float("nan")
     drawn = difference(_swaps(clusters).astype(np.float64))
     extreme = int((np.abs(drawn) >= abs(observed) * (1 - 1e-9) - 1e-12).sum())  # NaN is not extreme
-    return extreme / len(drawn) if clusters <= ENUMERATED else (extreme + 1) / (len(drawn) + 1)
+    return extreme / len(drawn) if clusters <= MAX_ENUMERATED else (extreme + 1) / (len(drawn) + 1)
 
 
 @functools.lru_cache(maxsize=8)
 def _swaps(clusters: int) -> AnyArray:
-    """Return which clusters are exchanged, (draw, cluster), 0 or 1."""
-    if clusters <= ENUMERATED:
+    """Return 1 for the clusters that are exchanged in each draw, else 0: (draw, cluster)."""
+    if clusters <= MAX_ENUMERATED:
         return np.arange(2**clusters)[:, None] >> np.arange(clusters) & 1
     return np.random.default_rng(0).integers(0, 2, (SWAPS, clusters), dtype=np.int8)
 
 
-def _side_by_side(model: Sums, reference: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
-    """Return sums of the model, then of another predictor, (seed, cluster, part), and the clusters' names."""
-    elsewhere: dict[str, list[AnyFloats]] = {}
+def _paired_sums(model: Sums, reference: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
+    """Return the concatenated sums of a model and another predictor, (seed, cluster, part), and the clusters' names."""
+    reference_sums: dict[str, list[AnyFloats]] = {}
     for (_, recording), errors in reference.items():
-        elsewhere.setdefault(recording, []).append(errors)
+        reference_sums.setdefault(recording, []).append(errors)
     rows = [
         (
             seed,
             recording,
             errors,
-            reference[seed, recording] if (seed, recording) in reference else np.mean(elsewhere[recording], axis=0),
+            reference[seed, recording]
+            if (seed, recording) in reference
+            else np.mean(reference_sums[recording], axis=0),
         )
         for (seed, recording), errors in model.items()
-        if recording in elsewhere
+        if recording in reference_sums
     ]
     if not rows:
         return np.zeros((0, 0, 0)), []
-    repeats = _repeats([(seed, recording) for seed, recording, *_ in rows])
+    repeats = _repeat_index([(seed, recording) for seed, recording, *_ in rows])
     units = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
-    places = {name: at for at, name in enumerate(sorted(set(units)))}
-    sums = np.zeros((max(repeats.values()) + 1, len(places), 2 * len(rows[0][2])))
-    spot = np.array([repeats[seed] for seed, *_ in rows]), np.array([places[name] for name in units])
-    np.add.at(sums, spot, np.array([np.concatenate([first, second]) for _, _, first, second in rows]))
-    return sums, list(places)
+    cluster_index = {name: at for at, name in enumerate(sorted(set(units)))}
+    sums = np.zeros((max(repeats.values()) + 1, len(cluster_index), 2 * len(rows[0][2])))
+    cells = np.array([repeats[seed] for seed, *_ in rows]), np.array([cluster_index[name] for name in units])
+    np.add.at(sums, cells, np.array([np.concatenate([first, second]) for _, _, first, second in rows]))
+    return sums, list(cluster_index)
 
 
-def _repeats(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
-    """Return the number of each seed among those that share recordings.
+def _repeat_index(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
+    """Return the index of each seed among the seeds that share recordings with it.
 
-    Seeds without a common recording are folds, each of which tests other recordings, and repeat nothing.
-
-    >>> _repeats([(3, "a"), (4, "a"), (5, "b"), (6, "b")])
-    {3: 0, 4: 1, 5: 0, 6: 1}
+    Seeds without a common recording are folds, which test different recordings and are not repeats.
     """
     by_recording: dict[str, set[Hashable]] = {}
     for seed, recording in keys:
@@ -308,11 +305,7 @@ def _repeats(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
 
 
 def add_by_key(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
-    """Return sums by key, those of one key added up.
-
-    >>> add_by_key([("a", np.array([1.0])), ("b", np.array([2.0])), ("a", np.array([3.0]))])
-    {'a': array([4.]), 'b': array([2.])}
-    """
+    """Return the sum of the arrays of each key."""
     sums: dict[Key, AnyFloats] = {}
     for key, part in parts:
         sums[key] = sums[key] + part if key in sums else part
@@ -320,17 +313,17 @@ def add_by_key(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
 
 
 def value_intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
-    """Return several values of one predictor's sums and their 95 % intervals, from sums (draw, part) to (draw, value)."""
-    rows, _ = _side_by_side(sums, sums, None)
+    """Return several values of one predictor with their 95 % intervals; ``statistic`` maps (draw, part) to (draw, value)."""
+    rows, _ = _paired_sums(sums, sums, None)
     return intervals.jackknife(rows[:, :, : rows.shape[2] // 2], statistic).interval()
 
 
 def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval | None:
-    """Return by how much several values of one predictor exceed those of another on the recordings of both.
+    """Return the differences of several values of two predictors on their common recordings, with intervals.
 
-    None if they share none.
+    Returns None if there are no common recordings.
     """
-    pairs, names = _side_by_side(first, second, None)
+    pairs, names = _paired_sums(first, second, None)
     width = pairs.shape[2] // 2
     if not names:
         return None

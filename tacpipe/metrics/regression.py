@@ -1,7 +1,7 @@
-"""How far predicted values are from the true ones, how much nearer than a baseline's, and how sure that is.
+"""Compute errors of predicted values, the skill over a baseline, and its interval.
 
-Values are (grasp, value): one of a pressure, 24 of electrodes. An error is global: over all grasps and values at once.
-Published figures are often means over batches instead, which are never larger and depend on how batches fall
+Values are (grasp, value): one for a pressure, 24 for electrodes. An error is global: over all grasps and values at
+once. Published figures are often means over batches instead, which are never larger and depend on the batches
 (`batch_mean_rmse`).
 """
 
@@ -14,13 +14,13 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import intervals
 from tacpipe.metrics.intervals import Estimate
 
-BATCH = 10  # grasps over which the letter (RA-L 2020) takes each RMSE before it averages them
+BATCH = 10  # grasps per batch whose RMSE the letter (RA-L 2020) averages
 
 
 def squared_sums(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
-    """Return the sum over values of each grasp's squared error, (grasp, value) to (grasp,).
+    """Return the squared error of each grasp, summed over values: (grasp, value) to (grasp,).
 
-    Raises `TacpipeError` if the two are not of one such shape.
+    Raises `TacpipeError` if the shapes differ.
     """
     error = _error(true, predicted)
     total: AnyFloats = np.einsum("gv,gv->g", error, error)
@@ -28,24 +28,17 @@ def squared_sums(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
 
 
 def rmse(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the root of the mean squared error over all grasps and values; NaN without any.
-
-    >>> rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]))
-    5.0
-    """
+    """Return the root mean squared error over all grasps and values; NaN if there are none."""
     return _root_mean_square(_error(true, predicted))
 
 
 def batch_mean_rmse(true: AnyFloats, predicted: AnyFloats, batch: int = BATCH) -> float:
-    """Return the mean of the RMSE of successive batches of grasps, the last of which may be smaller; NaN without any.
+    """Return the mean RMSE of successive batches of grasps, the last of which may be smaller; NaN if there are no grasps.
 
-    It is no larger than `rmse` where batches are as large (Jensen), which is why both are reported.
-
-    >>> batch_mean_rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]), batch=1)
-    4.0
+    It is at most `rmse` if batches have equal sizes (Jensen), which is why both are reported.
     """
     if batch < 1:
-        raise TacpipeError(f"A batch of {batch} grasps holds none; give 1 or more.")
+        raise TacpipeError(f"The batch size is {batch}; it must be 1 or more.")
     error = _error(true, predicted)
     if not error.size:
         return float("nan")
@@ -53,28 +46,28 @@ def batch_mean_rmse(true: AnyFloats, predicted: AnyFloats, batch: int = BATCH) -
 
 
 def mae(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the mean absolute error over all grasps and values; NaN without any."""
+    """Return the mean absolute error over all grasps and values; NaN if there are none."""
     error = _error(true, predicted)
     return float(np.abs(error).mean()) if error.size else float("nan")
 
 
 def r2(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the fraction of variance that is explained, each value's about its own mean, or NaN if nothing varies.
+    """Return the explained fraction of variance, with each value's variance about its own mean; NaN if nothing varies.
 
-    1 is perfect; 0 is as good as the mean of these very grasps, which nobody knows beforehand: a constant that was fitted
-    elsewhere falls below it.
+    1 is perfect; 0 equals the mean of these grasps, which is unknown in advance: a constant fitted elsewhere is below
+    it.
     """
     error, spread = _sums_by_value(true, predicted)
     return _explained(error.sum(), spread.sum())
 
 
 def r2_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
-    """Return `r2` of each value alone, (grasp, value) to (value,)."""
+    """Return `r2` of each value separately, (grasp, value) to (value,)."""
     return np.array([_explained(*pair) for pair in zip(*_sums_by_value(true, predicted), strict=True)])
 
 
 def rmse_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
-    """Return `rmse` of each value alone, (grasp, value) to (value,)."""
+    """Return `rmse` of each value separately, (grasp, value) to (value,)."""
     error = _error(true, predicted)
     return np.array([_root_mean_square(column) for column in error.T])
 
@@ -82,19 +75,19 @@ def rmse_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
 def skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Estimate:
     """Return 1 - RMSE / RMSE of a baseline with its 95 % interval, from `squared_sums` of both, each (grasp,).
 
-    ``clusters`` (grasp,) groups the grasps that depend on each other: those of an object where the next object counts, a
-    grasp and what other runs predicted for it where objects are known. Raises `TacpipeError` for other shapes.
+    ``clusters`` (grasp,) groups dependent grasps: those of an object if predictions are for new objects, or a grasp in
+    several runs if objects are known. Raises `TacpipeError` if lengths differ.
     """
     if not len(model) == len(baseline) == len(clusters):
         raise TacpipeError(
-            f"There are errors of {len(model)} and {len(baseline)} grasps and clusters of {len(clusters)}; give both errors "
-            f"and the cluster of the same grasps."
+            f"There are errors of {len(model)} and {len(baseline)} grasps and clusters of {len(clusters)}; give all three "
+            f"for the same grasps."
         )
     return intervals.skill_interval(model[:, None], baseline[:, None], clusters, power=0.5).first
 
 
 def _error(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
-    """Return predicted less true as float64."""
+    """Return predicted minus true as float64."""
     if np.ndim(true) != 2 or np.shape(true) != np.shape(predicted):
         raise TacpipeError(
             f"True values of the shape {np.shape(true)} and predicted ones of {np.shape(predicted)} cannot be compared; "
@@ -108,7 +101,7 @@ def _root_mean_square(error: AnyFloats) -> float:
 
 
 def _sums_by_value(true: AnyFloats, predicted: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
-    """Return each value's sum of squared errors and that of its distances from its mean, two of (value,)."""
+    """Return the sums of squared errors and of squared deviations from the mean of each value, both (value,)."""
     error = _error(true, predicted)
     if not len(error):
         return np.zeros(error.shape[1]), np.zeros(error.shape[1])
@@ -121,14 +114,14 @@ def _explained(error: float, spread: float) -> float:
 
 
 def squared_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
-    """Return the sum over windows of the squared error, (window, step, channel) to (step, channel), as float64."""
+    """Return the squared error summed over windows: (window, step, channel) to (step, channel), as float64."""
     error = predicted.astype(np.float64) - truth
     total: AnyFloats = np.einsum("wsc,wsc->sc", error, error)
     return total
 
 
 def absolute_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
-    """Return the sum over windows of the absolute error, (window, step, channel) to (step, channel), as float64."""
+    """Return the absolute error summed over windows: (window, step, channel) to (step, channel), as float64."""
     total: AnyFloats = np.abs(predicted.astype(np.float64) - truth).sum(axis=0)
     return total
 
@@ -136,7 +129,7 @@ def absolute_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
 def mean_error(sums: AnyFloats, windows: Ints) -> AnyFloats:
     """Return the error of each step, averaged over all windows and channels, shape (step,).
 
-    ``sums`` is (recording, step, channel) as summed above, ``windows`` is (recording,). NaN without windows.
+    ``sums`` is (recording, step, channel) as summed above, ``windows`` is (recording,). NaN if there are no windows.
     """
     count = windows.sum() * sums.shape[2]
     total: AnyFloats = sums.sum(axis=(0, 2))

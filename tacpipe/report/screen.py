@@ -215,7 +215,7 @@ def _verb(comparison: Comparison, row: ComparisonRow) -> str:
         return f"was evaluated without a baseline, on {size}"
     verdict = row.gain.verdict
     if verdict == headline.NO_VERDICT:
-        warning = headline.too_few(row.n, comparison.measure.cluster, row.gain.effective)
+        warning = headline.explain_no_verdict(row.n, comparison.measure.cluster, row.gain.effective)
         return f"has {_gained(comparison, row)} over the best baseline, {row.baseline}; {warning}"
     return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(comparison, row, '95 % interval ')}"
 

@@ -1,1 +1,1 @@
-"""Turn recordings into arrays to draw: curves, maps of taxels, spans, paths and predictions."""
+"""Convert recordings to arrays for drawing: curves, maps of taxels, spans, paths and predictions."""

@@ -1,4 +1,4 @@
-"""Return the curves of a stream, channels with names and units for plots, and the paths of positions through space."""
+"""Extract the curves of a stream for plots, with names and units, and paths of positions in space."""
 
 from __future__ import annotations
 
@@ -16,13 +16,23 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TIME = "t_ns"
-_NO_CURVES = ("time", "sequence", "mask", "label", "image", "colour", "tactile", "prediction", "latent")  # quantities
+_UNDRAWN_QUANTITIES = (
+    "time",
+    "sequence",
+    "mask",
+    "label",
+    "image",
+    "colour",
+    "tactile",
+    "prediction",
+    "latent",
+)  # quantities
 _NO_UNIT = ("", "1")
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Channels of one stream, quantity and unit, which share an axis."""
+    """The channels of a stream with the same quantity and unit, which share an axis."""
 
     stream: str
     quantity: str
@@ -40,50 +50,50 @@ class Curves:
 
 
 def curves_of_streams(streams: Mapping[str, pa.Table]) -> list[Curves]:
-    """Return the curves of all streams with times, stream by stream, but for tactile channels, labels and clocks."""
+    """Return the curves of all streams with times, stream by stream, except tactile channels, labels and clocks."""
     return [curves for stream, table in streams.items() for curves in curves_of_table(stream, table)]
 
 
 def curves_of_table(stream: str, table: pa.Table) -> list[Curves]:
-    """Return the curves of a stream, one for each quantity and unit in the order of its columns; see `of_streams`.
+    """Return the curves of a stream, one for each quantity and unit in the order of its columns.
 
-    Several vibration readings a row are one curve at their own rate, a finger.
+    If rows contain several vibration readings, these are one curve per finger, at their own rate.
     """
     if TIME not in table.column_names or table.num_rows < 2:
         return []
     t_ns = table.column(TIME).to_numpy()
     groups: dict[tuple[str, str, str], list[pa.Field]] = {}
     for field in table.schema:
-        about = described(field)
-        if _drawn(field, about):
+        about = field_metadata(field)
+        if _is_drawn(field, about):
             finger = about.get("finger", "") if about.get("quantity") == "vibration" else ""
             groups.setdefault((about.get("quantity", ""), about.get("unit", ""), finger), []).append(field)
     curves = []
     for (quantity, unit, finger), fields in groups.items():
         values = matrix(table, [field.name for field in fields])
         if quantity == "vibration" and len(fields) > 1:
-            name = f"{finger} {len(fields)} readings a row".strip()
-            curves.append(Curves(stream, quantity, unit, (name,), *unrolled(t_ns, values)))
+            name = f"{finger} {len(fields)} readings per row".strip()
+            curves.append(Curves(stream, quantity, unit, (name,), *unroll_readings(t_ns, values)))
         else:
             curves.append(Curves(stream, quantity, unit, short_names(fields), t_ns, values))
     return curves
 
 
-def described(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a field as text."""
+def field_metadata(field: pa.Field) -> dict[str, str]:
+    """Return the metadata of a field as strings."""
     return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
 
 
 def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
-    """Return columns of a table side by side as float64 (time, channel); nulls are NaN."""
+    """Return columns of a table as a float64 matrix (time, channel); nulls are NaN."""
     columns = [table.column(name).to_numpy() for name in names]
     return np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
 
 
-def unrolled(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
-    """Return readings taken one after the other within each row (time, reading) as one channel: times, (time, 1).
+def unroll_readings(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
+    """Flatten rows of successive readings (time, reading) to one channel, and return its times and values (time, 1).
 
-    >>> [part.ravel().tolist() for part in unrolled(np.array([0, 10]), np.array([[1.0, 2.0], [3.0, 4.0]]))]
+    >>> [part.ravel().tolist() for part in unroll_readings(np.array([0, 10]), np.array([[1.0, 2.0], [3.0, 4.0]]))]
     [[0, 5, 10, 15], [1.0, 2.0, 3.0, 4.0]]
     """
     readings = values.shape[1]
@@ -93,7 +103,7 @@ def unrolled(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
 
 
 def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
-    """Return names for a legend: the components where they are those of one vector, else the columns' names."""
+    """Return names for a legend: the components if the fields are one vector, otherwise the column names."""
     parts = [arm.component(field) for field in fields]
     one_vector = len({arm.shared_name(field) for field in fields}) == 1
     if len(fields) > 1 and one_vector and all(parts) and len(set(parts)) == len(parts):
@@ -101,12 +111,12 @@ def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
     return tuple(str(field.name) for field in fields)
 
 
-def _drawn(field: pa.Field, about: Mapping[str, str]) -> bool:
+def _is_drawn(field: pa.Field, about: Mapping[str, str]) -> bool:
     import pyarrow as pa
 
-    number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
-    clock = field.name == TIME or field.name.startswith("t_") or field.name in ("seq", "device_seq")
-    return number and not clock and about.get("quantity", "") not in _NO_CURVES
+    is_number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
+    is_clock = field.name == TIME or field.name.startswith("t_") or field.name in ("seq", "device_seq")
+    return is_number and not is_clock and about.get("quantity", "") not in _UNDRAWN_QUANTITIES
 
 
 @dataclass(frozen=True)
@@ -116,44 +126,46 @@ class Path:
     name: str
     t_ns: Times  # (time,)
     position_m: Floats  # (time, xyz)
-    quaternion: Floats | None = None  # (time, xyzw), where the stream has one orientation
+    quaternion: Floats | None = None  # (time, xyzw), if the stream has one orientation
 
 
 def paths_of_streams(streams: Mapping[str, pa.Table]) -> list[Path]:
-    """Return the paths of all streams whose rows are moments, but not of clouds, whose rows are points."""
+    """Return the paths of all streams, except clouds, whose rows are points."""
     return [path for stream, table in streams.items() for path in paths_of_table(stream, table)]
 
 
 def paths_of_table(stream: str, table: pa.Table) -> list[Path]:
-    """Return the paths of a stream: one for each position in m, cm or mm with the components x, y and z."""
+    """Return the paths of a stream, one for each position in m, cm or mm with the components x, y and z."""
     if TIME not in table.column_names or not table.num_rows:
         return []
     t_ns = table.column(TIME).to_numpy()
-    if 2 * len(np.unique(t_ns)) < len(t_ns):  # a cloud's points share a stamp
+    if 2 * len(np.unique(t_ns)) < len(t_ns):  # a cloud's points share a timestamp
         return []
     positions = _vectors(table, POSITION, "xyz")
-    turned = _vectors(table, ORIENTATION, "xyzw")
-    quaternion = matrix(table, [field.name for field in next(iter(turned.values()))]) if len(turned) == 1 else None
+    orientations = _vectors(table, ORIENTATION, "xyzw")
+    quaternion = (
+        matrix(table, [field.name for field in next(iter(orientations.values()))]) if len(orientations) == 1 else None
+    )
     paths = []
     for shared, fields in positions.items():
-        scale = [METRES.get(described(field).get("unit", "m")) for field in fields]
+        scale = [METRES.get(field_metadata(field).get("unit", "m")) for field in fields]
         if None in scale:
             continue
-        place_m = matrix(table, [field.name for field in fields]) * np.array(scale, dtype=np.float64)
-        valid = np.isfinite(place_m).all(axis=1)
+        position_m = matrix(table, [field.name for field in fields]) * np.array(scale, dtype=np.float64)
+        valid = np.isfinite(position_m).all(axis=1)
         if quaternion is not None:
             valid &= np.isfinite(quaternion).all(axis=1) & (np.abs(quaternion).sum(axis=1) > 0)
         if valid.any():
             part = f"{stream} {shared.split('_')[0]}".strip() if len(positions) > 1 else stream or "position"
-            paths.append(Path(part, t_ns[valid], place_m[valid], None if quaternion is None else quaternion[valid]))
+            paths.append(Path(part, t_ns[valid], position_m[valid], None if quaternion is None else quaternion[valid]))
     return paths
 
 
 def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Field]]:
-    """Return the columns of each vector of a quantity that has all of ``parts``, in their order."""
+    """Return the columns of each vector of a quantity that has all of ``parts``, in this order."""
     by_name: dict[str, dict[str, pa.Field]] = {}
     for field in table.schema:
-        if described(field).get("quantity") == quantity:
+        if field_metadata(field).get("quantity") == quantity:
             shared = arm.split_name(field.name)[1]
             by_name.setdefault(shared, {})[arm.component(field)] = field
     return {

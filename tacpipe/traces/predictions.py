@@ -1,4 +1,4 @@
-"""Pair predictions with measurements: forecasts at their target times, and classes next to the label."""
+"""Pair predictions with measurements: forecasts at their target times, and predicted classes with the label."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.signals.resampling import linear
-from tacpipe.traces.curves import TIME, described, matrix
+from tacpipe.traces.curves import TIME, field_metadata, matrix
 from tacpipe.traces.taxels import Taxels
 
 if TYPE_CHECKING:
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DrawnForecast:
-    """A model's prediction for one finger ``step`` rows ahead and the measured values; both are changes from rest."""
+    """A prediction for one finger ``step`` rows ahead, and the measured values; both are changes from rest."""
 
     step: int
-    predicted: Taxels  # its t_ns are the times that were predicted
+    predicted: Taxels  # its t_ns are the predicted times
     measured: Taxels  # measured values at the same times
 
     @property
@@ -35,21 +35,21 @@ class DrawnForecast:
 
     @property
     def error(self) -> Floats:
-        """The mean absolute error over the channels (time,), as `tacpipe evaluate` averages it."""
+        """The mean absolute error over the channels (time,), as `tacpipe evaluate` computes it."""
         return np.asarray(np.abs(self.predicted.change - self.measured.change).mean(axis=(1, 2)))
 
 
-def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[DrawnForecast]:
-    """Return the forecasts in a recording of `tacpipe predict`, or of `tacpipe evaluate`, finger by finger, step by step.
+def forecasts_from_table(table: pa.Table, measured: Sequence[Taxels]) -> list[DrawnForecast]:
+    """Return the forecasts in a recording of `tacpipe predict` or `tacpipe evaluate`, by finger and step.
 
     A column is matched by its name: ``xela1_taxel01_z_t5`` is the channel ``taxel01_z`` of the stream ``xela1``, 5 rows
-    ahead. Fingers without a column for each channel have no forecast. A row's stamp is the last row that the model read.
+    ahead. Fingers with missing columns have no forecast. A row's timestamp is that of the last row that the model read.
     """
     if TIME not in table.column_names or table.num_rows < 2:
         return []
     by_step: dict[int, set[str]] = {}
     for field in table.schema:
-        step = described(field).get("step", "0")
+        step = field_metadata(field).get("step", "0")
         if step.isdigit() and int(step) > 0:
             by_step.setdefault(int(step), set()).add(str(field.name))
     t_ns = table.column(TIME).to_numpy()
@@ -58,14 +58,14 @@ def of_table(table: pa.Table, measured: Sequence[Taxels]) -> list[DrawnForecast]
         for taxels in measured
         if len(taxels.t_ns) > 1
         for step in sorted(by_step)
-        for forecast in _of_step(table, t_ns, step, by_step[step], taxels)
+        for forecast in _forecasts_for_step(table, t_ns, step, by_step[step], taxels)
     ]
 
 
-def of_values(values: Mapping[str, Attribute], measured: Sequence[Taxels]) -> list[DrawnForecast]:
-    """Return what a model predicted for the only reading of two BioTac SP, finger by finger, as forecasts of step 0.
+def forecasts_from_values(values: Mapping[str, Attribute], measured: Sequence[Taxels]) -> list[DrawnForecast]:
+    """Return the predictions for a single reading of two BioTac SP sensors, by finger, as forecasts of step 0.
 
-    ``values`` are named by target, as `tacpipe.channels.biotac_sp.value_columns` names them.
+    ``values`` are named by target, see `tacpipe.channels.biotac_sp.value_columns`.
     """
     forecasts = []
     for taxels in measured:
@@ -79,7 +79,9 @@ def of_values(values: Mapping[str, Attribute], measured: Sequence[Taxels]) -> li
     return forecasts
 
 
-def _of_step(table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels: Taxels) -> list[DrawnForecast]:
+def _forecasts_for_step(
+    table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels: Taxels
+) -> list[DrawnForecast]:
     prefix = f"{taxels.stream}_" if taxels.stream else ""
     names = [f"{prefix}{channel}_t{step}" for channel in taxels.channels]
     if not set(names) <= columns:
@@ -89,38 +91,42 @@ def _of_step(table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels:
     shape = (int(covered.sum()), *taxels.change.shape[1:])
     measured = linear(taxels.t_ns, taxels.change.reshape(len(taxels.t_ns), -1), target_ns[covered])
     predicted = matrix(table, names)[covered]
-    at = replace(taxels, t_ns=target_ns[covered])
+    at_target = replace(taxels, t_ns=target_ns[covered])
     return [
-        DrawnForecast(step, replace(at, change=predicted.reshape(shape)), replace(at, change=measured.reshape(shape)))
+        DrawnForecast(
+            step,
+            replace(at_target, change=predicted.reshape(shape)),
+            replace(at_target, change=measured.reshape(shape)),
+        )
     ]
 
 
 MODEL, SCORE = "model", "score_"
-LEADING = 5  # names of a chart
+MAX_CHART_CLASSES = 5  # number of classes in a chart
 
 
 @dataclass(frozen=True)
 class Classification:
-    """The predicted classes of one recording next to its label, all as text."""
+    """The predicted classes of one recording and its label, all as text."""
 
     key: str  # name of the label, such as ``material``
-    label: str  # label of the recording, empty without one
-    predicted: Mapping[str, str]  # class by predictor, the model first; predictors without an answer are left out
-    scores: Mapping[str, float]  # scores of the model by class, in the order of columns
+    label: str  # the label of the recording; empty if it has none
+    predicted: Mapping[str, str]  # predictor -> class, the model first, without predictors that predicted none
+    scores: Mapping[str, float]  # class -> score of the model, in the order of columns
 
     @property
-    def of_model(self) -> str:
+    def model_class(self) -> str:
         """The class that the model predicted."""
         return self.predicted[MODEL]
 
-    def leading(self) -> dict[str, float]:
-        """Return the names of the largest scores, the largest first, and that of the label behind them.
+    def leading_scores(self) -> dict[str, float]:
+        """Return the classes with the largest scores, in descending order; the last may be the label instead.
 
-        >>> Classification("material", "7", {"model": "1"}, {str(one): -one for one in range(9)}).leading()
+        >>> Classification("material", "7", {"model": "1"}, {str(number): -number for number in range(9)}).leading_scores()
         {'0': 0, '1': -1, '2': -2, '3': -3, '7': -7}
         """
         order = sorted(self.scores, key=lambda name: -self.scores[name])
-        first = order[:LEADING]
+        first = order[:MAX_CHART_CLASSES]
         if self.label in self.scores and self.label not in first:
             first[-1] = self.label
         return {name: self.scores[name] for name in first}
@@ -132,22 +138,22 @@ class Classification:
         >>> Classification("material", "cork", {"model": "felt"}, {}).sentence
         'material: felt predicted, but labelled cork'
         """
-        name = self.of_model
+        name = self.model_class
         if not self.label:
             return f"{self.key}: {name} predicted"
         return f"{self.key}: {name} predicted, {'as labelled' if name == self.label else f'but labelled {self.label}'}"
 
 
-def of_row(row: pa.Table, attributes: Mapping[str, Attribute]) -> Classification | None:
-    """Return the names in a recording's row of `tacpipe predict`, or of `tacpipe evaluate`, or None if it has none.
+def classification_from_row(row: pa.Table, attributes: Mapping[str, Attribute]) -> Classification | None:
+    """Return the classes in a recording's row of `tacpipe predict` or `tacpipe evaluate`, or None if there are none.
 
-    The quantity of a column (``label``, ``prediction``, ``score``) states what it holds. A row of `predict` names the
-    recording in a column of the label's own name; the label is then the recording's.
+    The quantity of a column (``label``, ``prediction``, ``score``) describes its content. In a row of `predict`, the
+    column of predicted classes has the label's name; the label is then the recording's attribute.
     """
     values = row.to_pylist()[0]
     by_quantity: dict[str, list[str]] = {}
     for field in row.schema:
-        by_quantity.setdefault(described(field).get("quantity", ""), []).append(str(field.name))
+        by_quantity.setdefault(field_metadata(field).get("quantity", ""), []).append(str(field.name))
     columns = [name for name in by_quantity.get("prediction", []) if values[name] is not None]
     scores = {_class(name): float(values[name]) for name in by_quantity.get("score", []) if values[name] is not None}
     if not columns or not scores:
@@ -165,10 +171,6 @@ def of_row(row: pa.Table, attributes: Mapping[str, Attribute]) -> Classification
 
 
 def _class(column: str) -> str:
-    """Return the name that a column of scores is of: numbers were filled with zeros.
-
-    >>> _class("score_03"), _class("score_00"), _class("score_cork")
-    ('3', '0', 'cork')
-    """
+    """Return the class of a column of scores; numbers in column names are zero-padded."""
     name = column.removeprefix(SCORE)
     return str(int(name)) if name.isascii() and name.isdigit() else name

@@ -1,4 +1,4 @@
-"""Find the spans of a recording (contacts, slides, slips and other labels of rows, gaps) and its events."""
+"""Extract the spans of a recording (contacts, slides, slips and other labels of rows, gaps) and its events."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
 from tacpipe.channels.streams import GAP, gaps_before
-from tacpipe.traces.curves import TIME, described
+from tacpipe.traces.curves import TIME, field_metadata
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_NAMED = {"phase": {-1: "", 0: "slide", 1: ""}}  # values of label columns that have names of their own
-_NOTHING = ("", "0", "-1", "False", "None", "nan")  # values of a label of rows that nothing is drawn for
-CONTACT, PADDING = "contact", "padding"  # lane of the contacts, and the text of a span that is padding
+_VALUE_NAMES = {"phase": {-1: "", 0: "slide", 1: ""}}  # values of label columns with names of their own
+_UNSET = ("", "0", "-1", "False", "None", "nan")  # values of a label that are not drawn
+CONTACT, PADDING = "contact", "padding"  # lane of the contacts, and text of padding
 _SWITCHES = ({"0", "1"}, {"1"}, {"0"}, {"False", "True"}, {"True"}, {"False"})
 
 
 class Span(NamedTuple):
-    """A time during which something holds, in one lane of a diagram."""
+    """A time interval in one lane of a diagram."""
 
     lane: str
     text: str
@@ -40,26 +40,26 @@ class FaultMark(NamedTuple):
     text: str
 
 
-def of_labels(table: pa.Table) -> list[Span]:
-    """Return the spans in which each label column of a table has one value, lane by lane.
+def label_spans(table: pa.Table) -> list[Span]:
+    """Return the spans in which each label column of a table is constant, lane by lane.
 
-    A column of 0 and 1 gives spans by its own name. One with other values, as ``contact`` with numbers from 0, gives
-    spans with name and value; -1, null and the empty text are no span there.
+    The spans of a column of 0 and 1 have the column's name as text. Those of other columns, such as ``contact`` with
+    numbers from 0, have name and value; there, -1, null and the empty string are not spans.
     """
     if TIME not in table.column_names or not table.num_rows:
         return []
     t_ns = table.column(TIME).to_numpy()
     spans = []
     for field in table.schema:
-        if described(field).get("quantity") == "label" and field.name != TIME:
-            spans += _of_column(str(field.name), table.column(field.name), t_ns)
+        if field_metadata(field).get("quantity") == "label" and field.name != TIME:
+            spans += _column_spans(str(field.name), table.column(field.name), t_ns)
     return spans
 
 
 def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[Span]:
-    """Return the spans with each contact split into padding, touch and padding; a contact without touch stays whole.
+    """Split each contact into padding, touch and padding; a contact without touch is not split.
 
-    ``touching`` (time,) has the rows of touch at the stamps ``t_ns`` (time,).
+    ``touching`` (time,) marks the rows of touch at the timestamps ``t_ns`` (time,).
     """
     parts: list[Span] = []
     for span in labels:
@@ -75,15 +75,15 @@ def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[
     return parts
 
 
-def _of_column(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:
+def _column_spans(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:
     encoded = column.combine_chunks().dictionary_encode()
     codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)  # (time,)
     values = {code: _text(value) for code, value in enumerate(encoded.dictionary.to_pylist())} | {-1: ""}
-    numbered = not any(set(values.values()) - {""} <= switch for switch in _SWITCHES)
-    texts = {code: _label_text(name, value, numbered=numbered) for code, value in values.items()}
+    is_numbered = not any(set(values.values()) - {""} <= switch for switch in _SWITCHES)
+    texts = {code: _label_text(name, value, numbered=is_numbered) for code, value in values.items()}
     return [
         Span(name, texts[int(codes[start])], int(t_ns[start]), stop_ns(t_ns, stop))
-        for start, stop in _stretches(codes)
+        for start, stop in _runs(codes)
         if texts[int(codes[start])]
     ]
 
@@ -93,22 +93,22 @@ def _text(value: object) -> str:
 
 
 def _label_text(name: str, value: str, *, numbered: bool) -> str:
-    if name in _NAMED:
-        return _NAMED[name].get(int(value), value) if value.lstrip("-").isdigit() else value
+    if name in _VALUE_NAMES:
+        return _VALUE_NAMES[name].get(int(value), value) if value.lstrip("-").isdigit() else value
     if numbered:
-        unset = set(_NOTHING) - {"0"}
+        unset = set(_UNSET) - {"0"}
         return "" if value in unset else f"{name} {value}" if value.lstrip("-").isdigit() else value
-    return "" if value in _NOTHING else name
+    return "" if value in _UNSET else name
 
 
-def _stretches(values: AnyArray) -> list[tuple[int, int]]:
-    """Return first row and stop of each stretch of one value."""
+def _runs(values: AnyArray) -> list[tuple[int, int]]:
+    """Return first row and exclusive stop of each run of equal values."""
     edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
     return list(pairwise(edges))
 
 
 def stop_ns(t_ns: Times, stop: int) -> int:
-    """Return when a stretch of rows ends, given its stop, exclusive: with the next row, or a step behind the last."""
+    """Return the end of a run of rows with the exclusive ``stop``: the next row, or one step after the last row."""
     if stop < len(t_ns):
         return int(t_ns[stop])
     step_ns = int(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0
@@ -116,7 +116,7 @@ def stop_ns(t_ns: Times, stop: int) -> int:
 
 
 def gaps(stream: str, table: pa.Table) -> list[Span]:
-    """Return the gaps of a stream: from the sample before to the one after it."""
+    """Return the gaps of a stream, each from the sample before it to the sample after it."""
     if TIME not in table.column_names or table.num_rows < 2:
         return []
     t_ns = table.column(TIME).to_numpy()
@@ -124,7 +124,7 @@ def gaps(stream: str, table: pa.Table) -> list[Span]:
 
 
 def masked_gaps(table: pa.Table) -> list[Span]:
-    """Return the gaps of streams in a synchronized table, by its masks that end in ``_gap``."""
+    """Return the gaps of streams in a synchronized table, from its masks, which end in ``_gap``."""
     if TIME not in table.column_names or not table.num_rows:
         return []
     t_ns = table.column(TIME).to_numpy()
@@ -135,16 +135,16 @@ def masked_gaps(table: pa.Table) -> list[Span]:
             lane = name.removesuffix(GAP)
             spans += [
                 Span(lane, "gap", int(t_ns[start]), stop_ns(t_ns, stop))
-                for start, stop in _stretches(values)
+                for start, stop in _runs(values)
                 if values[start]
             ]
     return spans
 
 
-def merged(spans: Sequence[Span], lane: str = "gaps") -> list[Span]:
-    """Return spans of several lanes as one lane without overlaps; each names the lanes that it is of.
+def merge_lanes(spans: Sequence[Span], lane: str = "gaps") -> list[Span]:
+    """Merge spans of several lanes into one lane without overlaps; each text lists the original lanes.
 
-    >>> [span[1:] for span in merged([Span("a", "gap", 0, 5), Span("b", "gap", 3, 9)])]
+    >>> [span[1:] for span in merge_lanes([Span("a", "gap", 0, 5), Span("b", "gap", 3, 9)])]
     [('a', 0, 3), ('a, b', 3, 5), ('b', 5, 9)]
     """
     edges = sorted({edge for span in spans for edge in (span.start_ns, span.stop_ns)})
@@ -165,7 +165,7 @@ def merged(spans: Sequence[Span], lane: str = "gaps") -> list[Span]:
 
 
 def events(table: pa.Table) -> list[FaultMark]:
-    """Return the rows of a stream of events, in the order of time."""
+    """Return the rows of a stream of events, ordered by time."""
     rows = table.to_pylist()
     parsed = [
         FaultMark(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event_text(row))

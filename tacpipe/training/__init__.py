@@ -1,1 +1,1 @@
-"""Train networks: the loop, checkpoints, scaling."""
+"""Train networks: the training loop, checkpoints, scaling."""

@@ -1,6 +1,6 @@
-"""Choose the device that networks are trained on: the processor or one accelerator.
+"""Choose the device for training networks: the CPU or one accelerator.
 
-The device is part of no key; records state it. One training uses one device.
+The device is not part of any key, but records contain it. A training uses one device.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ Device = Literal["auto", "cpu", "cuda", "mps"]
 AUTO: Device = "auto"
 CPU, CUDA, MPS = "cpu", "cuda", "mps"
 Precision = Literal["float32", "bfloat16"]
-VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"  # CUDA's variable: which GPUs a process sees, separated by commas
-_GPUS = Path("/proc/driver/nvidia/gpus")  # NVIDIA's driver has one folder here per GPU
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"  # CUDA's variable for the visible GPUs, separated by commas
+_GPUS = Path("/proc/driver/nvidia/gpus")  # NVIDIA's driver creates one folder here per GPU
 
-_chosen: ContextVar[Device] = ContextVar("device", default=AUTO)
+_device: ContextVar[Device] = ContextVar("device", default=AUTO)
 
 
 @contextlib.contextmanager
-def chosen(device: Device) -> Iterator[None]:
-    """Train networks in the block on ``device``; ``auto`` is CUDA where there is a GPU.
+def use_device(device: Device) -> Iterator[None]:
+    """Train networks in the block on ``device``; ``auto`` is CUDA if there is a GPU.
 
     Raises `UsageError` if this computer lacks the device, and under ``torchrun``.
     """
-    _refuse_torchrun()
+    _reject_torchrun()
     if device != AUTO:
-        _check(device)
-    token = _chosen.set(device)
+        _require_available(device)
+    token = _device.set(device)
     try:
         yield
     finally:
-        _chosen.reset(token)
+        _device.reset(token)
 
 
 def kind() -> str:
-    """Return the kind of device that networks are trained on: cpu, cuda or mps; it is cpu as long as torch is not loaded."""
-    device = _chosen.get()
+    """Return the kind of device for training: cpu, cuda or mps. With ``auto`` it is cpu until torch is imported."""
+    device = _device.get()
     if device != AUTO:
         return device
     torch = sys.modules.get("torch")
@@ -51,9 +51,10 @@ def kind() -> str:
 
 
 def gpu_for(worker: int) -> dict[str, str]:
-    """Return the variable that restricts worker ``worker`` (from 0) to one GPU; empty if there are fewer than two.
+    """Return the environment variable that restricts ``worker`` (from 0) to one GPU; empty with fewer than two GPUs.
 
-    Workers take the visible GPUs in turn, so concurrent training runs do not share one while another is idle.
+    Workers are assigned the visible GPUs in turn, so that concurrent trainings do not share a GPU while another is
+    idle.
     """
     visible = os.environ.get(VISIBLE_GPUS)
     if visible is None:
@@ -63,7 +64,7 @@ def gpu_for(worker: int) -> dict[str, str]:
     return {VISIBLE_GPUS: names[worker % len(names)]} if len(names) > 1 else {}
 
 
-def _check(device: Device) -> None:
+def _require_available(device: Device) -> None:
     """Raise `UsageError` if this computer has no such device."""
     import torch
 
@@ -76,8 +77,8 @@ def _check(device: Device) -> None:
         )
 
 
-def _refuse_torchrun() -> None:
-    """Raise `UsageError` in one of several processes that ``torchrun`` has started."""
+def _reject_torchrun() -> None:
+    """Raise `UsageError` in one of several processes that ``torchrun`` started."""
     size = os.environ.get("WORLD_SIZE", "1")
     if "TORCHELASTIC_RUN_ID" in os.environ and size != "1":
         raise UsageError(

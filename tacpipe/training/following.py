@@ -1,6 +1,8 @@
-"""Follow a training while it runs: a growing file, the terminal, trackers. None of them changes the result.
+"""Report the progress of a training to its followers: a history file, the terminal, trackers.
 
-A stage with a workspace is run within `in_workspace`; the loop calls `network` for each network that it trains there.
+They do not affect the result.
+
+A stage with a workspace runs inside `in_workspace`; the training loop calls `network` for each network that it trains.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ HISTORY = "history.jsonl"
 
 
 def read_history(content: bytes) -> list[Line]:
-    """Return the lines of a history file."""
+    """Parse the lines of a history file."""
     return [json.loads(line) for line in content.splitlines() if line.strip()]
 
 
@@ -31,37 +33,37 @@ def history_bytes(history: Iterable[Line]) -> bytes:
 
 
 class NetworkLabels(TypedDict, total=False):
-    """Names of a network in its lines, where a stage trains several."""
+    """Labels of a network in its lines, if a stage trains several."""
 
     target: str
     network: int
 
 
 class Validated(TypedDict):
-    """Results of a validation: the loss, and of joint training those of each sensor."""
+    """Results of a validation: the loss and, for joint training, those of each sensor."""
 
     val_loss: float
     alignment: NotRequired[float | None]
-    train: NotRequired[dict[str, dict[str, float | None]]]  # sensor to the mean of each part of the training loss
-    val: NotRequired[dict[str, dict[str, float]]]  # sensor to the validation accuracy and the parts of its loss
+    train: NotRequired[dict[str, dict[str, float | None]]]  # sensor -> mean of each part of the training loss
+    val: NotRequired[dict[str, dict[str, float]]]  # sensor -> validation accuracy and the parts of its loss
 
 
 class Line(Validated, NetworkLabels):
-    """One line of the history: the results of an epoch, as JSON holds them."""
+    """One line of the history file: the results of an epoch."""
 
     epoch: int  # from 1
     train_loss: float
-    best: NotRequired[bool]  # true if a part of the model was never as good before
+    best: NotRequired[bool]  # true if a part of the model improved
 
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """One of the networks that a stage trains: which it is, and how long it may take."""
+    """One of the networks that a stage trains."""
 
-    epochs: int  # upper limit
+    epochs: int  # maximum number
     number: int = 1
     count: int = 1
-    labels: NetworkLabels = field(default_factory=NetworkLabels)  # are added to each of its lines
+    labels: NetworkLabels = field(default_factory=NetworkLabels)  # added to each of its lines
 
     @property
     def name(self) -> str:
@@ -70,24 +72,24 @@ class TrainedNetwork:
 
 
 class Follower(Protocol):
-    """Receive calls as a training proceeds."""
+    """Receive calls during a training."""
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
-        """Begin to follow the training of a network; ``history`` are its epochs before an interruption."""
+        """Start following the training of a network; ``history`` contains its epochs before an interruption."""
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
-        """Follow a batch that was learned; ``passed`` is the fraction of the epoch, ``loss`` returns the mean so far."""
+        """Receive a trained batch; ``passed`` is the fraction of the epoch, ``loss`` returns the mean loss so far."""
 
     def line(self, line: Line, learning_rate: float) -> None:
-        """Follow an epoch that is over and whose checkpoint is written."""
+        """Receive the line of a completed epoch, after its checkpoint is written."""
 
     def end(self, *, trained: bool) -> None:
-        """End: the network is trained, or an error or a user ended its training."""
+        """Stop following: the network is trained, or an error or a user ended the training."""
 
 
 @dataclass(frozen=True)
 class Followers:
-    """Several as one."""
+    """Forward calls to several followers."""
 
     followers: Sequence[Follower] = ()
 
@@ -103,12 +105,12 @@ class Followers:
 
 
 _trackers: ContextVar[tuple[Follower, ...]] = ContextVar("trackers", default=())  # trackers of the command
-_current: ContextVar[tuple[Follower, ...]] = ContextVar("followers", default=())  # followers of the stage that runs
+_current: ContextVar[tuple[Follower, ...]] = ContextVar("followers", default=())  # followers of the running stage
 
 
 @contextlib.contextmanager
-def tracked(trackers: Sequence[Follower]) -> Iterator[None]:
-    """Have each training in the block followed by ``trackers`` too."""
+def track_with(trackers: Sequence[Follower]) -> Iterator[None]:
+    """Add ``trackers`` to the followers of each training in the block."""
     before = _trackers.set(tuple(trackers))
     try:
         yield
@@ -118,7 +120,7 @@ def tracked(trackers: Sequence[Follower]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def in_workspace(workspace: Path, *displays: Follower) -> Iterator[None]:
-    """Have a file in ``workspace``, ``displays`` and the command's trackers follow each training in the block."""
+    """Let the history file in ``workspace``, ``displays`` and the command's trackers follow each training in the block."""
     file = _HistoryFile(workspace / HISTORY)
     before = _current.set((file, *_trackers.get(), *displays))
     try:
@@ -148,8 +150,8 @@ def network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Foll
 
 
 @contextlib.contextmanager
-def resumable(network: TrainedNetwork, epochs_trained: int) -> Iterator[None]:
-    """Have an interrupt of the epoch in the block stated with the epoch that the same command resumes from."""
+def announce_resume(network: TrainedNetwork, epochs_trained: int) -> Iterator[None]:
+    """Let the message for an interrupt in the block contain the epoch from which the same command resumes."""
     name = f" of {network.name}" if network.name else ""
     epoch = f"epoch {epochs_trained + 1} of {network.epochs}"
     sentence = f"tacpipe: interrupted; the same command resumes training{name} from {epoch}."
@@ -158,7 +160,10 @@ def resumable(network: TrainedNetwork, epochs_trained: int) -> Iterator[None]:
 
 
 class _HistoryFile:
-    """The lines of all networks of a stage as JSON lines, for ``tail -f``; a failure to write it ends no training."""
+    """Write the lines of all networks of a stage to a JSON lines file, for ``tail -f``.
+
+    A write error does not stop a training.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -170,7 +175,7 @@ class _HistoryFile:
         self._labels = network.labels
         if self._handle is None and not self._failed:
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-            with self._forgiven():
+            with self._tolerate_errors():
                 self._handle = os.open(self._path, flags, 0o666)
         for line in history:
             self.line(line, 0.0)
@@ -180,23 +185,23 @@ class _HistoryFile:
 
     def line(self, line: Line, learning_rate: float) -> None:
         if self._handle is not None:
-            with self._forgiven():
+            with self._tolerate_errors():
                 os.write(self._handle, history_bytes([{**line, **self._labels}]))
 
     def end(self, *, trained: bool) -> None:
         pass
 
     def close(self) -> None:
-        """Close the file, and remove one without a line: a workspace in which nothing was saved is removed."""
+        """Close the file, and delete it if it is empty, so that an empty workspace can be removed."""
         if self._handle is not None:
-            with self._forgiven():
+            with self._tolerate_errors():
                 if not os.fstat(self._handle).st_size:
                     self._path.unlink()
             os.close(self._handle)
             self._handle = None
 
     @contextlib.contextmanager
-    def _forgiven(self) -> Iterator[None]:
+    def _tolerate_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -207,7 +212,7 @@ class _HistoryFile:
             self._failed = True
 
 
-BATCH_S = 0.5  # least time between two messages about batches: each reads the loss
+BATCH_S = 0.5  # minimum interval between messages about batches, because each reads the loss
 
 
 class NetworkFields(TypedDict):
@@ -232,36 +237,36 @@ class TrainingMessage(TypedDict, total=False):
 
 
 class Sender:
-    """A follower that sends what it is called with."""
+    """Send the calls of a follower as messages."""
 
     def __init__(self, send: Callable[[TrainingMessage], None]) -> None:
         self._send, self._sent_s = send, time.monotonic()
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
-        """Send which network is trained, and its epochs before an interruption."""
+        """Send the network, and its epochs before an interruption."""
         fields = NetworkFields(epochs=network.epochs, number=network.number, count=network.count, labels=network.labels)
         self._send({"begin": fields, "history": list(history)})
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
-        """Send how far an epoch is, every half second at most."""
+        """Send the progress of an epoch, at most every half second."""
         now_s = time.monotonic()
         if now_s - self._sent_s >= BATCH_S:
             self._sent_s = now_s
             self._send({"batch": passed, "loss": loss()})
 
     def line(self, line: Line, learning_rate: float) -> None:
-        """Send an epoch."""
+        """Send the line of an epoch."""
         self._send({"line": line, "learning_rate": learning_rate})
 
     def end(self, *, trained: bool) -> None:
-        """Send that the network is trained, or was ended."""
+        """Send whether the network was trained or the training was stopped."""
         self._send({"end": trained})
 
 
 class Receiver:
-    """Calls followers as messages come.
+    """Call followers when messages arrive.
 
-    Where a worker died, another one begins the network again: epochs that the followers have are not given twice.
+    If a worker died, another one starts the network again: epochs that the followers already received are skipped.
     """
 
     def __init__(self, followers: Sequence[Follower]) -> None:
@@ -270,7 +275,7 @@ class Receiver:
         self._epochs = 0  # epochs of the network that the followers have received
 
     def take(self, message: TrainingMessage) -> None:
-        """Call the followers with what a message holds."""
+        """Call the followers with the content of a message."""
         if "begin" in message:
             self._begin(TrainedNetwork(**message["begin"]), message["history"])
         elif "batch" in message:
@@ -278,11 +283,11 @@ class Receiver:
                 follower.batch(message["batch"], lambda: float(message["loss"]))
         elif "line" in message:
             self._line(message["line"], message["learning_rate"])
-        elif message["end"]:  # else another process may continue the training
+        elif message["end"]:  # otherwise another process may continue the training
             self._end(trained=True)
 
     def close(self) -> None:
-        """End a network that was not trained to its end."""
+        """Report the end of a network whose training was not completed."""
         if self._network is not None:
             self._end(trained=False)
 

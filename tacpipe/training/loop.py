@@ -1,9 +1,9 @@
-"""The training loop: Adam, clipped gradients, early stopping, and a checkpoint after every epoch.
+"""Train a network: Adam, gradient clipping, early stopping, and a checkpoint after every epoch.
 
-What is learned comes as `TrainingWork`: its batches, its loss, and what is watched after each epoch. Batches are rows of
-tensors picked by index, so no loader stands between the data and the step. All randomness (initial weights, dropout,
-shuffles) comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and
-resumed gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
+A `TrainingWork` provides the batches, the loss, and the validation after each epoch. Batches are rows of tensors,
+selected by index, so no data loader is needed. All randomness (initial weights, dropout, shuffling) comes from torch's
+generator with one seed, whose state is part of the checkpoint: on a CPU, a run that was killed and resumed gives the
+same bits as an uninterrupted run. A GPU adds in a different order each time.
 """
 
 from __future__ import annotations
@@ -34,17 +34,16 @@ from tacpipe.training.following import Followers, NetworkLabels, TrainedNetwork,
 from tacpipe.training.following import Line as Line
 from tacpipe.training.schedule import Schedule as Schedule
 
-BETAS, EPSILON = (0.9, 0.999), 1e-8  # those of the paper, and torch's defaults
+BETAS, EPSILON = (0.9, 0.999), 1e-8  # as in the paper, and torch's defaults
 
 
 class Adam:
-    """Steps along the gradients of weights; ``weight_decay`` of each weight is added to its gradient.
+    """Update weights along their gradients; ``weight_decay`` of each weight is added to its gradient.
 
-    Adam (Kingma and Ba, Adam: A Method for Stochastic Optimization, 2015), to the bit as `torch.optim.Adam` computes it.
+    Adam (Kingma and Ba, Adam: A Method for Stochastic Optimization, 2015), bit-identical to `torch.optim.Adam`.
 
     The first `torch.optim.Adam` of a process imports torch's compiler, which takes as long as torch itself: 1.2 s of
-    processor time, of some 6 s that a short training of one epoch takes. The function that it calls at each step needs
-    none of that.
+    CPU time, of some 6 s for a short training of one epoch. The function that it calls at each step needs none of it.
     """
 
     def __init__(self, weights: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
@@ -53,12 +52,12 @@ class Adam:
         self._state: dict[int, dict[str, Tensor]] = {}
 
     def zero_grad(self) -> None:
-        """Forget all gradients."""
+        """Discard all gradients."""
         for weight in self.weights:
             weight.grad = None
 
     def step(self) -> None:
-        """Change each weight that has a gradient; others stay, and so does what is known of them."""
+        """Update each weight that has a gradient, and its moments; others are not changed."""
         changed = [(number, weight) for number, weight in enumerate(self.weights) if weight.grad is not None]
         state = [self._moments(number) for number, _ in changed]
         with torch.no_grad():
@@ -80,11 +79,11 @@ class Adam:
             )
 
     def state(self) -> dict[int, dict[str, Tensor]]:
-        """Return what is known of each weight that had a gradient, by its number: ``step``, ``exp_avg``, ``exp_avg_sq``."""
+        """Return the moments of each weight that had a gradient, by its number: ``step``, ``exp_avg``, ``exp_avg_sq``."""
         return self._state
 
     def load(self, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-        """Take over what `state` returned of weights in the same order, maybe on another device."""
+        """Restore what `state` returned, for weights in the same order, possibly on another device."""
         self._state = {
             number: {name: value.to(self.weights[number].device) for name, value in moments.items()}
             for number, moments in state.items()
@@ -106,10 +105,10 @@ log = logging.getLogger(__name__)
 
 
 def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Sequence[Line]) -> None:
-    """Replace the checkpoint in ``folder``; after return it is on disk, and before it the old one is whole.
+    """Replace the checkpoint in ``folder`` atomically; on return it is on disk.
 
-    Its first line is the digest of the rest, a safetensors file with the history as JSON in its header: two files could be
-    torn apart by a crash between them, and training must not resume from a weight that a disk has changed.
+    Its first line is the digest of the rest, a safetensors file with the history as JSON in its header. A crash could
+    separate two files, and training must not resume from weights that a disk has corrupted.
     """
     state = json.dumps({"history": history})
     content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": state})
@@ -117,13 +116,13 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Seque
     with readable_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         draft = folder / f"{FILE}.draft"
-        draft.unlink(missing_ok=True)  # left by a run that was killed
+        draft.unlink(missing_ok=True)  # left by a killed run
         write_whole(str(folder / FILE), signed, str(draft))
         sync_folder(str(folder))
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], list[Line]] | None:
-    """Return tensors and history of the checkpoint in ``folder``, or None if there is none or it is damaged."""
+    """Return the tensors and history of the checkpoint in ``folder``, or None if it does not exist or is damaged."""
     path = folder / FILE
     try:
         signed = regular.content(path, follow=False)
@@ -145,12 +144,12 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], list[Line]] | None
         return None
 
 
-Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
+Loss = Callable[[nn.Module, Tensor], Tensor]  # returns the mean loss of the windows with these indices
 
 
 @dataclass(frozen=True)
 class WindowSet:
-    """Training or validation windows: how many, and the mean loss of some."""
+    """Training or validation windows: their number, and the mean loss of a selection."""
 
     count: int
     loss: Loss
@@ -160,40 +159,41 @@ class TrainingWork(Protocol):
     """Define a training: the batches of an epoch, the loss of each, and the validation after the epoch."""
 
     def batches(self, epoch: int) -> Sequence[Any]:
-        """Return the batches of an epoch, from 0; what is random in them comes from torch's generator."""
+        """Return the batches of an epoch, from 0; randomness comes from torch's generator."""
 
     def loss(self, model: nn.Module, batch: Any, epoch: int) -> tuple[Tensor, int]:
-        """Return the loss to be lowered and the weight of the batch in the epoch's mean."""
+        """Return the loss to minimise and the weight of the batch in the epoch's mean."""
 
     def watch(self, model: nn.Module) -> Validated:
-        """Return ``val_loss`` and whatever else the epoch's line of the history shall hold."""
+        """Validate the model: return ``val_loss`` and further entries of the epoch's line."""
 
     def ranks(self, line: Line) -> Mapping[str, Sequence[float]]:
-        """Return what an epoch is chosen by, the lowest being best, for each part of the model that is chosen alone.
+        """Return the rank of an epoch, lowest best, for each part of the model that is selected separately.
 
-        A part is named by how its weights' names begin; the part ``""`` is the whole model.
+        A part is the common prefix of its weights' names; the part ``""`` is the full model.
         """
 
 
 @dataclass(frozen=True)
 class WindowTraining:
-    """The work of most models: training windows in another order every epoch, chosen by the validation loss."""
+    """Define the training of most models: windows are shuffled every epoch, and the validation loss selects the best."""
 
     training: WindowSet
     validation: WindowSet
     batch: int
 
     def __post_init__(self) -> None:
-        """Refuse parts without windows."""
+        """Raise `TacpipeError` if a part has no windows."""
         for name, part in (("training", self.training), ("validation", self.validation)):
             if not part.count:
                 raise TacpipeError(
-                    f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
+                    f"The {name} recordings contain no window. Give more or longer recordings, or shorten context "
+                    f"and horizon."
                 )
 
     def batches(self, epoch: int) -> list[Tensor]:
-        """Return indices of all training windows, shuffled."""
-        return list(_pieces(torch.randperm(self.training.count), self.batch))
+        """Return the indices of all training windows, shuffled."""
+        return list(_chunks(torch.randperm(self.training.count), self.batch))
 
     def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
         """Return the mean loss of the windows with these indices, and their number."""
@@ -202,8 +202,8 @@ class WindowTraining:
     def watch(self, model: nn.Module) -> Validated:
         """Return the mean loss over all validation windows."""
         total: Tensor | float = 0.0
-        for indices in _pieces(torch.arange(self.validation.count), self.batch):
-            total = total + precise(self.validation.loss(model, indices)) * len(indices)
+        for indices in _chunks(torch.arange(self.validation.count), self.batch):
+            total = total + to_float64(self.validation.loss(model, indices)) * len(indices)
         return {"val_loss": float(total) / self.validation.count}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
@@ -212,8 +212,8 @@ class WindowTraining:
 
 
 @dataclass(frozen=True)
-class Trained:
-    """The weights of the best epoch and of the last, and the history of all epochs."""
+class TrainingResult:
+    """The weights of the best and the last epoch, and the history of all epochs."""
 
     weights: dict[str, Tensor]
     history: list[Line]
@@ -222,7 +222,7 @@ class Trained:
 
 @dataclass
 class _TrainingState:
-    """Hold the state that an epoch changes; all of it is in the checkpoint."""
+    """The state that an epoch changes; all of it is in the checkpoint."""
 
     model: nn.Module
     optimiser: Adam
@@ -251,11 +251,11 @@ class _TrainingState:
         self.optimiser.load(slots)
         torch.set_rng_state(tensors["random"])
 
-    def over(self, schedule: Schedule) -> bool:
+    def is_finished(self, schedule: Schedule) -> bool:
         if len(self.history) >= schedule.epochs:
             return True
-        since = next((i for i, line in enumerate(reversed(self.history)) if line["best"]), 0)
-        return since >= schedule.patience
+        epochs_since_best = next((i for i, line in enumerate(reversed(self.history)) if line["best"]), 0)
+        return epochs_since_best >= schedule.patience
 
 
 def train(
@@ -268,13 +268,13 @@ def train(
     number: int = 1,
     count: int = 1,
     labels: NetworkLabels | None = None,
-) -> Trained:
-    """Return the best weights of the model that ``build`` makes, trained to lower the loss of ``work``.
+) -> TrainingResult:
+    """Train the model that ``build`` creates on ``work``, and return the best weights.
 
-    ``weight_decay`` is Adam's: this fraction of each weight is added to its gradient. Weights that need no gradient stay.
-    Resumes from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
-    ``number`` of ``count`` and ``labels`` are what followers are given of one of several networks.
-    Raises `TacpipeError` if the loss is no longer finite.
+    ``weight_decay`` is Adam's: this fraction of each weight is added to its gradient. Weights without gradients do not
+    change. Training resumes from the checkpoint in ``workspace`` if there is one, and leaves torch's own generator
+    unchanged. ``number`` of ``count`` and ``labels`` identify one of several networks to followers. Raises
+    `TacpipeError` if the loss is not finite.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(schedule.seed)
@@ -282,48 +282,48 @@ def train(
         learned = [weight for weight in model.parameters() if weight.requires_grad]
         run = _TrainingState(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [])
         run.resume(workspace)
-        _follow(run, work, schedule, workspace, TrainedNetwork(schedule.epochs, number, count, labels or {}))
-    return Trained(
+        _train_epochs(run, work, schedule, workspace, TrainedNetwork(schedule.epochs, number, count, labels or {}))
+    return TrainingResult(
         {name: value.cpu() for name, value in run.best.items()},
         run.history,
         {name: value.detach().cpu() for name, value in run.model.state_dict().items()},
     )
 
 
-def _follow(
+def _train_epochs(
     run: _TrainingState, work: TrainingWork, schedule: Schedule, workspace: Path, network: TrainedNetwork
 ) -> None:
-    """Train all epochs that are left, each reported to the followers."""
+    """Train all remaining epochs and report each to the followers."""
     random = torch.get_rng_state()
     with following.network(network, list(run.history)) as followers:
-        torch.set_rng_state(random)  # whatever a tracker drew
-        while not run.over(schedule):
+        torch.set_rng_state(random)  # undo what followers drew
+        while not run.is_finished(schedule):
             epochs_trained = len(run.history)
-            with following.resumable(network, epochs_trained):
-                line = _epoch(run, work, schedule, followers)
+            with following.announce_resume(network, epochs_trained):
+                line = _train_epoch(run, work, schedule, followers)
                 run.save(workspace)
             with torch.random.fork_rng(devices=[]):
-                followers.line(line, schedule.of_epoch(epochs_trained + 1))
+                followers.line(line, schedule.rate_at_epoch(epochs_trained + 1))
 
 
-def _epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, followers: Followers) -> Line:
-    """Train for one epoch, add its line to the history and return it."""
+def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, followers: Followers) -> Line:
+    """Train for one epoch, append its line to the history and return it."""
     run.model.train()
     epoch = len(run.history)
     total: Tensor | float = 0.0
     count = 0
     batches = work.batches(epoch)
-    reduced = _reduced(run.model, schedule)
+    reduced_precision = _reduced_precision(run.model, schedule)
     for step, batch in enumerate(batches):
         run.optimiser.learning_rate = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
-        with reduced:
+        with reduced_precision:
             loss, weight = work.loss(run.model, batch, epoch)
         run.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if math.isfinite(schedule.gradient_clip):
             nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
         run.optimiser.step()
-        total = total + precise(loss) * weight
+        total = total + to_float64(loss) * weight
         count += weight
         followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
@@ -334,23 +334,23 @@ def _epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, follower
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
         )
-    better = _better(work.ranks(line), [work.ranks(old) for old in run.history])
-    line["best"] = bool(better)
-    if better:
+    improved = _improved_parts(work.ranks(line), [work.ranks(old) for old in run.history])
+    line["best"] = bool(improved)
+    if improved:
         now = run.model.state_dict().items()
-        run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(better))}
+        run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(improved))}
     run.history.append(line)
     return line
 
 
-def _reduced(model: nn.Module, schedule: Schedule) -> contextlib.AbstractContextManager[Any]:
-    """Return what has products in its block computed in the precision of the schedule."""
+def _reduced_precision(model: nn.Module, schedule: Schedule) -> contextlib.AbstractContextManager[Any]:
+    """Return a context in which products are computed in the precision of the schedule."""
     device = next(model.parameters()).device.type
     return torch.autocast(device, torch.bfloat16, enabled=schedule.precision == "bfloat16")
 
 
-def precise(value: Tensor) -> Tensor:
-    """Return a value in float64 to add it up, without waiting for the device; in float32 where that has no float64."""
+def to_float64(value: Tensor) -> Tensor:
+    """Convert a value to float64 for summation, without waiting for the device; to float32 if the device has no float64."""
     return value.detach().to(torch.float32 if value.device.type == "mps" else torch.float64)
 
 
@@ -358,13 +358,15 @@ def _mean(total: Tensor | float, count: int) -> float:
     return float(total) / count
 
 
-def _better(ranks: Mapping[str, Sequence[float]], ranks_before: Iterable[Mapping[str, Sequence[float]]]) -> list[str]:
-    """Return the parts of the model that were never as good as now."""
+def _improved_parts(
+    ranks: Mapping[str, Sequence[float]], ranks_before: Iterable[Mapping[str, Sequence[float]]]
+) -> list[str]:
+    """Return the parts of the model that are better than in all earlier epochs."""
     earlier = list(ranks_before)
     return [part for part, rank in ranks.items() if all(tuple(rank) < tuple(old[part]) for old in earlier)]
 
 
-def _pieces(indices: Tensor, batch: int) -> Iterator[Tensor]:
-    """Yield the indices in pieces of ``batch``, the last maybe shorter."""
+def _chunks(indices: Tensor, batch: int) -> Iterator[Tensor]:
+    """Yield the indices in chunks of ``batch``; the last may be shorter."""
     for first in range(0, len(indices), batch):
         yield indices[first : first + batch]

@@ -1,4 +1,4 @@
-"""Scaling of each dimension to [-1, 1] by what the training rows held."""
+"""Scale each dimension to [-1, 1] by the range of the training rows, or each channel by an affine map."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MinMax:
-    """The lowest and highest training value of each dimension, float64, shape (dimension,)."""
+    """The minimum and maximum training value of each dimension, float64, shape (dimension,)."""
 
     low: Floats
     high: Floats
 
     @property
     def half(self) -> Floats:
-        """Half the range of each dimension, and 1 for one that never moved."""
+        """Half the range of each dimension, or 1 if it is constant."""
         half = (self.high - self.low) / 2
         return np.where(half > 0, half, 1.0)
 
@@ -33,7 +33,7 @@ class MinMax:
         return (self.high + self.low) / 2
 
     def scale(self, values: Floats) -> Floats:
-        """Return ``values`` (…, dimension) as float32, training data within [-1, 1], others maybe beyond."""
+        """Return ``values`` (…, dimension) as float32, scaled so that training values are in [-1, 1]."""
         return ((values - self.centre) / self.half).astype(np.float32)
 
     def restore(self, scaled: Floats) -> Floats:
@@ -41,25 +41,25 @@ class MinMax:
         return scaled.astype(np.float64) * self.half + self.centre
 
     def to_json(self) -> dict[str, list[float]]:
-        """Return what `from_json` reads."""
+        """Return the lists that `from_json` reads."""
         return {"low": self.low.tolist(), "high": self.high.tolist()}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Sequence[float]]) -> MinMax:
-        """Return the scaling that `to_json` wrote."""
+        """Return the scaling that `to_json` stored."""
         return cls(np.array(stored["low"], dtype=np.float64), np.array(stored["high"], dtype=np.float64))
 
 
 def fit(values: Floats) -> MinMax:
-    """Return the scaling fitted on training rows ``values``, shape (time, dimension).
+    """Fit the scaling on training rows ``values``, shape (time, dimension).
 
-    Raises `TacpipeError` if there is no row or a value is not finite.
+    Raises `TacpipeError` if there are no rows or a value is not finite.
     """
     if not len(values):
-        raise TacpipeError("A scaling cannot be fitted on 0 rows. Give training recordings that hold windows.")
+        raise TacpipeError("A scaling cannot be fitted on 0 rows. Give training recordings with windows.")
     if not np.isfinite(values).all():
         at = int(np.argwhere(~np.isfinite(values))[0, 1])
-        raise TacpipeError(f"Dimension {at} of the training rows holds a value that is not finite. Mask it as a gap.")
+        raise TacpipeError(f"Dimension {at} of the training rows has a value that is not finite. Mask it as a gap.")
     return MinMax(values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64))
 
 
@@ -68,14 +68,17 @@ KINDS = ("none", "standard", "spread", "log")
 
 @dataclass(frozen=True)
 class Affine:
-    """Offset and scale of each channel, float64 (channel,); a logarithm may come first."""
+    """Offset and scale of each channel, float64 (channel,), optionally after a logarithm."""
 
     offset: Floats
     scale: Floats
-    logarithm: bool = False  # log(1 + x), for counts of a heavy tail
+    logarithm: bool = False  # log(1 + x), for counts with a heavy tail
 
     def apply(self, values: Floats) -> Floats:
-        """Return ``values`` (…, channel) scaled, as float32. Raises `TacpipeError` if a logarithm meets -1 or less."""
+        """Return scaled ``values`` (…, channel) as float32.
+
+        Raises `TacpipeError` if a logarithm is undefined (-1 or less).
+        """
         if self.logarithm:
             if (values <= -1).any():
                 raise TacpipeError(f"The logarithm of 1 + {values.min():g} is not defined. Choose another scaling.")
@@ -83,25 +86,25 @@ class Affine:
         return ((values - self.offset) / self.scale).astype(np.float32)
 
     def restore(self, scaled: Floats) -> Floats:
-        """Return scaled values (…, channel) in their own unit, as float64: what `apply` undoes."""
+        """Reverse `apply`: return scaled values (…, channel) in their own unit, as float64."""
         values: Floats = scaled.astype(np.float64) * self.scale + self.offset
         return np.expm1(values) if self.logarithm else values
 
     def to_tensors(self) -> dict[str, Floats]:
-        """Return what `from_tensors` reads."""
+        """Return the arrays that `from_tensors` reads."""
         return {"offset": self.offset, "scale": self.scale, "logarithm": np.array([float(self.logarithm)])}
 
     @classmethod
     def from_tensors(cls, stored: Mapping[str, Floats]) -> Affine:
-        """Return the scaling that `to_tensors` wrote."""
+        """Return the scaling that `to_tensors` stored."""
         return cls(stored["offset"], stored["scale"], bool(stored["logarithm"][0]))
 
     @classmethod
     def fit(cls, values: Floats, kind: str) -> Affine:
-        """Return the scaling ``kind`` fitted on training ``values`` (…, channel).
+        """Fit the scaling ``kind`` on training ``values`` (…, channel).
 
-        none leaves all as it is; standard takes each channel to mean 0 and standard deviation 1; spread divides all
-        channels by one standard deviation, so that zero and the proportions of channels stay; log is spread after
+        none does not scale; standard scales each channel to mean 0 and standard deviation 1; spread divides all
+        channels by one standard deviation, which preserves zero and the proportions of channels; log is spread after
         log(1 + x). Raises `TacpipeError` for another kind.
         """
         channels = values.shape[-1]

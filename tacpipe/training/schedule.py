@@ -1,4 +1,4 @@
-"""How long and how fast to train: no torch, so that a stored model's learning rates are known without it."""
+"""Define the schedule of a training. Without torch, so that the learning rates of a stored model load fast."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Protocol, Self
 from tacpipe.errors import TacpipeError
 from tacpipe.training.devices import Precision
 
-RISE = 0.3  # fraction of all epochs over which the learning rate of a cycle rises
+RISE = 0.3  # fraction of all epochs in which the learning rate of a cycle rises
 
 
 def learning_rate(peak: float, progress: float, *, cycle: bool) -> float:
-    """Return the learning rate when ``progress`` of all epochs has passed, from 0 to 1.
+    """Return the learning rate after the fraction ``progress`` of all epochs, 0 to 1.
 
-    With ``cycle`` it rises from a 25th to its peak and falls to nothing, both along a cosine (Smith and Topin,
-    Super-convergence, 2018): the fall makes up for stopping early on few validation recordings.
+    With ``cycle`` it rises from 1/25 of the peak to the peak and falls to zero, both along a cosine (Smith and Topin,
+    Super-convergence, 2018). The fall replaces early stopping if there are few validation recordings.
     """
     if not cycle:
         return peak
@@ -26,7 +26,7 @@ def learning_rate(peak: float, progress: float, *, cycle: bool) -> float:
 
 
 class Trainable(Protocol):
-    """The params of a network that a schedule is made of."""
+    """The params of a network from which a schedule is created."""
 
     @property
     def epochs(self) -> int: ...  # noqa: D102
@@ -49,21 +49,21 @@ class Trainable(Protocol):
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast to train."""
+    """The length of a training and its learning rates."""
 
     epochs: int
     batch: int
     learning_rate: float
-    patience: int  # epochs without a better validation loss after which training ends
-    gradient_clip: float  # largest norm of the gradient
+    patience: int  # epochs without a better validation loss until training stops
+    gradient_clip: float  # maximum norm of the gradient
     seed: int
-    cycle: bool = False  # the rate rises over the first part of all epochs and then falls
-    # bfloat16: of products in forward and backward passes; weights, their sums and what is validated stay in float32
+    cycle: bool = False  # the rate rises in the first epochs and then falls
+    # bfloat16: for products in forward and backward passes; weights, sums and validation use float32
     precision: Precision = "float32"
 
     @classmethod
     def from_params(cls, params: Trainable, seed: int, gradient_clip: float = math.inf) -> Self:
-        """Return the schedule of a network's params; with a patience of 0 it trains for all epochs."""
+        """Return the schedule of a network's params; with a patience of 0 all epochs are trained."""
         return cls(
             epochs=params.epochs,
             batch=params.batch,
@@ -76,15 +76,15 @@ class Schedule:
         )
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained with."""
+        """Raise `TacpipeError` if a value is not above 0."""
         for name in ("epochs", "batch", "patience", "learning_rate", "gradient_clip"):
             if not getattr(self, name) > 0:
                 raise TacpipeError(f"{name} is {getattr(self, name)}; it must be above 0.")
 
     def rate(self, progress: float) -> float:
-        """Return the learning rate when ``progress`` of all epochs has passed, from 0 to 1: `learning_rate`."""
+        """Return the `learning_rate` after the fraction ``progress`` of all epochs, 0 to 1."""
         return learning_rate(self.learning_rate, progress, cycle=self.cycle)
 
-    def of_epoch(self, epoch: int) -> float:
+    def rate_at_epoch(self, epoch: int) -> float:
         """Return the learning rate of the first batch of an epoch, from 1."""
         return learning_rate(self.learning_rate, (epoch - 1) / self.epochs, cycle=self.cycle)

@@ -1,1 +1,1 @@
-"""Recordings as they are seen: in Rerun's viewer, and as a picture."""
+"""Show recordings in Rerun's viewer, or draw them as a picture."""

@@ -1,4 +1,4 @@
-"""All that is drawn of one recording: its curves, taxels, spans, events, paths, clouds, camera frames and forecasts."""
+"""Collect the contents of a recording to draw: curves, taxels, spans, events, paths, clouds, camera frames and forecasts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tacpipe.printable import plain
 from tacpipe.signals import contact
 from tacpipe.traces import curves, spans, taxels
 from tacpipe.traces import predictions as forecasts
-from tacpipe.traces.curves import TIME, Curves, Path, described
+from tacpipe.traces.curves import TIME, Curves, Path, field_metadata
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute
     from tacpipe.store.records import Step
 
-# quantities, in the order in which they are looked for
-FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
-MAX_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
+# quantities by priority
+QUANTITY_PRIORITY = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
+MAX_VALUES = 1 << 24  # a picture shows only some rows of a stream with more values
 STRIP_FRAMES = 8
-STRETCHES = 1200  # the image of all taxels has as many bins
+INTERVALS = 1200  # equal to the number of bins of the image of all taxels
 
 
 @dataclass(frozen=True)
 class Points:
-    """A cloud at one moment; one without times holds for the whole recording."""
+    """A cloud at one moment, or of the full recording if it has no time."""
 
     stream: str
     t_ns: int | None
@@ -54,7 +54,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Frames:
-    """The pictures of a camera as they were encoded."""
+    """The encoded images of a camera."""
 
     stream: str
     t_ns: Times  # (time,)
@@ -78,7 +78,7 @@ class DrawnContents:
 
     name: str
     attributes: Mapping[str, Attribute]
-    rates: Mapping[str, tuple[int, float | None]]  # rows and rate in Hz, by stream
+    rates: Mapping[str, tuple[int, float | None]]  # stream -> number of rows and rate in Hz
     curves: list[Curves] = field(default_factory=list)
     truth: list[Curves] = field(default_factory=list)  # ground truth of a simulation
     taxels: list[Taxels] = field(default_factory=list)
@@ -91,13 +91,13 @@ class DrawnContents:
     forecasts: list[DrawnForecast] = field(default_factory=list)
     predicted: Mapping[str, Attribute] = field(
         default_factory=dict
-    )  # values that a model predicted for the whole recording
-    classification: Classification | None = None  # class that it predicted for the whole recording
+    )  # values that a model predicted for the full recording
+    classification: Classification | None = None  # class that a model predicted for the full recording
     strips: list[FrameStrip] = field(default_factory=list)
 
     @cached_property
     def ends_ns(self) -> tuple[int, int]:
-        """When the first and the last sample of any stream were taken; twice 0 where nothing has a time."""
+        """The times of the first and the last sample of all streams; (0, 0) if there are no times."""
         timed: list[Curves | Taxels | Path | Frames]
         timed = [*self.curves, *self.truth, *self.taxels, *self.paths, *self.frames]
         stamps = [member.t_ns for member in timed if len(member.t_ns)]
@@ -106,8 +106,8 @@ class DrawnContents:
         return (min(int(t_ns[0]) for t_ns in stamps), max(int(t_ns[-1]) for t_ns in stamps)) if stamps else (0, 0)
 
     @property
-    def empty(self) -> bool:
-        """True without anything to draw."""
+    def is_empty(self) -> bool:
+        """True if there is nothing to draw."""
         return not (self.curves or self.taxels or self.paths or self.clouds or self.frames or self.strips)
 
     @property
@@ -116,45 +116,48 @@ class DrawnContents:
         return {name: self.attributes[name] for name in sorted(self.attributes) if not name.startswith(TRUTH)}
 
     @property
-    def by_interest(self) -> list[str]:
-        """The streams with curves, those first whose quantities a reader looks for first."""
+    def streams_by_priority(self) -> list[str]:
+        """The streams with curves, ordered by the priority of their quantities."""
 
         def rank(name: str) -> int:
             quantities = [member.quantity for member in self.curves if member.stream == name]
-            return min((FIRST.index(quantity) for quantity in quantities if quantity in FIRST), default=len(FIRST))
+            return min(
+                (QUANTITY_PRIORITY.index(quantity) for quantity in quantities if quantity in QUANTITY_PRIORITY),
+                default=len(QUANTITY_PRIORITY),
+            )
 
         return sorted(dict.fromkeys(member.stream for member in self.curves), key=rank)
 
     @property
     def duration_s(self) -> float:
-        """How long the recording lasts."""
+        """The duration of the recording."""
         start_ns, stop_ns = self.ends_ns
         return (stop_ns - start_ns) / 1e9
 
 
-def of(
+def collect(
     recording: Recording,
     predictions: pa.Table | None = None,
     row: pa.Table | None = None,
     *,
     chain: Sequence[Step] = (),
 ) -> DrawnContents:
-    """Return what is drawn of a recording.
+    """Return the contents of a recording to draw.
 
-    ``predictions`` is its table in a dataset of predictions or results, ``row`` its row where that has one each.
-    Where the ``chain`` of its dataset marked contacts, their padding is a span of its own.
+    ``predictions`` is its table in a dataset of predictions or results; ``row`` is its row, if such a dataset has one
+    row per recording. If the ``chain`` of its dataset segmented contacts, their padding is a separate span.
     """
     tables = {stream: recording.table(stream) for stream in recording.streams}
-    contents = _of_tables(recording.name, recording.attributes, tables, predictions, row)
+    contents = _collect_tables(recording.name, recording.attributes, tables, predictions, row)
     return _split_contacts(contents, chain)
 
 
 def for_picture(recording: Recording, *, chain: Sequence[Step] = ()) -> DrawnContents:
-    """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
+    """Return the contents of a recording for a picture; for a long stream, some rows of each of `INTERVALS` intervals.
 
-    These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
-    and those at which a label or a mask changes. Of a video it shows `STRIP_FRAMES` frames. Memory does not grow with the
-    length of the recording.
+    These are the rows with the minimum and maximum touch, those with the minimum and maximum of any other channel, and
+    those at which a label or a mask changes. For a video, `STRIP_FRAMES` frames are returned. Memory does not grow with
+    the length of the recording.
     """
     columns = {stream: recording.columns(stream) for stream in recording.streams}
     strips = [_strip(stream, stored) for stream, stored in columns.items() if read_format(stored) is not None]
@@ -165,7 +168,7 @@ def for_picture(recording: Recording, *, chain: Sequence[Step] = ()) -> DrawnCon
 
 
 def _strip(stream: str, stored: Columns) -> FrameStrip:
-    """Return the frames in the middle of `STRIP_FRAMES` equal stretches of time, each frame once."""
+    """Return the frames in the middle of `STRIP_FRAMES` equal intervals, without duplicates."""
     t_ns = stored.column(TIME).to_numpy()
     if not len(t_ns):
         return FrameStrip(stream, t_ns, [], t_ns)
@@ -177,17 +180,19 @@ def _strip(stream: str, stored: Columns) -> FrameStrip:
 
 
 def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: Sequence[Step]) -> DrawnContents:
-    long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MAX_VALUES}
+    long_streams = {
+        stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MAX_VALUES
+    }
     tables = {
-        stream: _thinned(stored) if stream in long else stored.read(stored.column_names)
+        stream: _subsample(stored) if stream in long_streams else stored.read(stored.column_names)
         for stream, stored in columns.items()
     }
-    contents = _of_tables(recording.name, recording.attributes, tables)
+    contents = _collect_tables(recording.name, recording.attributes, tables)
     contents = _split_contacts(contents, chain)
-    if not long or set(tables) == {""}:  # a mask marks its gaps
+    if not long_streams or set(tables) == {""}:  # a synchronized table marks its gaps in masks
         return contents
-    gaps = [gap for gap in contents.gaps if gap.lane not in long]
-    for stream in sorted(long):
+    gaps = [gap for gap in contents.gaps if gap.lane not in long_streams]
+    for stream in sorted(long_streams):
         clocks = read_clocks(columns[stream])
         if clocks is not None and not _is_cloud(tables[stream]):
             stamps = zip(clocks.gap_starts_ns.tolist(), clocks.gap_stops_ns.tolist(), strict=True)
@@ -195,12 +200,12 @@ def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: Se
     return replace(contents, gaps=gaps)
 
 
-def _level(param: ParamValue) -> float:
+def _threshold(param: ParamValue) -> float:
     return param if isinstance(param, int | float) else np.inf
 
 
 def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnContents:
-    """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
+    """Split contacts into touch and padding, by the load and the thresholds of `segment contacts`."""
     params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
     if not params or params[-1].get("begins") == "grasped" or not contents.taxels:
         return contents
@@ -211,27 +216,27 @@ def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnCont
         loads.append(np.average([finger.load for finger in fingers], 0, [len(finger.names) for finger in fingers]))
         name = f"{stream}_contact" if stream else "contact"
         on, off = contents.attributes.get(f"{name}_on"), contents.attributes.get(f"{name}_off")
-        if on is None or off is None:  # the stream has fixed thresholds in counts, or never leaves its level at rest
+        if on is None or off is None:  # the stream has fixed thresholds in counts, or never leaves its rest level
             fixed = params[-1] if fingers[0].unit == COUNT else {}
-            limits.append((_level(fixed.get("on_count")), _level(fixed.get("off_count"))))
+            limits.append((_threshold(fixed.get("on_count")), _threshold(fixed.get("off_count"))))
         else:
             limits.append((float(on), float(off)))
     touching = contact.contact_mask(np.array(loads), *np.array(limits).T)
     return replace(contents, spans=spans.split_padding(contents.spans, contents.taxels[0].t_ns, touching))
 
 
-def _thinned(stored: Columns) -> pa.Table:
-    """Return some rows of a long stream, as `for_picture` chooses them, without columns of bytes."""
+def _subsample(stored: Columns) -> pa.Table:
+    """Return some rows of a long stream, chosen as in `for_picture`, without columns of bytes."""
     import pyarrow as pa
 
     names = [channel.name for channel in stored.schema if not str(channel.type).endswith("binary")]
     chosen: list[pa.Table] = []
-    resting: dict[str, float] = {}
-    for stretch in stored.batches(names, -(-stored.num_rows // STRETCHES)):
-        rows = {0, stretch.num_rows - 1}
-        touch = np.zeros(stretch.num_rows)
-        for channel, column in zip(stretch.schema, stretch.columns, strict=True):
-            quantity = described(channel).get("quantity", "")
+    rest_values: dict[str, float] = {}
+    for interval in stored.batches(names, -(-stored.num_rows // INTERVALS)):
+        rows = {0, interval.num_rows - 1}
+        touch = np.zeros(interval.num_rows)
+        for channel, column in zip(interval.schema, interval.columns, strict=True):
+            quantity = field_metadata(channel).get("quantity", "")
             if quantity in ("label", "mask"):
                 values = (
                     column.combine_chunks().dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
@@ -240,18 +245,18 @@ def _thinned(stored: Columns) -> pa.Table:
             elif pa.types.is_integer(channel.type) or pa.types.is_floating(channel.type):
                 values = np.nan_to_num(column.to_numpy().astype(np.float64))
                 if quantity == "tactile":
-                    touch += np.abs(values - resting.setdefault(channel.name, float(values[0])))
+                    touch += np.abs(values - rest_values.setdefault(channel.name, float(values[0])))
                 elif quantity not in ("time", "sequence"):
                     rows.update((int(values.argmin()), int(values.argmax())))
         rows.update((int(touch.argmin()), int(touch.argmax())))
         if not chosen and TIME in names:
-            t_ns = stretch[TIME].to_numpy()
+            t_ns = interval[TIME].to_numpy()
             rows.update(np.flatnonzero(t_ns <= t_ns[0] + taxels.REST_S * 1e9).tolist())
-        chosen.append(stretch.take(pa.array(sorted(rows))))
+        chosen.append(interval.take(pa.array(sorted(rows))))
     return pa.concat_tables(chosen)
 
 
-def _of_tables(
+def _collect_tables(
     name: str,
     attributes: Mapping[str, Attribute],
     tables: Mapping[str, pa.Table],
@@ -264,42 +269,42 @@ def _of_tables(
         return DrawnContents(name, attributes, {"": (only_table.num_rows, None)})
     streams = split_tables(tables)
     truth = _truth(tables)
-    touched = taxels.of_streams(streams)
-    marks = [span for table in streams.values() for span in spans.of_labels(table)]
-    marks += [span for table in truth.values() for span in spans.of_labels(table)]
+    fingers = taxels.taxels_from_streams(streams)
+    marks = [span for table in streams.values() for span in spans.label_spans(table)]
+    marks += [span for table in truth.values() for span in spans.label_spans(table)]
     if only_table is None:
         missing = [
             span for stream, table in streams.items() if not _is_cloud(table) for span in spans.gaps(stream, table)
         ]
     else:
         missing = spans.masked_gaps(only_table)
-    happened = spans.events(tables[EVENTS]) if EVENTS in tables else []
+    events = spans.events(tables[EVENTS]) if EVENTS in tables else []
     clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
-    ahead = [] if predictions is None else forecasts.of_table(predictions, touched)
-    ahead += forecasts.of_values(predicted, touched)
+    drawn_forecasts = [] if predictions is None else forecasts.forecasts_from_table(predictions, fingers)
+    drawn_forecasts += forecasts.forecasts_from_values(predicted, fingers)
     return DrawnContents(
         name,
         attributes,
         {stream: (table.num_rows, None if stream in clouds else rate_hz(table)) for stream, table in streams.items()},
         curves.curves_of_streams(plotted),
         curves.curves_of_streams(truth),
-        touched,
+        fingers,
         marks,
         missing,
-        happened,
+        events,
         curves.paths_of_streams(plotted),
         [points for stream, table in clouds.items() for points in _points(stream, table)],
         [frames for stream, table in streams.items() for frames in _frames(stream, table)],
-        ahead,
+        drawn_forecasts,
         predicted,
-        None if row is None else forecasts.of_row(row, attributes),
+        None if row is None else forecasts.classification_from_row(row, attributes),
     )
 
 
 def _values(row: pa.Table) -> dict[str, Attribute]:
-    """Return what a row of predictions holds for a reader: neither the recording's name nor latents."""
-    names = [field.name for field in row.schema if described(field).get("quantity") != "latent"]
+    """Return the values in a row of predictions, without the recording's name and latents."""
+    names = [field.name for field in row.schema if field_metadata(field).get("quantity") != "latent"]
     return {name: row.column(name)[0].as_py() for name in names if name != "recording"}
 
 
@@ -318,7 +323,7 @@ def _is_cloud(table: pa.Table) -> bool:
 
 
 def _points(stream: str, table: pa.Table) -> list[Points]:
-    """Return the clouds of a stream, one for each stamp."""
+    """Return the clouds of a stream, one per timestamp."""
     points_m = curves.matrix(table, POSITION).astype(np.float32)
     coloured = set(COLOUR) <= set(table.column_names)
     colours = curves.matrix(table, COLOUR).astype(np.uint8) if coloured else None
@@ -333,7 +338,7 @@ def _points(stream: str, table: pa.Table) -> list[Points]:
 
 
 def _frames(stream: str, table: pa.Table) -> list[Frames]:
-    """Return the images of a stream as they were encoded, and the frames of a video as JPEG."""
+    """Return the encoded images of a stream, or the frames of a video as JPEG."""
     if TIME not in table.column_names:
         return []
     t_ns = table.column(TIME).to_numpy()
@@ -353,7 +358,7 @@ def _frames(stream: str, table: pa.Table) -> list[Frames]:
     return frames
 
 
-MAX_LABELS = 40  # labels
+MAX_LABELS = 40
 
 
 def to_markdown(contents: DrawnContents) -> str:

@@ -1,4 +1,4 @@
-"""A picture of a recording: touch, contacts and labels, all taxels, and its streams over time; matplotlib draws it."""
+"""Draw a picture of a recording with matplotlib: touch, contacts and labels, all taxels, and its streams over time."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from tacpipe.plugins import extras
 from tacpipe.printable import plain
 from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
-from tacpipe.traces.spans import CONTACT, PADDING, Span, merged
+from tacpipe.traces.spans import CONTACT, PADDING, Span, merge_lanes
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer.contents import STRIP_FRAMES, DrawnContents, FrameStrip
 
-ENDINGS = (".png", ".svg", ".pdf")
+SUFFIXES = (".png", ".svg", ".pdf")
 WIDTH_IN, DPI = 11.0, 110
-STRIP_PX = 320  # width of a drawn frame, at least
-POINTS = 2400  # points of a line: two per pixel
+STRIP_PX = 320  # minimum width of a drawn frame
+MAX_POINTS = 2400  # points per line: two per pixel
 BINS = 1200  # bins of the image of all taxels
-PANELS, NAMED = 9, 8  # sets of curves that are drawn, and lines that a legend names
+MAX_PANELS, MAX_LEGEND = 9, 8  # maximum numbers of drawn sets of curves, and of lines in a legend
 MAPS_A_ROW = 4
 LINE = 1.0
 TEXT = "#24292f"
@@ -41,27 +41,29 @@ class Panel(NamedTuple):
 
 
 def panels(contents: DrawnContents) -> list[Panel]:
-    """Return what is plotted over time, the touch of all fingers of one unit first, then the streams, at most ten."""
-    found = []
+    """Return the plots over time: the touch of all fingers, one plot per unit, then at most nine plots of the streams."""
+    plots = []
     touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     for unit in dict.fromkeys(finger.unit for finger in touched):
         title = f"touch: mean distance of the taxels from rest ({unit})".replace(" ()", "")
-        some = [finger for finger in touched if finger.unit == unit]
-        t_ns = some[0].t_ns
-        loads = [finger.load if finger.t_ns is t_ns else np.interp(t_ns, finger.t_ns, finger.load) for finger in some]
-        found.append(Panel(title, t_ns, np.column_stack(loads), tuple(finger.name for finger in some)))
-    curves = [curve for name in contents.by_interest for curve in contents.curves if curve.stream == name]
-    return found + [Panel(curve.title, curve.t_ns, curve.values, curve.names) for curve in curves[:PANELS]]
+        same_unit = [finger for finger in touched if finger.unit == unit]
+        t_ns = same_unit[0].t_ns
+        loads = [
+            finger.load if finger.t_ns is t_ns else np.interp(t_ns, finger.t_ns, finger.load) for finger in same_unit
+        ]
+        plots.append(Panel(title, t_ns, np.column_stack(loads), tuple(finger.name for finger in same_unit)))
+    curves = [curve for name in contents.streams_by_priority for curve in contents.curves if curve.stream == name]
+    return plots + [Panel(curve.title, curve.t_ns, curve.values, curve.names) for curve in curves[:MAX_PANELS]]
 
 
 def draw(contents: DrawnContents, path: Path) -> None:
-    """Write a picture of a recording to ``path``, whose ending is .png, .svg or .pdf.
+    """Draw a recording and write the picture to ``path``, whose suffix is .png, .svg or .pdf.
 
-    Raises `UsageError` for another ending and where there is nothing to draw, `TacpipeError` if matplotlib is not installed
+    Raises `UsageError` for another suffix or if there is nothing to draw; `TacpipeError` if matplotlib is not installed
     or the file cannot be written.
     """
-    if path.suffix.lower() not in ENDINGS:
-        raise UsageError(f"{path} is not a name for a picture; it must end in one of {', '.join(ENDINGS)}.")
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{path} is not a picture file; its suffix must be one of {', '.join(SUFFIXES)}.")
     lines = panels(contents)
     strips = [strip for strip in contents.strips if strip.images]
     if not lines and not contents.taxels and not strips:
@@ -69,15 +71,17 @@ def draw(contents: DrawnContents, path: Path) -> None:
     with extras.explain_missing("A picture"):
         import matplotlib
     with matplotlib.rc_context({"svg.hashsalt": "recording", "font.size": 9, "axes.titlesize": 9, "text.color": TEXT}):
-        figure = _over_time(contents, lines, strips) if lines or strips else _at_once(contents)
+        figure = _draw_over_time(contents, lines, strips) if lines or strips else _draw_single_reading(contents)
         content, kind = io.BytesIO(), path.suffix.lower()[1:]
-        bare = {"png": ("Software",), "svg": ("Date", "Creator"), "pdf": ("CreationDate", "Creator", "Producer")}[kind]
-        figure.savefig(content, format=kind, metadata=dict.fromkeys(bare))  # the same recording gives the same bytes
+        omitted = {"png": ("Software",), "svg": ("Date", "Creator"), "pdf": ("CreationDate", "Creator", "Producer")}[
+            kind
+        ]
+        figure.savefig(content, format=kind, metadata=dict.fromkeys(omitted))  # the same recording gives the same bytes
     with readable_errors(path.parent):
         write_whole(str(path), content.getvalue(), f"{path}.draft")
 
 
-def _over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence[FrameStrip]) -> Any:
+def _draw_over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence[FrameStrip]) -> Any:
     from matplotlib.figure import Figure
 
     start_ns, stop_ns = contents.ends_ns
@@ -92,19 +96,19 @@ def _over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence
     )
     if lines:
         main = axes.pop(0)
-        _plot(main, lines[0], start_ns)
+        _draw_panel(main, lines[0], start_ns)
         for span in contents.spans:
             if span.lane == CONTACT:
-                look = _look(span, drawing.DISTINCT[0])
-                main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **look)
+                style = _style(span, drawing.DISTINCT[0])
+                main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **style)
     if lanes:
-        _diagram(axes.pop(0), lanes, start_ns)
+        _draw_lanes(axes.pop(0), lanes, start_ns)
     for strip in strips:
         _draw_strip(axes.pop(0), strip, start_ns)
     for finger in touched:
-        _image(axes.pop(0), finger, start_ns, stop_ns)
+        _draw_taxels(axes.pop(0), finger, start_ns, stop_ns)
     for panel in lines[1:]:
-        _plot(axes.pop(0), panel, start_ns)
+        _draw_panel(axes.pop(0), panel, start_ns)
     bottom = figure.axes[-1]
     bottom.set_xlabel("time since the start of the recording (s)")
     bottom.set_xlim(0, max(_s(stop_ns, start_ns), 1e-3))
@@ -115,13 +119,13 @@ def _over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence
 
 
 def _strip_height(strip: FrameStrip) -> float:
-    """Return the height in inches at which frames keep their proportions."""
+    """Return the height in inches that preserves the aspect ratio of the frames."""
     height, width = strip.images[0].shape[:2]
     return float(min(0.95 * WIDTH_IN / STRIP_FRAMES * height / width, 3.0))
 
 
 def _draw_strip(axes: Any, strip: FrameStrip, start_ns: int) -> None:
-    """Draw frames side by side, each in the stretch of time that it was taken from."""
+    """Draw frames next to each other, each in its interval of time."""
     first_s, last_s = _s(strip.ends_ns, start_ns).tolist()
     step_s = max(last_s - first_s, 1e-3) / STRIP_FRAMES
     for t_ns, image in zip(strip.t_ns.tolist(), strip.images, strict=True):
@@ -141,31 +145,31 @@ def _title(contents: DrawnContents) -> str:
 
 
 def _is_label(name: str, value: object) -> bool:
-    """Return whether a label is one that the title names: of the recording, not of how it was synchronized."""
+    """Return whether the title shows a label: one of the recording, not of its synchronization."""
     return isinstance(value, str | bool) and not name.startswith("grid") and name not in ("trial", "simulated")
 
 
 def _lanes(contents: DrawnContents) -> dict[str, list[Span]]:
     lanes: dict[str, list[Span]] = {}
-    for span in (*contents.spans, *merged(contents.gaps)):
+    for span in (*contents.spans, *merge_lanes(contents.gaps)):
         lanes.setdefault(span.lane, []).append(span)
     return lanes
 
 
-def _plot(axes: Any, panel: Panel, start_ns: int) -> None:
-    t_ns, values = envelope(panel.t_ns, panel.values, POINTS)
+def _draw_panel(axes: Any, panel: Panel, start_ns: int) -> None:
+    t_ns, values = envelope(panel.t_ns, panel.values, MAX_POINTS)
     seconds = _s(t_ns, start_ns)
     vector = set(panel.names) <= set("xyzw")
     for place, name in enumerate(panel.names):
-        colour = drawing.numbered(place, drawing.AXES if vector else drawing.PRINTED)
-        axes.plot(seconds, values[:, place], color=colour, linewidth=LINE, label=name if place < NAMED else None)
+        colour = drawing.indexed_colour(place, drawing.AXES if vector else drawing.PRINTED)
+        axes.plot(seconds, values[:, place], color=colour, linewidth=LINE, label=name if place < MAX_LEGEND else None)
     axes.set_title(panel.title, loc="left")
     axes.grid(alpha=0.25)
     axes.margins(x=0)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     if len(panel.names) > 1:
-        legend_title = f"and {len(panel.names) - NAMED} more" if len(panel.names) > NAMED else None
+        legend_title = f"and {len(panel.names) - MAX_LEGEND} more" if len(panel.names) > MAX_LEGEND else None
         axes.legend(
             loc="center left",
             bbox_to_anchor=(1.0, 0.5),
@@ -176,21 +180,21 @@ def _plot(axes: Any, panel: Panel, start_ns: int) -> None:
         )
 
 
-def _diagram(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
-    """Draw the spans of each lane as bars, with their texts where there is room."""
+def _draw_lanes(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
+    """Draw the spans of each lane as bars, with their texts if they fit."""
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
     for place, (lane, spans) in enumerate(lanes.items()):
-        colour = drawing.FAULT if lane == "gaps" else drawing.numbered(place)
+        colour = drawing.FAULT if lane == "gaps" else drawing.indexed_colour(place)
         bars: dict[
             tuple[tuple[str, str], ...], list[tuple[float, float]]
-        ] = {}  # bars by look: those of one look are drawn at once
+        ] = {}  # bars by style; bars of the same style are drawn at once
         for span in spans:
             left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
-            bars.setdefault(tuple(_look(span, colour).items()), []).append((left, width))
+            bars.setdefault(tuple(_style(span, colour).items()), []).append((left, width))
             if width > 0.012 * width_s * len(span.text):
                 axes.text(left + width / 2, place, span.text, ha="center", va="center", fontsize=7)
-        for look, extents in bars.items():
-            axes.broken_barh(extents, (place - 0.35, 0.7), linewidth=0.5, **{"edgecolor": "white", **dict(look)})
+        for style, extents in bars.items():
+            axes.broken_barh(extents, (place - 0.35, 0.7), linewidth=0.5, **{"edgecolor": "white", **dict(style)})
     axes.set_yticks(range(len(lanes)), [plain(lane) for lane in lanes])
     axes.invert_yaxis()
     padded = any(span.text == PADDING for spans in lanes.values() for span in spans)
@@ -201,17 +205,17 @@ def _diagram(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _look(span: Span, colour: str) -> dict[str, str]:
-    """Return how a span is filled: padding is hatched, everything else has a plain colour."""
+def _style(span: Span, colour: str) -> dict[str, str]:
+    """Return the style of a span: padding is hatched, everything else is filled."""
     if span.text == PADDING:
         return {"facecolor": "white", "edgecolor": colour, "hatch": "/////"}
     return {"facecolor": colour}
 
 
-def _image(axes: Any, finger: Taxels, start_ns: int, stop_ns: int) -> None:
-    """Draw all taxels over time, a row each, with the ends of the colour scale in the title."""
+def _draw_taxels(axes: Any, finger: Taxels, start_ns: int, stop_ns: int) -> None:
+    """Draw all taxels over time, one row each, with the ends of the colour scale in the title."""
     low, high = taxels.scale(finger.magnitude)
-    colours = drawing.coloured(taxels.binned(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS), low, high)
+    colours = drawing.map_colours(taxels.bin_peaks(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS), low, high)
     extent = (0, _s(stop_ns, start_ns), len(finger.names) + 0.5, 0.5)
     axes.imshow(taxels.image(colours, 1), aspect="auto", extent=extent, interpolation="nearest")
     unit = f" {finger.unit}" if finger.unit else ""
@@ -221,8 +225,8 @@ def _image(axes: Any, finger: Taxels, start_ns: int, stop_ns: int) -> None:
     axes.set_ylabel("taxel")
 
 
-def _at_once(contents: DrawnContents) -> Any:
-    """Draw maps of taxels of which there is one reading."""
+def _draw_single_reading(contents: DrawnContents) -> Any:
+    """Draw maps of taxels with a single reading."""
     from matplotlib.figure import Figure
 
     fingers = contents.taxels
@@ -233,7 +237,7 @@ def _at_once(contents: DrawnContents) -> Any:
     low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
     for place, finger in enumerate(fingers):
         axes: Any = figure.add_subplot(rows, columns, place + 1)
-        colours = drawing.coloured(finger.magnitude[-1], low, high) / 255
+        colours = drawing.map_colours(finger.magnitude[-1], low, high) / 255
         axes.scatter(*finger.places.T, c=colours, s=260, edgecolors="#6e7781", linewidths=0.5)
         for (x, y), value in zip(finger.places, finger.magnitude[-1], strict=True):
             axes.annotate(

@@ -1,10 +1,10 @@
-"""Show recordings in a viewer session, with few large views and the others in tabs.
+"""Show recordings in Rerun's viewer, with a few large views and the others in tabs.
 
-Rerun's program serves the viewer and the recordings. Its page would load fonts and send statistics over the network;
-the server here hands the page on with a policy under which a browser refuses that.
+Rerun's program serves the viewer and the recordings. Its page would load fonts and send statistics over the network, so
+the server in this module forwards the page with a content security policy that prevents it.
 
-On the left the time axes, one below the other and moved together: touch, spans, streams. On the right the taxels at the
-cursor, all taxels over the whole recording, and space. Rerun is imported inside the functions.
+The left side has the time axes, one below the other and linked: touch, spans, streams. The right side has the taxels at
+the cursor, all taxels over the full recording, and a view of space. Rerun is imported inside the functions.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from tacpipe.viewer import stream
 from tacpipe.viewer.contents import DrawnContents
 
 NAME = "tacpipe"
-ENDING = ".rrd"
-UNSAFE = r"[/\\:\x00]"  # characters that no file name may have
+SUFFIX = ".rrd"
+UNSAFE = r"[/\\:\x00]"  # characters that are not allowed in file names
 
 
 def write(
     recordings: Iterable[DrawnContents], folder: Path, dataset: str, *, with_list: bool = True, all_rows: bool = False
 ) -> list[Path]:
-    """Write a file of Rerun's for each recording and return the files; the viewer lists them by name below ``dataset``.
+    """Write a Rerun file for each recording and return the paths; the viewer lists them by name below ``dataset``.
 
     Lines of more than 30,000 rows are written as their envelope, unless ``all_rows``. ``with_list`` shows the list.
     """
@@ -47,23 +47,23 @@ def write(
 
     from tacpipe.viewer import stream
 
-    looks: dict[str, str] = {}
+    applications: dict[str, str] = {}
     paths = []
     for contents in recordings:
-        look = repr(signature(contents))
-        name = looks.setdefault(look, application(dataset, len(looks)))
-        paths.append(folder / f"{re.sub(UNSAFE, '-', contents.name)}{ENDING}")
+        layout = repr(signature(contents))
+        name = applications.setdefault(layout, application(dataset, len(applications)))
+        paths.append(folder / f"{re.sub(UNSAFE, '-', contents.name)}{SUFFIX}")
         recording = rr.RecordingStream(name, recording_id=contents.name)
         recording.save(paths[-1])
         recording.send_recording_name(contents.name)
         recording.send_blueprint(blueprint(contents, with_list=with_list))
         stream.RerunStream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
-        recording.disconnect()  # writes what is left
+        recording.disconnect()  # flushes the file
     return paths
 
 
 def program() -> str:
-    """Return the path of Rerun's viewer, a program of its own within the package. Raises `MissingModuleError` without it."""
+    """Return the path of Rerun's viewer, a separate program in the package. Raises `MissingModuleError` if not installed."""
     import rerun_cli
 
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
@@ -72,21 +72,17 @@ def program() -> str:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of Rerun's programs: with ``CI`` set they neither collect nor send what they call analytics."""
+    """Return the environment of Rerun's programs; ``CI`` prevents them from collecting or sending analytics."""
     return {**os.environ, "CI": "true"}
 
 
 def show(files: Sequence[Path]) -> int:
-    """Open files in the viewer and return its exit code once it is closed."""
+    """Open files in the viewer, wait until it is closed, and return its exit code."""
     return subprocess.run([program(), *files], env=environment(), stderr=subprocess.DEVNULL, check=False).returncode
 
 
 def application(dataset: str, number: int) -> str:
-    """Return the name under which the viewer groups recordings that share a layout; it allows few characters.
-
-    >>> application("data/recordings", 0), application("data/recordings", 1)
-    ('data-recordings', 'data-recordings-2')
-    """
+    """Return the name by which the viewer groups recordings with the same layout, of allowed characters only."""
     name = re.sub(r"[^A-Za-z0-9]+", "-", dataset).strip("-") or NAME
     return name if not number else f"{name}-{number + 1}"
 
@@ -96,17 +92,17 @@ POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data: http://localhost:* http://127.0.0.1:*"
 )
-PATIENCE_S = 60.0  # until the viewer's page is there
+TIMEOUT_S = 60.0  # timeout for the viewer's page
 
 
 class _Handler(BaseHTTPRequestHandler):
     source = ""
 
     def do_GET(self) -> None:
-        """Answer with what the viewer's own server gives, under the policy."""
+        """Forward the response of the viewer's own server, with the policy."""
         try:
-            with urllib.request.urlopen(self.source + self.path, timeout=PATIENCE_S) as answer:
-                content, kind = answer.read(), answer.headers.get("Content-Type", "application/octet-stream")
+            with urllib.request.urlopen(self.source + self.path, timeout=TIMEOUT_S) as response:
+                content, kind = response.read(), response.headers.get("Content-Type", "application/octet-stream")
         except OSError:
             self.send_error(502)
             return
@@ -119,22 +115,22 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """Print nothing."""
+        """Suppress log messages."""
 
 
 @contextmanager
-def served(files: Sequence[Path], port: int | None) -> Iterator[str]:
-    """Serve files in the web viewer while in the block, and yield the address to open; ``port`` None is 9090 or a free one.
+def serve(files: Sequence[Path], port: int | None) -> Iterator[str]:
+    """Serve files in the web viewer during the block, and yield its address; a ``port`` of None is 9090 or a free port.
 
-    Raises `TacpipeError` if a port is taken or the viewer does not start.
+    Raises `TacpipeError` if the port is in use or the viewer does not start.
     """
-    data, assets = _free(), _free()
+    data, assets = _free_port(), _free_port()
     ports = ["--bind", HOST, "--port", str(data), "--web-viewer-port", str(assets)]
     command = [program(), *map(str, files), "--serve-web", *ports]
     with subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
         try:
             source = f"http://{HOST}:{assets}"
-            _wait(source, viewer)
+            _wait_for_viewer(source, viewer)
             server = _server(port, source)
             Thread(target=server.serve_forever, daemon=True).start()
             try:
@@ -157,28 +153,32 @@ def _server(port: int | None, source: str) -> ThreadingHTTPServer:
         raise TacpipeError(f"Port {port} cannot be used ({error.strerror}); give another --port.") from error
 
 
-def _wait(source: str, viewer: subprocess.Popen[bytes]) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while viewer.poll() is None and time.monotonic() < until_s:
-        with suppress(OSError), urllib.request.urlopen(source, timeout=PATIENCE_S):
+def _wait_for_viewer(source: str, viewer: subprocess.Popen[bytes]) -> None:
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while viewer.poll() is None and time.monotonic() < deadline_s:
+        with suppress(OSError), urllib.request.urlopen(source, timeout=TIMEOUT_S):
             return
         time.sleep(0.05)
     raise TacpipeError("Rerun's web viewer did not start; `tacpipe view DATASET --save FILE.rrd` writes a file for it.")
 
 
-def _free() -> int:
+def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
 
 
-LANE, LEAST, MOST = 0.35, 1.1, 2.2  # height of the spans next to that of the touch, 3: a lane, and its limits
+LANE_HEIGHT, MIN_HEIGHT, MAX_HEIGHT = (
+    0.35,
+    1.1,
+    2.2,
+)  # height of the spans (the touch has 3): per lane, minimum and maximum
 MAPS_A_ROW = 3
-SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of a longer one
+SHORT_S, LOOP_S = 20.0, 10.0  # a recording up to this length plays in full; duration that is played of a longer one
 
 
 def signature(contents: DrawnContents) -> tuple[Any, ...]:
-    """Return what the layout depends on; recordings with the same one share it."""
+    """Return the properties that determine the layout; recordings with the same ones share it."""
     titles = (
         sorted(f"{curve.stream} {curve.title}" for curve in contents.curves),
         sorted(finger.name for finger in contents.taxels),
@@ -187,32 +187,34 @@ def signature(contents: DrawnContents) -> tuple[Any, ...]:
     space = (sorted(path.name for path in contents.paths), sorted({cloud.stream for cloud in contents.clouds}))
     cameras = sorted(camera.stream for camera in contents.frames)
     prediction = (
-        (contents.classification.key, len(contents.classification.leading())) if contents.classification else ()
+        (contents.classification.key, len(contents.classification.leading_scores())) if contents.classification else ()
     )
     return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), prediction)
 
 
 def blueprint(contents: DrawnContents, *, with_list: bool = False) -> Any:
-    """Return the layout of a recording's views as Rerun's blueprint."""
+    """Return the layout of a recording's views as a Rerun blueprint."""
     import rerun.blueprint as rrb
 
-    left, right = _times(contents), _moments(contents)
+    left, right = _time_views(contents), _cursor_views(contents)
     if left:
-        root = rrb.Horizontal(_stacked(left), _stacked([*right, _places(contents)]), column_shares=[1.7, 1])
+        root = rrb.Horizontal(_stack(left), _stack([*right, _space_views(contents)]), column_shares=[1.7, 1])
     elif right:
-        root = rrb.Horizontal(_places(contents)[0], _stacked(right), column_shares=[1, 1.2])
+        root = rrb.Horizontal(_space_views(contents)[0], _stack(right), column_shares=[1, 1.2])
     else:
-        root = _places(contents)[0]
+        root = _space_views(contents)[0]
     return rrb.Blueprint(
         root,
-        _playing(contents),
+        _time_panel(contents),
         rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="expanded" if with_list else "collapsed"),  # this panel has the list of recordings
+        rrb.BlueprintPanel(
+            state="expanded" if with_list else "collapsed"
+        ),  # this panel contains the list of recordings
     )
 
 
-def _playing(contents: DrawnContents) -> Any:
-    """Return the panel of time: a long recording plays the seconds around its largest touch, over and over."""
+def _time_panel(contents: DrawnContents) -> Any:
+    """Return the time panel; for a long recording, it loops over the seconds around the maximum touch."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -230,7 +232,7 @@ def _playing(contents: DrawnContents) -> Any:
 
 
 def loop_s(contents: DrawnContents) -> tuple[float, float] | None:
-    """Return the part of a recording of more than 20 s that plays at first, seconds from its start; None for all."""
+    """Return the part of a recording of more than 20 s that plays first, in seconds from its start; None for all."""
     touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     if contents.duration_s <= SHORT_S or not touched:
         return None
@@ -240,15 +242,15 @@ def loop_s(contents: DrawnContents) -> tuple[float, float] | None:
     return start_s, start_s + LOOP_S
 
 
-def _stacked(parts: list[tuple[Any, float]]) -> Any:
+def _stack(parts: list[tuple[Any, float]]) -> Any:
     import rerun.blueprint as rrb
 
     views, shares = zip(*parts, strict=True)
     return rrb.Vertical(*views, row_shares=list(shares)) if len(views) > 1 else views[0]
 
 
-def _times(contents: DrawnContents) -> list[tuple[Any, float]]:
-    """Return the views with a time axis, with their heights."""
+def _time_views(contents: DrawnContents) -> list[tuple[Any, float]]:
+    """Return the views with a time axis, and their heights."""
     import rerun.blueprint as rrb
 
     views: list[tuple[Any, float]] = []
@@ -264,8 +266,8 @@ def _times(contents: DrawnContents) -> list[tuple[Any, float]]:
     lanes = {span.lane for span in contents.spans} | ({"gaps"} if contents.gaps else set())
     lanes |= {f"events {event.stream}" for event in contents.events}
     if lanes:
-        view = rrb.StateTimelineView(origin=stream.SPANS, name="Contacts, labels, gaps", time_view=_linked())
-        views.append((view, min(max(LEAST, LANE * (len(lanes) + 1)), MOST)))
+        view = rrb.StateTimelineView(origin=stream.SPANS, name="Contacts, labels, gaps", time_view=_linked_axis())
+        views.append((view, min(max(MIN_HEIGHT, LANE_HEIGHT * (len(lanes) + 1)), MAX_HEIGHT)))
     tabs = _tabs(contents)
     if tabs:
         views.append((rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0], 3.2))
@@ -273,11 +275,11 @@ def _times(contents: DrawnContents) -> list[tuple[Any, float]]:
 
 
 def _tabs(contents: DrawnContents) -> list[Any]:
-    """Return a tab a stream, one of each finger's taxels, and that of the ground truth."""
+    """Return one tab per stream, one for each finger's taxels, and one for the ground truth."""
     import rerun.blueprint as rrb
 
     tabs = []
-    for name in contents.by_interest:
+    for name in contents.streams_by_priority:
         views = [
             _plot(_origin(stream.SERIES, name, curve.title), curve.title)
             for curve in contents.curves
@@ -299,17 +301,17 @@ def _tabs(contents: DrawnContents) -> list[Any]:
     return tabs
 
 
-def _space(contents: DrawnContents) -> Any:
-    """Return the view of paths and clouds, seen from a side from which all of them are in sight."""
+def _space_view(contents: DrawnContents) -> Any:
+    """Return the view of paths and clouds, with a camera position from which all are visible."""
     import rerun.blueprint as rrb
 
-    places = [path.position_m for path in contents.paths] + [cloud.points_m for cloud in contents.clouds]
-    if contents.clouds:  # the camera that saw the cloud looks along z
+    positions = [path.position_m for path in contents.paths] + [cloud.points_m for cloud in contents.clouds]
+    if contents.clouds:  # the camera that recorded the cloud looks along z
         middle = np.median(np.concatenate([cloud.points_m for cloud in contents.clouds]), axis=0)
         eye_direction, up = np.array([0.0, 0.0, -1.0]), (0, -1, 0)
         extent = np.concatenate([cloud.points_m for cloud in contents.clouds])
     else:
-        extent = np.concatenate(places)
+        extent = np.concatenate(positions)
         middle, eye_direction, up = (extent.min(axis=0) + extent.max(axis=0)) / 2, np.array([0.8, -1.0, 0.6]), (0, 0, 1)
     low, high = np.quantile(extent, [0.02, 0.98], axis=0)
     reach_m = max(float(np.linalg.norm(high - low)), 0.05)
@@ -319,7 +321,7 @@ def _space(contents: DrawnContents) -> Any:
     return rrb.Spatial3DView(origin=stream.SPACE, name="Space (m)", eye_controls=eye)
 
 
-def _carpet(contents: DrawnContents) -> Any:
+def _carpet_view(contents: DrawnContents) -> Any:
     import rerun.blueprint as rrb
 
     width, height = stream.carpet_size(contents)
@@ -327,30 +329,30 @@ def _carpet(contents: DrawnContents) -> Any:
     return rrb.Spatial2DView(origin=stream.CARPET, name="All taxels over the recording", visual_bounds=bounds)
 
 
-def _moments(contents: DrawnContents) -> list[tuple[Any, float]]:
-    """Return the views of the moment at the cursor, with their heights."""
+def _cursor_views(contents: DrawnContents) -> list[tuple[Any, float]]:
+    """Return the views of the moment at the cursor, and their heights."""
     import rerun.blueprint as rrb
 
     views: list[tuple[Any, float]] = []
-    maps = [_map(name, one, contents) for name, one in _maps(contents)]
+    maps = [_map_view(name, finger, contents) for name, finger in _maps(contents)]
     if maps:
         grid = rrb.Grid(*maps, grid_columns=min(len(maps), MAPS_A_ROW)) if len(maps) > 1 else maps[0]
         views.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
     if any(len(finger.t_ns) > 1 for finger in contents.taxels):
-        views.append((_carpet(contents), 1.3))
+        views.append((_carpet_view(contents), 1.3))
     if contents.classification is not None:
-        rows = len(contents.classification.leading())
+        rows = len(contents.classification.leading_scores())
         bounds = rrb.VisualBounds2D(x_range=(-stream.NAMES_WIDTH, stream.BARS_WIDTH + 0.5), y_range=(-1.9, rows - 0.4))
         title = f"Predicted {contents.classification.key}, and the largest scores"
         views.append((rrb.Spatial2DView(origin=stream.NAMED, name=title, visual_bounds=bounds), 1.8))
     return views
 
 
-def _places(contents: DrawnContents) -> tuple[Any, float]:
-    """Return the tabs with what lies in space, cameras, and the recording's labels, with their height."""
+def _space_views(contents: DrawnContents) -> tuple[Any, float]:
+    """Return the tabs of space, cameras, and the recording's labels, and their height."""
     import rerun.blueprint as rrb
 
-    views: list[Any] = [_space(contents)] if contents.paths or contents.clouds else []
+    views: list[Any] = [_space_view(contents)] if contents.paths or contents.clouds else []
     views += [
         rrb.Spatial2DView(origin=_origin(stream.CAMERAS, camera.stream), name=camera.stream)
         for camera in contents.frames
@@ -359,7 +361,7 @@ def _places(contents: DrawnContents) -> tuple[Any, float]:
     return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
 
 
-def _map(name: str, finger: Taxels, contents: DrawnContents) -> Any:
+def _map_view(name: str, finger: Taxels, contents: DrawnContents) -> Any:
     import rerun.blueprint as rrb
 
     x, y = stream.map_bounds(finger)
@@ -370,7 +372,7 @@ def _map(name: str, finger: Taxels, contents: DrawnContents) -> Any:
 
 
 def _maps(contents: DrawnContents) -> list[tuple[str, Taxels]]:
-    """Return the maps by name, of measured taxels and of what was predicted of them."""
+    """Return the maps by name, of measured taxels and of predictions."""
     names = []
     for finger in contents.taxels:
         names.append((finger.name, finger))
@@ -386,7 +388,7 @@ def _unit(contents: DrawnContents) -> str:
 
 
 def _map_title(name: str, finger: Taxels, contents: DrawnContents) -> str:
-    """Return the title of a map, short enough for three of them in a row."""
+    """Return the title of a map, short enough for three in a row."""
     steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
     if not steps or name == finger.name:
         return name if contents.forecasts else f"{name} ({finger.unit})".replace(" ()", "")
@@ -397,10 +399,10 @@ def _map_title(name: str, finger: Taxels, contents: DrawnContents) -> str:
 def _plot(origin: str, name: str) -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TimeSeriesView(origin=origin, name=name, axis_x=_linked(), plot_legend=rrb.PlotLegend("RightTop"))
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_x=_linked_axis(), plot_legend=rrb.PlotLegend("RightTop"))
 
 
-def _linked() -> Any:
+def _linked_axis() -> Any:
     import rerun.blueprint as rrb
 
     return rrb.TimeAxis(link="LinkToGlobal")

@@ -1,4 +1,4 @@
-"""A recording as Rerun's columns: one entity for each set of curves, map of taxels, lane of spans, path, cloud and camera.
+"""Write a recording as Rerun columns: one entity for each set of curves, map of taxels, lane, path, cloud and camera.
 
 Rerun is imported inside the functions. All times are on the timeline ``time``, nanoseconds since the recording's start.
 """
@@ -15,7 +15,7 @@ from tacpipe.signals.filters import envelope
 from tacpipe.traces import drawing, taxels
 from tacpipe.traces.curves import Curves, Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
-from tacpipe.traces.spans import PADDING, Span, merged
+from tacpipe.traces.spans import PADDING, Span, merge_lanes
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer.contents import DrawnContents, Frames, Points, to_markdown
 
@@ -28,28 +28,28 @@ MAPS, SPANS, SPACE, CAMERAS, CARPET, ABOUT, EVENTS = "taxels", "spans", "space",
 NAMED = "named"
 AXES = "xyz"
 COMPARED = ("predicted", "residual")
-FRAMES_HZ = 60.0  # largest rate of maps and paths: that of a display
-MAX_ROWS = 30_000  # points of a plot's line; a viewer cannot draw millions, so longer lines are drawn as their envelope
+FRAMES_HZ = 60.0  # maximum rate of maps and paths: that of a display
+MAX_ROWS = 30_000  # maximum points per line; a viewer cannot draw millions, so longer lines are drawn as their envelope
 POINTS = 4000  # points of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # bins and height of the carpet, in pixels
-BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in its rows
+BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in rows
 BAR = "#5a6572"
 EVENT_WIDTH = 1 / 200  # drawn length of an event, as a fraction of the recording
 RAMP = 24  # steps of a colour scale
 
 
 class RerunStream:
-    """Writes one recording's contents to a stream of Rerun's; times count from ``start_ns``."""
+    """Write the contents of one recording to a Rerun stream; times are relative to ``start_ns``."""
 
     def __init__(self, recording: rr.RecordingStream, start_ns: int, *, all_rows: bool = False) -> None:
         self._recording, self._start_ns, self._all_rows = recording, start_ns, all_rows
 
     def send(self, contents: DrawnContents) -> None:
-        """Write everything that is drawn of a recording."""
+        """Write all contents of a recording."""
         for place, finger in enumerate(contents.taxels):
             self._touch(finger, place)
             self._channels(finger)
-        for name, members in groups(contents.taxels).items():
+        for name, members in group_by_scale(contents.taxels).items():
             self._maps(name, members)
         self._forecasts(contents.forecasts)
         self._carpet(contents)
@@ -67,16 +67,16 @@ class RerunStream:
             self._scores(contents.classification)
         self._static((ABOUT,), _rerun().TextDocument(to_markdown(contents), media_type="text/markdown"))
 
-    def _at(self, t_ns: AnyArray) -> Any:
-        since = (np.asarray(t_ns, np.int64) - self._start_ns).astype("timedelta64[ns]")
-        return _rerun().TimeColumn(TIMELINE, duration=since)
+    def _time_column(self, t_ns: AnyArray) -> Any:
+        elapsed = (np.asarray(t_ns, np.int64) - self._start_ns).astype("timedelta64[ns]")
+        return _rerun().TimeColumn(TIMELINE, duration=elapsed)
 
     def _static(self, parts: Sequence[str], *components: Any) -> None:
         self._recording.log(list(parts), *components, static=True)
 
     def _columns(self, parts: Sequence[str], t_ns: AnyArray, columns: Any) -> None:
         path = _rerun().new_entity_path(list(parts))
-        self._recording.send_columns(path, [self._at(t_ns)], columns)
+        self._recording.send_columns(path, [self._time_column(t_ns)], columns)
 
     def _lines(
         self, parts: Sequence[str], t_ns: Times, values: Floats, names_and_colours: Sequence[tuple[str, str]]
@@ -95,26 +95,26 @@ class RerunStream:
     def _curves(self, parts: Sequence[str], curves: Curves) -> None:
         are_axes = curves.names in (tuple("xyz"), tuple("xyzw"), tuple("xy"))
         colours = drawing.AXES if are_axes else drawing.DISTINCT
-        names_and_colours = [(name, drawing.numbered(place, colours)) for place, name in enumerate(curves.names)]
+        names_and_colours = [(name, drawing.indexed_colour(place, colours)) for place, name in enumerate(curves.names)]
         self._lines(parts, curves.t_ns, curves.values, names_and_colours)
 
     def _touch(self, finger: Taxels, place: int) -> None:
         if len(finger.t_ns) > 1:
             self._lines(
-                (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.numbered(place))]
+                (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.indexed_colour(place))]
             )
 
     def _channels(self, finger: Taxels) -> None:
-        """Write the change of each taxel, an axis at a time."""
+        """Write the change of each taxel, one plot per axis."""
         if len(finger.t_ns) < 2:
             return
-        names_and_colours = [(name, drawing.numbered(place)) for place, name in enumerate(finger.names)]
+        names_and_colours = [(name, drawing.indexed_colour(place)) for place, name in enumerate(finger.names)]
         for axis, name in enumerate(AXES if finger.change.shape[2] == 3 else ("",)):
             parts = (CHANNELS, finger.name, channels_title(finger, name))
             self._lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
 
     def _maps(self, group: str, fingers: Sequence[Taxels]) -> None:
-        """Write the maps of fingers that share a scale of colours and of arrows."""
+        """Write the maps of fingers that share a scale of colours and arrows."""
         low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
         shear = np.concatenate([np.linalg.norm(finger.change[:, :, :2], axis=2).ravel() for finger in fingers])
         longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE) if group == "3" else 1.0
@@ -122,23 +122,23 @@ class RerunStream:
             self._map((MAPS, finger.name), finger, low, high, longest)
 
     def _map(self, parts: tuple[str, ...], finger: Taxels, low: float, high: float, longest: float) -> None:
-        """Write a map of taxels: a disc each, its colour the change from rest, an arrow its shear along x and y."""
+        """Write a map of taxels: discs coloured by the change from rest, with arrows for the shear along x and y."""
         rr = _rerun()
         pitch = spacing(finger.places)
-        place = finger.places * (1, -1)  # pixels go down
+        place = finger.places * (1, -1)  # pixel coordinates increase downwards
         self._static((*parts, "discs"), rr.Points2D(place, radii=0.42 * pitch, labels=finger.names, show_labels=False))
         self._scale((*parts, "scale"), place, pitch, low, high, finger.unit)
-        rows = _thinned(finger.t_ns)
+        rows = _display_rows(finger.t_ns)
         t_ns, change, magnitude = finger.t_ns[rows], finger.change[rows], finger.magnitude[rows]
-        if len(rows) > 1 and t_ns[0] > self._start_ns:  # nothing is known before the first row
+        if len(rows) > 1 and t_ns[0] > self._start_ns:  # the change is unknown before the first row
             t_ns = np.concatenate([[self._start_ns], t_ns])
             change, magnitude = (np.concatenate([np.zeros_like(values[:1]), values]) for values in (change, magnitude))
-        colours = _packed(drawing.coloured(magnitude, low, high))  # (time, taxel)
+        colours = _pack_colours(drawing.map_colours(magnitude, low, high))  # (time, taxel)
         count = [colours.shape[1]] * len(colours)
         vectors = finger.change.shape[2] == 3
         arrows = change[:, :, :2] * (1, -1) * (0.9 * pitch / longest) if vectors else None
         style = {"origins": place, "colors": [(255, 255, 255)], "radii": 0.05 * pitch, "draw_order": 50.0}
-        if len(colours) == 1:  # the only reading holds for the whole recording
+        if len(colours) == 1:  # a single reading is valid for the full recording
             self._static((*parts, "discs"), rr.Points2D.from_fields(colors=colours.ravel()))
             if arrows is not None:
                 self._static((*parts, "shear"), rr.Arrows2D(vectors=arrows[0], **style))
@@ -157,7 +157,7 @@ class RerunStream:
         boxes = rr.Boxes2D(
             centers=np.column_stack([x, np.full(RAMP, bottom)]),
             half_sizes=[(max(right - left, pitch) / RAMP / 1.8, 0.12 * pitch)] * RAMP,
-            colors=drawing.coloured(np.linspace(low, high, RAMP), low, high),
+            colors=drawing.map_colours(np.linspace(low, high, RAMP), low, high),
             radii=0.1 * pitch,
         )
         ends = [f"{low:,.4g}", f"{high:,.4g} {unit}".strip()]
@@ -166,7 +166,7 @@ class RerunStream:
         self._static((*parts, "ends"), text)
 
     def _forecasts(self, forecasts: Sequence[DrawnForecast]) -> None:
-        """Write measured and predicted load of each finger, the errors, and the maps of the farthest step."""
+        """Write measured and predicted load of each finger, the errors, and the maps of the last step."""
         for name in dict.fromkeys(member.measured.name for member in forecasts):
             steps = [member for member in forecasts if member.measured.name == name]
             last = steps[-1]
@@ -178,15 +178,15 @@ class RerunStream:
             longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE)
             predicted, residual = (map_name(name, compared, last.step) for compared in COMPARED)
             self._map((MAPS, predicted), last.predicted, low, high, longest)
-            low, high = taxels.scale(last.residual.magnitude)  # one of its own, or small errors are not seen
+            low, high = taxels.scale(last.residual.magnitude)  # a separate scale, so that small errors are visible
             self._map((MAPS, residual), last.residual, low, high, max(high, taxels.MIN_SCALE))
 
     def _errors(self, name: str, steps: Sequence[DrawnForecast]) -> None:
-        """Write the load of a finger as measured and as predicted at each step, and the errors."""
+        """Write the measured load of a finger, the predicted load at each step, and the errors."""
         measured_line, last = [("measured", drawing.MEASURED)], steps[-1].measured
         self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
         for place, forecast in enumerate(steps):
-            names_and_colours = [(f"t+{forecast.step}", drawing.numbered(place))]
+            names_and_colours = [(f"t+{forecast.step}", drawing.indexed_colour(place))]
             parts = (name, names_and_colours[0][0])
             self._lines(
                 (FORECAST, *parts), forecast.predicted.t_ns, forecast.predicted.load[:, None], names_and_colours
@@ -194,7 +194,7 @@ class RerunStream:
             self._lines((ERROR, *parts), forecast.predicted.t_ns, forecast.error[:, None], names_and_colours)
 
     def _carpet(self, contents: DrawnContents) -> None:
-        """Write all taxels over the whole recording as one image, and a line in it at the cursor."""
+        """Write all taxels over the full recording as one image, with a line at the cursor."""
         rr = _rerun()
         fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
         if not fingers:
@@ -204,8 +204,8 @@ class RerunStream:
         rows = carpet_size(contents)[1] // (sum(len(finger.names) for finger in fingers) + len(fingers) - 1)
         for finger in fingers:
             low, high = taxels.scale(finger.magnitude)
-            values = taxels.binned(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS)
-            parts.append(taxels.image(drawing.coloured(values, low, high), rows))
+            values = taxels.bin_peaks(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS)
+            parts.append(taxels.image(drawing.map_colours(values, low, high), rows))
             labels.append((finger.name, top + parts[-1].shape[0] / 2))
             top += parts[-1].shape[0] + rows
             parts.append(np.zeros((rows, BINS, 3), np.uint8))
@@ -223,16 +223,16 @@ class RerunStream:
     def _spans(self, contents: DrawnContents) -> None:
         start_ns, stop_ns = contents.ends_ns
         width_ns = int((stop_ns - start_ns) * EVENT_WIDTH)
-        happened = [
+        event_spans = [
             Span(f"events {event.stream}".strip(), event.cause, event.t_ns, event.t_ns + width_ns)
             for event in contents.events
         ]
         lanes: dict[str, list[Span]] = {}
-        for span in (*contents.spans, *merged(contents.gaps), *happened):
+        for span in (*contents.spans, *merge_lanes(contents.gaps), *event_spans):
             lanes.setdefault(span.lane, []).append(span)
         for place, (lane, spans) in enumerate(lanes.items()):
-            fault = lane == "gaps" or lane.startswith("events")
-            self._lane(lane, spans, drawing.FAULT if fault else drawing.numbered(place))
+            is_fault = lane == "gaps" or lane.startswith("events")
+            self._lane(lane, spans, drawing.FAULT if is_fault else drawing.indexed_colour(place))
         if contents.events:
             rr = _rerun()
             at_ns = np.array([event.t_ns for event in contents.events])
@@ -241,7 +241,7 @@ class RerunStream:
 
     def _lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
         rr = _rerun()
-        t_ns, states = changes(spans)
+        t_ns, states = state_changes(spans)
         labels = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
         colours = [drawing.rgb(colour)] * len(labels) if len(labels) < 2 else _shades(colour, len(labels))
         values = [*labels, PADDING] if PADDING in states else labels
@@ -257,9 +257,9 @@ class RerunStream:
             style = {"radii": rr.Radius.ui_points(7), "colors": [colour], "labels": [path.name]}
             self._static(parts, rr.Points3D(path.position_m, **style))
             return
-        line = path.position_m[_spread(len(path.t_ns), POINTS)]
+        line = path.position_m[_evenly_spaced_rows(len(path.t_ns), POINTS)]
         self._static((*parts, "path"), rr.LineStrips3D([line], colors=[colour], radii=rr.Radius.ui_points(1.5)))
-        rows = _thinned(path.t_ns)
+        rows = _display_rows(path.t_ns)
         columns = {"translation": path.position_m[rows]}
         if path.quaternion is not None:
             columns["quaternion"] = path.quaternion[rows]
@@ -286,27 +286,27 @@ class RerunStream:
         self._columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
 
     def _scores(self, prediction: Classification) -> None:
-        """Write a bar a name, as long as its score: that of the model's name is bright, that of the label has a mark."""
+        """Write a bar of the length of the score for each class; the model's class is bright, and the label is marked."""
         rr = _rerun()
-        chosen = prediction.leading()
+        chosen = prediction.leading_scores()
         scores = np.array(list(chosen.values()))
         row = np.arange(len(chosen), dtype=np.float64)
-        ends = np.column_stack([bars(scores), row])
-        colours = [drawing.rgb(drawing.DISTINCT[0] if name == prediction.of_model else BAR) for name in chosen]
+        ends = np.column_stack([bar_lengths(scores), row])
+        colours = [drawing.rgb(drawing.DISTINCT[0] if name == prediction.model_class else BAR) for name in chosen]
         strips = [[(0.0, place), tuple(end)] for place, end in zip(row, ends, strict=True)]
         self._static((NAMED, "bars"), rr.LineStrips2D(strips, radii=0.3, colors=colours))
         marked = (f"{name} (label)" if name == prediction.label else name for name in chosen)
         texts = [f"{name}   {score:.3g}" for name, score in zip(marked, scores, strict=True)]
-        above = NAMES_RISE  # a text is drawn below its place
+        above = NAMES_RISE  # the viewer draws a text below its position
         self._static((NAMED, "names"), _labels([(-NAMES_WIDTH / 2, at - above) for at in row], texts))
         middle = (BARS_WIDTH - NAMES_WIDTH) / 2
         self._static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [prediction.sentence]))
 
 
-def bars(scores: Floats) -> Floats:
-    """Return scores as lengths from 0 to `BARS_WIDTH`, the largest the longest; scores below 0 count from the least.
+def bar_lengths(scores: Floats) -> Floats:
+    """Return scores as lengths from 0 to `BARS_WIDTH` for the largest; if scores are negative, the smallest has length 0.
 
-    >>> bars(np.array([0.0, 1.0, 4.0])).tolist(), bars(np.array([-2.0, 0.0])).tolist()
+    >>> bar_lengths(np.array([0.0, 1.0, 4.0])).tolist(), bar_lengths(np.array([-2.0, 0.0])).tolist()
     ([0.0, 2.0, 8.0], [0.0, 8.0])
     """
     lowest = min(float(scores.min()), 0.0)
@@ -315,30 +315,26 @@ def bars(scores: Floats) -> Floats:
 
 
 def map_bounds(finger: Taxels) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return what a map's view shows of x and of y, with room for the colour scale."""
+    """Return the bounds of a map's view along x and y, with room for the colour scale."""
     pitch = spacing(finger.places)
     (left, low), (right, high) = finger.places.min(axis=0), finger.places.max(axis=0)
     return (left - 0.8 * pitch, right + 0.8 * pitch), (-high - 0.8 * pitch, -low + 2.8 * pitch)
 
 
 def map_name(name: str, compared: str, step: int) -> str:
-    """Return how the map of a finger's forecast or residual is named; step 0 is a value of the whole recording.
-
-    >>> map_name("xela1", "predicted", 10), map_name("reading th", "residual", 0)
-    ('xela1 predicted t+10', 'reading th residual')
-    """
+    """Return the name of the map of a finger's forecast or residual; step 0 is a value of the full recording."""
     return f"{name} {compared} t+{step}" if step else f"{name} {compared}"
 
 
 def carpet_size(contents: DrawnContents) -> tuple[int, int]:
-    """Return width and height of the carpet in pixels: wide, whatever the number of taxels."""
+    """Return width and height of the carpet in pixels; it is wide whatever the number of taxels."""
     fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     rows = sum(len(finger.names) for finger in fingers) + max(len(fingers) - 1, 0)  # one row between two fingers
     return BINS, max(HEIGHT // max(rows, 1), 1) * rows
 
 
-def groups(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
-    """Return fingers that share a scale: those of one unit and as many axes, under the number of axes (and the unit)."""
+def group_by_scale(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
+    """Group fingers with the same unit and number of axes, which share a scale, by the number of axes (and the unit)."""
     shared: dict[tuple[int, str], list[Taxels]] = {}
     for member in fingers:
         shared.setdefault((member.change.shape[2], member.unit), []).append(member)
@@ -349,17 +345,17 @@ def groups(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
 
 
 def channels_title(finger: Taxels, axis: str) -> str:
-    """Return what a plot of the taxels' change along one axis is named."""
+    """Return the title of a plot of the taxels' change along one axis."""
     unit = f" ({finger.unit})" if finger.unit else ""
     return f"{finger.name} {axis}{' ' if axis else ''}change of each taxel{unit}"
 
 
-def changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
-    """Return the moments at which a lane changes and its state from then on; an empty text is no span.
+def state_changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
+    """Return the times at which a lane changes, and its state from then on; the empty string is no span.
 
-    Spans that follow one another leave no moment without one between them; one that begins before another ends cuts it.
+    Adjacent spans leave no gap between them; a span that starts before another ends cuts it off.
 
-    >>> at, states = changes([Span("a", "x", 0, 5), Span("a", "y", 5, 7)])
+    >>> at, states = state_changes([Span("a", "x", 0, 5), Span("a", "y", 5, 7)])
     >>> at.tolist(), states
     ([0, 5, 7], ['x', 'y', ''])
     """
@@ -374,7 +370,7 @@ def changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
 
 
 def spacing(places: Floats) -> float:
-    """Return the median distance of the places (taxel, 2) to their nearest neighbour; 1 of a single one."""
+    """Return the median distance of positions (taxel, 2) to their nearest neighbour; 1 for a single position."""
     if len(places) < 2:
         return 1.0
     distances = np.linalg.norm(places[:, None] - places, axis=2)
@@ -382,33 +378,33 @@ def spacing(places: Floats) -> float:
     return float(np.median(distances.min(axis=1))) or 1.0
 
 
-def _thinned(t_ns: Times) -> Indices:
-    """Return rows that are at least a frame of a display apart, all of them where the stream is slower."""
+def _display_rows(t_ns: Times) -> Indices:
+    """Return rows that are at least one display frame apart; all rows if the stream is slower."""
     if len(t_ns) < 2:
         return np.arange(len(t_ns))
     seconds = (t_ns[-1] - t_ns[0]) / 1e9
-    return _spread(len(t_ns), max(int(seconds * FRAMES_HZ), 2))
+    return _evenly_spaced_rows(len(t_ns), max(int(seconds * FRAMES_HZ), 2))
 
 
-def _spread(rows: int, limit: int) -> Indices:
+def _evenly_spaced_rows(rows: int, limit: int) -> Indices:
     return np.arange(rows) if rows <= limit else np.unique(np.linspace(0, rows - 1, limit).round().astype(np.intp))
 
 
-def _packed(colours: AnyArray) -> AnyArray:
-    """Return colours (…, rgb) as numbers 0xRRGGBBFF (…)."""
+def _pack_colours(colours: AnyArray) -> AnyArray:
+    """Pack colours (…, rgb) as numbers 0xRRGGBBFF (…)."""
     wide = colours.astype(np.uint32)
     return (wide[..., 0] << 24) | (wide[..., 1] << 16) | (wide[..., 2] << 8) | np.uint32(0xFF)
 
 
 def _shades(colour: str, count: int) -> list[tuple[int, int, int]]:
-    """Return a colour for each of ``count`` values of one lane, by turns lighter and darker."""
+    """Return a colour for each of ``count`` values of a lane, alternately lighter and darker."""
     bright = drawing.rgb(colour)
     dark = (int(bright[0] * 0.7), int(bright[1] * 0.7), int(bright[2] * 0.7))
     return [dark if place % 2 else bright for place in range(count)]
 
 
 def _labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:
-    """Return texts at places of a two-dimensional view."""
+    """Return texts at positions of a two-dimensional view."""
     return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[drawing.rgb(drawing.MEASURED)])
 
 

@@ -34,7 +34,7 @@ def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, represent
     begins = rng.random(12) < 0.3
     begins[0] = True
     assert np.allclose(
-        codec.inputs(values, begins, representation, frames), by_hand(values, begins, representation, frames)
+        codec.codec_inputs(values, begins, representation, frames), by_hand(values, begins, representation, frames)
     )
 
 
@@ -48,7 +48,7 @@ def test_rows_in_pieces_give_the_inputs_of_the_whole(seed: int, representation: 
     cuts = [0, *sorted(rng.integers(0, 13, 4).tolist()), 12]
     stacking = codec.Stacking(representation, frames)
     pieces = [stacking.next(values[start:stop], begins[start:stop]) for start, stop in itertools.pairwise(cuts)]
-    expected = codec.inputs(values, begins, representation, frames)
+    expected = codec.codec_inputs(values, begins, representation, frames)
     assert np.array_equal(np.concatenate(pieces), expected, equal_nan=True)
 
 
@@ -59,7 +59,7 @@ def test_later_rows_change_nothing_before_them() -> None:
     for representation in ("levels", "increments"):
         for frames in (1, 2, 3):
             first_inputs, second_inputs = (
-                codec.inputs(counts, None, representation, frames) for counts in (values, changed)
+                codec.codec_inputs(counts, None, representation, frames) for counts in (values, changed)
             )
             assert np.array_equal(first_inputs[:6], second_inputs[:6])
             assert not np.array_equal(first_inputs[6:], second_inputs[6:])
@@ -73,9 +73,9 @@ def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_med
 
 
 def test_no_rows_give_no_inputs_of_the_right_width() -> None:
-    assert codec.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
+    assert codec.codec_inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
 
 
 def test_another_kind_of_value_is_refused() -> None:
     with pytest.raises(TacpipeError, match="representation is 'speed'"):
-        codec.inputs(np.zeros((2, 1)), None, "speed", 1)
+        codec.codec_inputs(np.zeros((2, 1)), None, "speed", 1)

@@ -42,12 +42,12 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
         representation=representation,
     )
     files = codec.to_files(fitted)
-    expected = tactile.added(shard, files)  # type: ignore[arg-type]
+    expected = tactile.add_latents(shard, files)  # type: ignore[arg-type]
     assert isinstance(expected, pa.Table) and np.isnan(expected.column("z00").to_numpy()[300])
 
     monkeypatch.setattr(tactile, "SOME_ROWS", 100)
     decode_few_rows_at_a_time(monkeypatch, rows)
-    pieces = tactile.added(shard, files)  # type: ignore[arg-type]
+    pieces = tactile.add_latents(shard, files)  # type: ignore[arg-type]
     assert isinstance(pieces, pa.RecordBatchReader)
     streamed = pieces.read_all()
     assert streamed.schema.equals(expected.schema, check_metadata=True)
@@ -61,4 +61,4 @@ def test_latents_of_other_channels_are_refused_with_the_name_of_the_recording() 
     counts = tactile.above_rest(recording().content, tuple(CHANNELS))
     fitted = pca.fit(Moments.from_pieces([counts[:300, :5]], 5), CHANNELS[:5], [{}] * 5, components=3)
     with pytest.raises(TacpipeError, match="a: The codec does not fit this table"):
-        tactile.added(recording(), codec.to_files(fitted))  # type: ignore[arg-type]
+        tactile.add_latents(recording(), codec.to_files(fitted))  # type: ignore[arg-type]

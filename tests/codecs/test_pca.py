@@ -100,7 +100,7 @@ def test_rows_that_are_not_finite_have_no_latents() -> None:
 
 
 def test_channels_that_all_stand_still_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="None of the 6 tactile channels moves in 30 training rows"):
+    with pytest.raises(TacpipeError, match="None of the 6 tactile channels changes in 30 training rows"):
         fit(np.full((30, 6), 0.1), components=2)
 
 
@@ -205,7 +205,7 @@ def test_what_the_data_cannot_give_is_refused(rows: int, options: dict[str, floa
 
 
 def test_an_unknown_kind_and_missing_files_are_refused() -> None:
-    with pytest.raises(TacpipeError, match=r"no codec\.safetensors"):
+    with pytest.raises(TacpipeError, match=r"codec\.safetensors does not exist"):
         codec.load({"codec.json": b"{}"})
     with pytest.raises(TacpipeError, match=r"kind 'magic' is not installed.*autoencoder, pca"):
         codec.load({"codec.json": b'{"kind": "magic"}', "codec.safetensors": b""})

@@ -12,7 +12,7 @@ from tests.stages.learning_fakes import CHANNELS, motion, table
 
 
 def read(*shards: FakeShard, representation: str = "levels", frames: int = 1) -> TrainingRows:
-    return training_rows.read({shard.name: shard for shard in shards}, representation, frames)  # type: ignore[misc]
+    return training_rows.read_rows({shard.name: shard for shard in shards}, representation, frames)  # type: ignore[misc]
 
 
 def counts(rows: int = 20, seed: int = 0) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_rows_that_are_read_in_pieces_are_those_of_the_whole_recording(
     shard = FakeShard("a", table(values, contact=contact, gap=gap))
     expected = read(shard, representation=representation, frames=2).inputs["a"]
     decode_few_rows_at_a_time(monkeypatch, rows)
-    stored = training_rows.stored({"a": shard}, representation, 2)  # type: ignore[dict-item]
+    stored = training_rows.stored_rows({"a": shard}, representation, 2)  # type: ignore[dict-item]
     pieces = list(stored.pieces(["a"]))
     assert len(pieces) == -(-20 // rows)
     assert np.array_equal(np.concatenate(pieces), expected)

@@ -25,8 +25,8 @@ def predictions(measured: taxels.Taxels, steps: tuple[int, ...], off: float) -> 
 
 
 def test_a_forecast_stands_at_the_time_that_it_is_of() -> None:
-    (measured,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
-    steps_ahead = forecasts.of_table(predictions(measured, (1, 10), off=4.0), [measured])
+    (measured,) = taxels.taxels_from_table("xela1", hand.finger(hand.pressed()))
+    steps_ahead = forecasts.forecasts_from_table(predictions(measured, (1, 10), off=4.0), [measured])
 
     assert [forecast.step for forecast in steps_ahead] == [1, 10]
     for forecast in steps_ahead:
@@ -39,18 +39,18 @@ def test_a_forecast_stands_at_the_time_that_it_is_of() -> None:
 
 
 def test_a_finger_of_which_a_channel_is_missing_has_no_forecast() -> None:
-    (measured,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
+    (measured,) = taxels.taxels_from_table("xela1", hand.finger(hand.pressed()))
     table = predictions(measured, (1,), 0.0)
 
-    assert forecasts.of_table(table.drop_columns(table.column_names[-1]), [measured]) == []
-    assert forecasts.of_table(hand.arm(), [measured]) == []
+    assert forecasts.forecasts_from_table(table.drop_columns(table.column_names[-1]), [measured]) == []
+    assert forecasts.forecasts_from_table(hand.arm(), [measured]) == []
 
 
 def test_the_reading_of_two_fingers_is_compared_electrode_by_electrode() -> None:
     table = schema.stream(np.array([5]), np.arange(58)[:, None], biotac_sp.fields())
     values = {name: 1000.0 + place for place, name in enumerate(biotac_sp.value_columns("e_th"))}
 
-    (forecast,) = forecasts.of_values(values, taxels.of_table("reading", table))
+    (forecast,) = forecasts.forecasts_from_values(values, taxels.taxels_from_table("reading", table))
 
     assert (forecast.step, forecast.measured.finger) == (0, "th")
     np.testing.assert_array_equal(forecast.residual.magnitude, [1000.0 + np.arange(24) - (29 + np.arange(24))])

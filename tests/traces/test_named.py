@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from tacpipe.traces.predictions import of_row
+from tacpipe.traces.predictions import classification_from_row
 
 
 def row(**columns: tuple[Any, str]) -> pa.Table:
@@ -24,19 +24,21 @@ EVALUATED = {"material": (3, "label"), "mean_level": (3, "prediction"), "model":
 
 
 def test_an_evaluation_has_its_label_the_model_first_and_other_predictors() -> None:
-    naming = of_row(row(recording=("trial-0", ""), **EVALUATED, **SCORES, z01=(1.0, "latent")), {"material": 99})
+    naming = classification_from_row(
+        row(recording=("trial-0", ""), **EVALUATED, **SCORES, z01=(1.0, "latent")), {"material": 99}
+    )
     assert naming is not None
-    assert (naming.key, naming.label, naming.of_model) == ("material", "3", "10")
+    assert (naming.key, naming.label, naming.model_class) == ("material", "3", "10")
     assert list(naming.predicted.items()) == [("model", "10"), ("mean level", "3")]
-    assert naming.leading() == {"10": 0.75, "3": 0.25}
+    assert naming.leading_scores() == {"10": 0.75, "3": 0.25}
 
 
 @pytest.mark.parametrize(("attributes", "label"), [({"material": 10}, "10"), ({}, "")])
 def test_a_prediction_is_next_to_the_recordings_own_label(attributes: dict[str, Any], label: str) -> None:
-    naming = of_row(row(material=(10, "prediction"), **SCORES), attributes)
+    naming = classification_from_row(row(material=(10, "prediction"), **SCORES), attributes)
     assert naming is not None
-    assert (naming.of_model, naming.label) == ("10", label)
+    assert (naming.model_class, naming.label) == ("10", label)
 
 
 def test_values_without_names_are_no_names() -> None:
-    assert of_row(row(pdc_th=(1.0, "prediction")), {}) is None
+    assert classification_from_row(row(pdc_th=(1.0, "prediction")), {}) is None

@@ -21,19 +21,19 @@ def seconds(span_list: list[Span]) -> list[tuple[str, str, float, float]]:
 
 
 def test_contacts_have_their_number_and_slips_their_name() -> None:
-    assert seconds(spans.of_labels(hand.labels())) == [("contact", "contact 0", 1.0, 3.0), ("slip", "slip", 2.5, 3.0)]
+    assert seconds(spans.label_spans(hand.labels())) == [("contact", "contact 0", 1.0, 3.0), ("slip", "slip", 2.5, 3.0)]
 
 
 def test_a_span_up_to_the_last_row_ends_a_step_behind_it() -> None:
     table = schema.stream(np.arange(4) * 10, [[0, 0, 1, 1]], [schema.label_field("slip")])
 
-    assert spans.of_labels(table) == [Span("slip", "slip", 20, 40)]
+    assert spans.label_spans(table) == [Span("slip", "slip", 20, 40)]
 
 
 def test_of_the_phases_of_a_slide_the_slide_is_a_span() -> None:
     table = schema.stream(np.arange(5), [[-1, 0, 0, 1, 1]], [schema.label_field("phase")])
 
-    assert spans.of_labels(table) == [Span("phase", "slide", 1, 3)]
+    assert spans.label_spans(table) == [Span("phase", "slide", 1, 3)]
 
 
 def test_texts_are_spans_by_themselves_and_null_is_none() -> None:
@@ -41,13 +41,13 @@ def test_texts_are_spans_by_themselves_and_null_is_none() -> None:
     values = pa.array(["", "cork", "cork", None, "foam"])
     table = pa.table([pa.array(range(5)), values], schema=pa.schema([pa.field("t_ns", pa.int64()), field]))
 
-    assert [span[1:] for span in spans.of_labels(table)] == [("cork", 1, 3), ("foam", 4, 5)]
+    assert [span[1:] for span in spans.label_spans(table)] == [("cork", 1, 3), ("foam", 4, 5)]
 
 
 @given(st.lists(st.integers(-1, 3), min_size=2, max_size=60))
 def test_spans_are_the_rows_that_hold_their_value(values: list[int]) -> None:
     table = schema.stream(np.arange(len(values)), [values], [schema.label_field("contact")])
-    found_spans = spans.of_labels(table)
+    found_spans = spans.label_spans(table)
 
     texts_by_row = {row: span.text for span in found_spans for row in range(span.start_ns, span.stop_ns)}
     if set(values) <= {0, 1}:  # a switch
@@ -73,7 +73,7 @@ def test_masks_of_a_synchronized_table_give_the_gaps_of_its_streams() -> None:
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30), st.integers(1, 10)), max_size=12))
 def test_merged_spans_name_at_each_moment_all_lanes_that_are_there(intervals: list[tuple[str, int, int]]) -> None:
     given_spans = [Span(lane, "gap", start, start + length) for lane, start, length in intervals]
-    merged = spans.merged(given_spans)
+    merged = spans.merge_lanes(given_spans)
 
     for at in range(41):
         expected = sorted({span.lane for span in given_spans if span.start_ns <= at < span.stop_ns})

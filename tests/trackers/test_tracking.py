@@ -18,7 +18,7 @@ from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracking
 from tacpipe.training import following, loop
 from tacpipe.training.following import Line, history_bytes
-from tacpipe.training.loop import Trained
+from tacpipe.training.loop import TrainingResult
 from tests.chain import TRAIN
 from tests.conftest import Lab
 from tests.test_headline import ONE
@@ -51,9 +51,9 @@ class Kept:
         self._keep("end", path, dict(figures))
 
 
-def training(folder: Path, *trackers: Kept, loss_of: Any = loss) -> tuple[Trained, Tracking]:
+def training(folder: Path, *trackers: Kept, loss_of: Any = loss) -> tuple[TrainingResult, Tracking]:
     tracked = Tracking({f"kept{number}": tracker for number, tracker in enumerate(trackers)}, "m-1", {"a": 1})
-    with following.tracked([tracked]), following.in_workspace(folder):
+    with following.track_with([tracked]), following.in_workspace(folder):
         return run(folder, loss_of), tracked
 
 

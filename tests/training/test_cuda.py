@@ -12,7 +12,7 @@ from torch import nn
 
 from tacpipe.models import lstm
 from tacpipe.store.store import Store
-from tacpipe.training.devices import chosen
+from tacpipe.training.devices import use_device
 from tests.conftest import tacpipe
 from tests.training.networks import NETWORKS, losses
 
@@ -40,9 +40,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_gpu_learns_what_the_processor_does(name: str, precision: str, tmp_path: Path) -> None:
-    with chosen("cpu"):
+    with use_device("cpu"):
         expected = losses(NETWORKS[name](tmp_path / "cpu"))
-    with chosen("cuda"):
+    with use_device("cuda"):
         losses_on_gpu = losses(NETWORKS[name](tmp_path / "cuda", precision=precision))
     assert losses_on_gpu != expected
     compared = slice(1) if name in NOISY else slice(None)
@@ -73,11 +73,11 @@ def test_recurrent_layers_stay_in_float32_under_autocast(kind: type[nn.GRU | nn.
 @pytest.mark.parametrize(("first", "second"), [("cpu", "cuda"), ("cuda", "cpu")])
 def test_a_checkpoint_of_one_device_is_resumed_on_the_other(first: str, second: str, tmp_path: Path) -> None:
     train = NETWORKS["forward gru"]
-    with chosen("cpu"):
+    with use_device("cpu"):
         uninterrupted = losses(train(tmp_path / "whole", epochs=4))
-    with chosen(first):  # type: ignore[arg-type]
+    with use_device(first):  # type: ignore[arg-type]
         train(tmp_path / "cut", epochs=2)
-    with chosen(second):  # type: ignore[arg-type]
+    with use_device(second):  # type: ignore[arg-type]
         resumed = losses(train(tmp_path / "cut", epochs=4))
     assert resumed == pytest.approx(uninterrupted, rel=CLOSE)
 

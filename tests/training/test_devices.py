@@ -19,7 +19,7 @@ from tests.conftest import Lab
 def test_auto_is_cuda_where_there_is_one(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: available)
     assert devices.kind() == ("cuda" if available else "cpu")
-    with devices.chosen("cpu"):
+    with devices.use_device("cpu"):
         assert devices.kind() == "cpu"
         assert provenance.describe_provenance(0.0)["device"] == "cpu"
 
@@ -35,14 +35,14 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(UsageError, match=f"{device}.*it has cpu"), devices.chosen(device):  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=f"{device}.*it has cpu"), devices.use_device(device):  # type: ignore[arg-type]
         raise AssertionError
 
 
 def test_torchrun_is_refused_with_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(UsageError, match=r"torchrun has started 2 processes.*--jobs"), devices.chosen("auto"):
+    with pytest.raises(UsageError, match=r"torchrun has started 2 processes.*--jobs"), devices.use_device("auto"):
         raise AssertionError
 
 

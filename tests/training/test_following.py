@@ -17,7 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal, termination
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, TrainedNetwork
-from tacpipe.training.loop import Loss, Trained, WindowSet, WindowTraining, train
+from tacpipe.training.loop import Loss, TrainingResult, WindowSet, WindowTraining, train
 from tests.training.test_loop import SCHEDULE, build, interrupted_after, loss, run, same
 
 
@@ -47,7 +47,7 @@ class Seen:
         self.ends.append(trained)
 
 
-def followed(folder: Path, *followers: following.Follower, training: Loss = loss) -> Trained:
+def followed(folder: Path, *followers: following.Follower, training: Loss = loss) -> TrainingResult:
     with following.in_workspace(folder, *followers):
         return run(folder, training)
 
@@ -88,11 +88,11 @@ def test_the_history_file_grows_with_every_epoch_and_ends_as_the_history(tmp_pat
 def test_a_resumed_training_states_its_epoch_and_the_file_is_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(KeyboardInterrupt), display.on_stderr("train", tmp_path) as displays:
+    with pytest.raises(KeyboardInterrupt), display.followers_on_stderr("train", tmp_path) as displays:
         followed(tmp_path, *displays, training=interrupted_after(9))  # the third epoch has four batches
     before = capsys.readouterr().err
     epochs = len(lines(tmp_path))
-    with display.on_stderr("train", tmp_path) as displays:
+    with display.followers_on_stderr("train", tmp_path) as displays:
         trained = followed(tmp_path, *displays)
     after = capsys.readouterr().err
 
@@ -120,7 +120,7 @@ def test_the_lines_of_several_networks_are_in_one_file_with_their_labels(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     work = WindowTraining(WindowSet(32, loss), WindowSet(40, loss), SCHEDULE.batch)
-    with display.on_stderr("train", tmp_path) as displays, following.in_workspace(tmp_path, *displays):
+    with display.followers_on_stderr("train", tmp_path) as displays, following.in_workspace(tmp_path, *displays):
         trainings = [
             train(build, work, SCHEDULE, tmp_path / name, number=number, count=2, labels={"target": name})
             for number, name in enumerate(("a", "b"), 1)
@@ -178,7 +178,7 @@ def test_nothing_is_left_of_a_training_that_failed_in_its_first_epoch(tmp_path: 
 def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with display.on_stderr("train", tmp_path) as displays:
+    with display.followers_on_stderr("train", tmp_path) as displays:
         trained = followed(tmp_path, *displays)
     printed = re.findall(
         r"epoch (\d)/6  train ([\d.e-]+) +val ([\d.e-]+) +best ([\d.e-]+) \(epoch (\d)\)  \d+\.\d s  [\d:]+ left",
@@ -194,7 +194,7 @@ def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with terminal.showing_progress(False), display.on_stderr("train", tmp_path) as displays:
+    with terminal.showing_progress(False), display.followers_on_stderr("train", tmp_path) as displays:
         followed(tmp_path, *displays)
     assert capsys.readouterr().err == ""
 
@@ -205,7 +205,7 @@ def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remai
     monkeypatch.setattr(terminal, "is_visible", lambda: True)
     monkeypatch.setattr(display, "REDRAW_S", 0.0)
     drawn: list[tuple[str, float, str]] = []
-    with display.on_stderr("train", tmp_path) as displays:
+    with display.followers_on_stderr("train", tmp_path) as displays:
         assert isinstance(displays[0], display.Bar)
         tasks = displays[0].progress.tasks
         pulsing = [tasks[0].total]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.training import loop
 from tacpipe.training.following import Line, Validated
-from tacpipe.training.loop import Loss, Schedule, Trained, WindowSet, WindowTraining, train
+from tacpipe.training.loop import Loss, Schedule, TrainingResult, WindowSet, WindowTraining, train
 
 SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
 INPUTS = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
@@ -26,7 +26,7 @@ def loss(model: nn.Module, indices: Tensor) -> Tensor:
     return nn.functional.mse_loss(model(INPUTS[indices]), TARGETS[indices])
 
 
-def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE) -> Trained:
+def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE) -> TrainingResult:
     return train(
         build, WindowTraining(WindowSet(32, training_loss), WindowSet(40, loss), schedule.batch), schedule, folder
     )
@@ -43,7 +43,7 @@ def interrupted_after(calls: int) -> Loss:
     return interrupt
 
 
-def same(first: Trained, second: Trained) -> bool:
+def same(first: TrainingResult, second: TrainingResult) -> bool:
     return first.history == second.history and all(
         torch.equal(first.weights[k], second.weights[k]) for k in first.weights
     )
@@ -206,7 +206,7 @@ def test_each_part_of_a_model_keeps_the_weights_of_its_own_best_epoch(tmp_path: 
     def halves() -> nn.Module:
         return nn.ModuleDict({"a": nn.Linear(1, 1), "b": nn.Linear(1, 1)})
 
-    def trained_for(epochs: int) -> Trained:
+    def trained_for(epochs: int) -> TrainingResult:
         schedule = dataclasses.replace(SCHEDULE, epochs=epochs, patience=9, gradient_clip=float("inf"))
         return train(halves, TwoHalves(), schedule, tmp_path / str(epochs))
 
@@ -231,7 +231,7 @@ def test_weights_that_need_no_gradient_stay_as_they_were(tmp_path: Path) -> None
 
 
 def test_parts_without_windows_and_schedules_without_steps_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TacpipeError, match="The validation recordings hold no window"):
+    with pytest.raises(TacpipeError, match="The validation recordings contain no window"):
         train(build, WindowTraining(WindowSet(3, loss), WindowSet(0, loss), 8), SCHEDULE, tmp_path)
     with pytest.raises(TacpipeError, match="epochs is 0"):
         dataclasses.replace(SCHEDULE, epochs=0)

@@ -87,7 +87,7 @@ def test_show_states_the_format_of_a_video_and_its_missing_frames(mixed: Lab) ->
 
 def test_the_viewer_has_an_image_for_each_frame_of_a_video(mixed: Lab) -> None:
     recording = tacpipe.open(mixed.folder / "data/r")["a"]
-    (frames,) = contents.of(recording).frames
+    (frames,) = contents.collect(recording).frames
     expected = videos.decoded(mixed.folder / "lab/a/gel.mp4")
     assert frames.media_type == "image/jpeg"
     assert frames.t_ns.tolist() == recording.table("gel")["t_ns"].to_pylist()

@@ -20,7 +20,7 @@ from tests.viewer import hand
 
 
 def drawn() -> contents.DrawnContents:
-    return contents.of(hand.recording())  # type: ignore[arg-type]
+    return contents.collect(hand.recording())  # type: ignore[arg-type]
 
 
 def test_a_recording_has_its_fingers_arm_labels_events_and_camera() -> None:
@@ -40,7 +40,7 @@ def test_a_cloud_of_each_stamp_is_one_cloud() -> None:
     points = {f"{axis}_m": np.arange(6.0) for axis in "xyz"}
     table = pa.table({"t_ns": [hand.START_NS] * 2 + [hand.START_NS + 5] * 4, **points})
 
-    drawn_contents = contents.of(hand.recording(scene=table))  # type: ignore[arg-type]
+    drawn_contents = contents.collect(hand.recording(scene=table))  # type: ignore[arg-type]
 
     assert [(item.t_ns, item.points_m.tolist()) for item in drawn_contents.clouds] == [
         (hand.START_NS, [[0, 0, 0], [1, 1, 1]]),
@@ -56,9 +56,9 @@ def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: p
     lost = pa.concat_tables([touched.slice(0, 60), touched.slice(70)])
     label = pa.table({"t_ns": touched["t_ns"], "contact": hand.labels()["contact"]}, hand.labels().schema.remove(2))
     recording = hand.recording(xela1=lost, marks=label)
-    every_row = contents.of(recording)  # type: ignore[arg-type]
+    every_row = contents.collect(recording)  # type: ignore[arg-type]
     monkeypatch.setattr(contents, "MAX_VALUES", 100)
-    monkeypatch.setattr(contents, "STRETCHES", 10)
+    monkeypatch.setattr(contents, "INTERVALS", 10)
     brief = contents.for_picture(recording)  # type: ignore[arg-type]
 
     assert brief.spans == every_row.spans and brief.gaps == every_row.gaps and brief.ends_ns == every_row.ends_ns
@@ -84,7 +84,7 @@ def test_padding_is_apart_from_the_touch_also_where_neighbours_and_ends_cut_it(u
     chain = [{"stage": "segment.contacts", "params": dataclasses.asdict(params)}]
     shard = FakeShard("a", segmented.streams[""], segmented.attributes)
 
-    drawn = contents.of(shard, chain=chain).spans  # type: ignore[arg-type]
+    drawn = contents.collect(shard, chain=chain).spans  # type: ignore[arg-type]
 
     by_text = {text: np.zeros(400, dtype=bool) for text in ("contact", "padding")}
     for span in drawn:

@@ -72,7 +72,7 @@ def static(batches: list[pa.RecordBatch], component: str) -> Any:
 def write_and_read(
     folder: Path, **extra_streams: pa.Table
 ) -> tuple[contents.DrawnContents, dict[str, list[pa.RecordBatch]]]:
-    drawn = contents.of(hand.recording(**extra_streams))  # type: ignore[arg-type]
+    drawn = contents.collect(hand.recording(**extra_streams))  # type: ignore[arg-type]
     (file,) = session.write([drawn], folder, "data/hand")
     return drawn, read(file)
 
@@ -98,7 +98,7 @@ def test_maps_have_a_disc_a_taxel_in_the_colour_of_its_change_and_an_arrow_of_it
     low, high = taxels.scale(np.concatenate([taxel_map.magnitude.ravel() for taxel_map in drawn.taxels]))
     last = np.array(colours[-1], np.uint32)
     rgb = np.stack([last >> 24, (last >> 16) & 255, (last >> 8) & 255], axis=-1)
-    np.testing.assert_array_equal(rgb, drawing.coloured(taxel_map.magnitude[-1], low, high))
+    np.testing.assert_array_equal(rgb, drawing.map_colours(taxel_map.magnitude[-1], low, high))
     _, vectors = timed(entities["/taxels/xela1/shear"], "Arrows2D:vectors")
     assert np.array(vectors[0]).any() == np.False_
     right, up = np.array(vectors[-1]).T
@@ -117,7 +117,7 @@ def test_spans_begin_and_end_at_their_moments(tmp_path: Path) -> None:
 
 def test_long_lines_are_envelopes_unless_all_rows_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tacpipe.viewer.stream.MAX_ROWS", 500)
-    drawn = contents.of(hand.recording())  # type: ignore[arg-type]
+    drawn = contents.collect(hand.recording())  # type: ignore[arg-type]
     path = next(iter(name for name in write_and_read(tmp_path)[1] if name.startswith("/series/robot/robot\\ position")))
     for all_rows, row_limit in ((False, 500), (True, hand.SECONDS * hand.ARM_HZ)):
         (tmp_path / str(all_rows)).mkdir()
@@ -140,8 +140,8 @@ def test_arm_clouds_and_cameras_are_written(tmp_path: Path) -> None:
 
 
 def test_forecasts_stand_next_to_what_came_with_their_error(tmp_path: Path) -> None:
-    (measured, _) = contents.of(hand.recording()).taxels  # type: ignore[arg-type]
-    drawn = contents.of(hand.recording(), predictions(measured, (1, 10), 4.0))  # type: ignore[arg-type]
+    (measured, _) = contents.collect(hand.recording()).taxels  # type: ignore[arg-type]
+    drawn = contents.collect(hand.recording(), predictions(measured, (1, 10), 4.0))  # type: ignore[arg-type]
     (file,) = session.write([drawn], tmp_path, "hand")
     entities = read(file)
 
@@ -158,7 +158,7 @@ def test_the_names_of_a_recording_are_bars_as_long_as_their_scores(tmp_path: Pat
         for name, quantity in about.items()
     ]
     row = pa.Table.from_pylist([{"model": 2, "material": 1, "score_1": 0.25, "score_2": 1.0}], pa.schema(fields))
-    drawn = contents.of(hand.recording(), row=row)  # type: ignore[arg-type]
+    drawn = contents.collect(hand.recording(), row=row)  # type: ignore[arg-type]
     (file,) = session.write([drawn], tmp_path, "hand")
     entities = read(file)
 
@@ -216,8 +216,8 @@ def test_view_saves_the_recordings_that_are_chosen_as_one_file(lab: Lab, own_hom
 def test_the_page_of_the_web_viewer_forbids_connections_to_other_computers(tmp_path: Path) -> None:
     from tacpipe.viewer import session
 
-    files = session.write([contents.of(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
-    with session.served(files, None) as address, urllib.request.urlopen(address, timeout=60) as answer:
+    files = session.write([contents.collect(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
+    with session.serve(files, None) as address, urllib.request.urlopen(address, timeout=60) as answer:
         policy = answer.headers["Content-Security-Policy"]
         assert b"Rerun" in answer.read()
     sources = {word for part in policy.split(";") for word in part.split()[1:] if "://" in word}
@@ -228,7 +228,7 @@ def test_the_viewer_s_program_keeps_and_sends_no_statistics(
     tmp_path: Path, own_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("CI", raising=False)
-    (file,) = session.write([contents.of(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
+    (file,) = session.write([contents.collect(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
     # The second environment is the default one.
     for environment, expected in ((session.environment(), False), (dict(os.environ), True)):
         subprocess.run([session.program(), "rrd", "verify", file], env=environment, check=True)

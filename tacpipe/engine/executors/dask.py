@@ -344,7 +344,7 @@ def _work(
     worker = get_worker()
     name = str(worker.name)
     senders = [following.Sender(functools.partial(worker.log_event, topic))] if topic else []
-    with _one_at_a_time, terminal.showing_progress(False), provenance.worker(name), following.tracked(senders):
+    with _one_at_a_time, terminal.showing_progress(False), provenance.worker(name), following.track_with(senders):
         try:
             _check(name, versions, tasks[0])
             lease = _lease(tasks[0])

@@ -10,7 +10,7 @@ import numpy as np
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.metrics.calibration import check_levels, most_promised
+from tacpipe.metrics.calibration import check_levels, highest_promised_level
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
@@ -48,7 +48,7 @@ def calibrate(
         "levels": list(request.quantiles),
         "method": "promised" if request.promise else "pooled",
         "recordings": {"fitted": len(np.unique(training_errors.recordings)), "corrected": count},
-        "most_promised": most_promised(count),
+        "most_promised": highest_promised_level(count),
     }
     config["trained_on"] = add_calibration(config["trained_on"], trained_on_datasets(training, calibration))
     return {

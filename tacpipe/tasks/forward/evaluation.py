@@ -111,7 +111,8 @@ class QuantileSums:
         unit_sums = list(sums_by_unit.values())
         persistence = [sums[BASELINE] for sums in unit_sums]
         return {
-            name: calibration.tree([sums[name] for sums in unit_sums], percents, persistence) for name in unit_sums[0]
+            name: calibration.measures_by_step([sums[name] for sums in unit_sums], percents, persistence)
+            for name in unit_sums[0]
         }
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:

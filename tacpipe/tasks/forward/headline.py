@@ -269,7 +269,7 @@ def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
     ``values`` is the number of summed values, i.e. windows times channels.
     """
     (squared, absolute), (still_squared, still_absolute) = errors, persistence
-    logs, counted = intervals.log_ratios(absolute, still_absolute)
+    logs, counted = intervals.weighted_log_ratios(absolute, still_absolute)
     return np.concatenate([squared, still_squared, absolute, logs, counted, [values]])
 
 

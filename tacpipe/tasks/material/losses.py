@@ -23,7 +23,7 @@ from tacpipe.models.recurrent_autoencoder import (
     RecurrentClassifier,
 )
 from tacpipe.training.following import Line, Validated
-from tacpipe.training.loop import precise
+from tacpipe.training.loop import to_float64
 
 NONE = -1  # index of a missing slide in a row of a batch, and class of a slide without label
 PAIRINGS = ("random", "fixed", "permuted")
@@ -186,7 +186,7 @@ class _EpochSums:
     counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, mean: Tensor, count: int) -> None:
-        self.values[name] = self.values.get(name, 0.0) + precise(mean) * count
+        self.values[name] = self.values.get(name, 0.0) + to_float64(mean) * count
         self.counts[name] = self.counts.get(name, 0) + count
 
     def mean(self, name: str) -> float | None:

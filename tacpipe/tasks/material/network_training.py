@@ -167,7 +167,7 @@ def _describe(
         config["partners"] = {str(classes[number]): classes[partner] for number, partner in sorted(partners.items())}
 
 
-def _files(trained: loop.Trained, config: MaterialConfig, params: NetworkParams) -> dict[str, bytes]:
+def _files(trained: loop.TrainingResult, config: MaterialConfig, params: NetworkParams) -> dict[str, bytes]:
     """Return the files of trained networks: the selected weights, and those of the last epoch."""
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
     files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: history_bytes(trained.history)}

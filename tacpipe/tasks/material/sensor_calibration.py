@@ -238,7 +238,7 @@ def fit_calibration(
     most ``false_unknown``. Raises `TacpipeError` if there are too few slides for that.
     """
     count = len(validation.labels)
-    if calibration.most_promised(count) < 1 - false_unknown:
+    if calibration.highest_promised_level(count) < 1 - false_unknown:
         raise TacpipeError(
             f"{count} validation slides cannot set a threshold that at most {100 * false_unknown:g} % of known slides fall "
             f"below; it takes {int(np.ceil(1 / false_unknown - 1 - 1e-9))} or more. Split with more of them "

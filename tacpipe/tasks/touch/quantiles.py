@@ -110,7 +110,7 @@ def measures_by_predictor(
             sums, constant_sums = (
                 _sums(fitted, grasps, predicted, (name, target), mask, names) for name in (predictor, CONSTANT)
             )
-            for measure, values in calibration.tree(sums, fitted.percents, constant_sums).items():
+            for measure, values in calibration.measures_by_step(sums, fitted.percents, constant_sums).items():
                 if MEAN in values:
                     measures.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
     return measures

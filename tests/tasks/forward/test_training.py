@@ -311,9 +311,9 @@ def test_training_without_recordings_windows_or_touch_is_refused(tmp_path: Path)
     empty, short = dataset(), dataset(motion(1, rows=8))
     with pytest.raises(TacpipeError, match="no training recording"):
         forward_training.train(params(), empty, dataset(*VAL), tmp_path)
-    with pytest.raises(TacpipeError, match="validation recordings hold no window"):
+    with pytest.raises(TacpipeError, match="validation recordings contain no window"):
         forward_training.train(params(), dataset(*TRAIN), empty, tmp_path)
-    with pytest.raises(TacpipeError, match="training recordings hold no window"):
+    with pytest.raises(TacpipeError, match="training recordings contain no window"):
         forward_training.train(params(), short, dataset(*VAL), tmp_path)
     constant = dataset(FakeShard("still", table(np.zeros((40, len(CHANNELS))))))
     with pytest.raises(TacpipeError, match="None of the 12 tactile channels ever moves in 1 training recordings"):
@@ -325,7 +325,7 @@ def test_an_error_that_gaps_cause_names_the_stream_and_the_option(tmp_path: Path
         dataclasses.replace(shard, content=shard.content.append_column("sole_gap", pa.array(np.arange(80) % 4 > 0)))
         for shard in TRAIN
     ]
-    with pytest.raises(TacpipeError, match=r"training recordings hold no window.*stream sole.*--gap-ms"):
+    with pytest.raises(TacpipeError, match=r"training recordings contain no window.*stream sole.*--gap-ms"):
         forward_training.train(params(), dataset(*paused), dataset(*VAL), tmp_path)
 
 
