@@ -44,7 +44,11 @@ def _label(program: typer.Typer) -> None:
         help=SUMMARIES["label"]
         + "\n\nSets labels on the named recordings, or those of a table with one row per recording (--from, as CSV, TSV, "
         "Parquet, JSON or YAML). An empty cell changes nothing.\n\n"
-        "Example: tacpipe label data/recordings trial-003 --label material=foam",
+        "Intervals such as slips are in seconds since the first sample of a recording. --interval adds one to those of the "
+        "named recordings. --intervals replaces those of the recordings in a CSV with the columns recording, interval, "
+        "from_s and to_s; a row without times states that there is none.\n\n"
+        "Example: tacpipe label data/recordings trial-003 --label material=foam\n\n"
+        "Example: tacpipe label data/recordings trial-003 --interval slip 1.2 1.5",
     )
     def label(
         dataset: Annotated[Path, typer.Argument(help="The recordings.")],
@@ -58,6 +62,11 @@ def _label(program: typer.Typer) -> None:
             str | None, typer.Option("--exclude", help="Exclude from all stages, for this reason.")
         ] = None,
         include: Annotated[bool, typer.Option("--include", help="Undo --exclude.")] = False,
+        interval: Annotated[
+            tuple[str, float, float] | None,
+            typer.Option("--interval", help="Interval to add: its name, start and end, s.", metavar="NAME FROM TO"),
+        ] = None,
+        intervals: Annotated[Path | None, typer.Option("--intervals", help="CSV with one row per interval.")] = None,
         from_: Annotated[
             Path | None, typer.Option("--from", help="Table with one row per recording and one column per label.")
         ] = None,
@@ -71,14 +80,18 @@ def _label(program: typer.Typer) -> None:
     ) -> None:
         from tacpipe.datasets import labels
 
+        if intervals is not None:
+            refuse_others(names, label, exclude, include, from_, interval, option="--intervals")
+            label_intervals(dataset, intervals, as_json=as_json)
+            return
         if from_ is not None:
-            refuse_others(names, label, exclude, include)
+            refuse_others(names, label, exclude, include, interval)
             label_from_table(dataset, from_, key, dry_run=dry_run, as_json=as_json)
             return
         refuse_alone(names, key, dry_run)
         assert names is not None
-        parsed_labels = labels.parse(label or [], exclude, include=include)
-        changed = labels.change(dataset, names, parsed_labels)
+        parsed_labels = {} if interval and not label else labels.parse(label or [], exclude, include=include)
+        changed = labels.change(dataset, names, parsed_labels, interval)
         value = {
             "schema_version": 1,
             "output": str(changed.directory),
@@ -253,12 +266,27 @@ def summary(name: str) -> str:
 SHOWN = 20  # Maximum number of recordings whose changes are printed
 
 
-def refuse_others(names: Sequence[str] | None, sets: Sequence[str] | None, exclude: str | None, include: bool) -> None:
+def refuse_others(*others: object, option: str = "--from") -> None:
     """Raise `UsageError` if labels are passed both as a table and on the command line."""
-    if names or sets or exclude is not None or include:
+    if any(other is not None and other is not False and other != [] for other in others):
         raise UsageError(
-            "--from names recordings and labels itself. Leave out names, --label, --exclude and --include."
+            f"{option} names recordings and labels itself. Leave out names, --label, --interval, --exclude and --include."
         )
+
+
+def label_intervals(dataset: Path, path: Path, *, as_json: bool) -> None:
+    """Replace the labelled intervals of the recordings in a CSV."""
+    from tacpipe.datasets import labels
+    from tacpipe.formats.table.label_table import read_intervals
+
+    new_labels = read_intervals(path)
+    changed = labels.change_each(dataset, lambda current: labels.require_recordings(new_labels, current, path))
+    if as_json:
+        value = {"schema_version": 1, "output": str(changed.directory)}
+        terminal.result_json({**value, "recordings": changed.recordings, "labels": new_labels})
+        return
+    terminal.note(f"{len(changed.recordings)} of {len(new_labels)} recordings changed")
+    terminal.result(changed.directory)
 
 
 def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:

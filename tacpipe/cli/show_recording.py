@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
+from tacpipe.datasets.intervals import all_intervals
 from tacpipe.errors import UsageError
 from tacpipe.io import Json
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
@@ -156,6 +157,8 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
     events = spans.events(recording.table(streams.EVENTS)) if streams.EVENTS in recording.streams else []
     start_ns = min((stream_clocks.start_ns for stream_clocks in clocks), default=None)
     origin_ns = start_ns or 0
+    for label, labelled in all_intervals(recording.attributes).items():
+        label_spans += spans.interval_spans(label, labelled, origin_ns)
     return RecordingOverview(
         name,
         opened.source.stage,

@@ -9,8 +9,8 @@ from math import isfinite
 from pathlib import Path
 
 from tacpipe.datasets import directory as directory_of
+from tacpipe.datasets import intervals, pages
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Found, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
@@ -63,12 +63,46 @@ class Changed:
 ByRecording = Mapping[str, Mapping[str, Attribute]]
 
 
-def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Changed:
+def change(
+    path: Path,
+    patterns: Sequence[str],
+    labels: Mapping[str, Attribute],
+    interval: tuple[str, float, float] | None = None,
+) -> Changed:
     """Set ``labels`` on the recordings whose names match and return the dataset's directory and their names.
 
-    Raises `UsageError` if a pattern matches no recording.
+    ``interval`` (name, start and end in seconds) is added to the intervals of that name. Raises `UsageError` if a pattern
+    matches no recording, or if the interval is invalid.
     """
-    return _change(path, lambda dataset: dict.fromkeys(_matching(dataset, patterns), labels))
+    if interval is None:
+        return _change(path, lambda dataset: dict.fromkeys(_matching(dataset, patterns), labels))
+    kind, begin, end = interval
+    name, added = intervals.attribute(kind), intervals.checked(begin, end)
+
+    def labels_for(dataset: Found) -> ByRecording:
+        recordings = dataset.manifest.recordings
+        return {
+            recording: {
+                **labels,
+                name: intervals.to_text(
+                    [*(intervals.intervals_of(recordings[recording]["attributes"], kind) or []), added]
+                ),
+            }
+            for recording in _matching(dataset, patterns)
+        }
+
+    return _change(path, labels_for)
+
+
+def require_recordings(labels_by_name: ByRecording, existing: ByRecording, path: Path) -> ByRecording:
+    """Return the labels of a file. Raises `UsageError` if it names recordings that do not exist."""
+    unknown = sorted(set(labels_by_name) - set(existing))
+    if unknown:
+        raise UsageError(
+            f"{path} names {listed(unknown, _NAMED)}, and the dataset has no such recording. It has "
+            f"{listed(sorted(existing), _NAMED)}."
+        )
+    return labels_by_name
 
 
 def change_each(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> Changed:

@@ -56,6 +56,15 @@ def label_spans(table: pa.Table) -> list[Span]:
     return spans
 
 
+def interval_spans(name: str, intervals: Sequence[tuple[float, float]], start_ns: int) -> list[Span]:
+    """Return the spans of labelled intervals, in seconds since ``start_ns``.
+
+    >>> interval_spans("slip", [(0.5, 1.0)], 10)
+    [Span(lane='slip', text='slip', start_ns=500000010, stop_ns=1000000010)]
+    """
+    return [Span(name, name, *(start_ns + round(second * 1e9) for second in interval)) for interval in intervals]
+
+
 def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[Span]:
     """Split each contact into padding, touch and padding; a contact without touch is not split.
 

@@ -13,6 +13,7 @@ import numpy as np
 from tacpipe.arrays import Bytes, Float32s, Floats, Times
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
+from tacpipe.datasets.intervals import all_intervals
 from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
 from tacpipe.plugins.stage import ParamValue
@@ -256,6 +257,17 @@ def _subsample(stored: Columns) -> pa.Table:
     return pa.concat_tables(chosen)
 
 
+def _labelled_intervals(attributes: Mapping[str, Attribute], streams: Mapping[str, pa.Table]) -> list[Span]:
+    """Return the intervals that were labelled by hand, in seconds since the first sample of any stream."""
+    starts = [table[TIME][0].as_py() for table in streams.values() if TIME in table.column_names and table.num_rows]
+    return [
+        span
+        for label, intervals in all_intervals(attributes).items()
+        if starts
+        for span in spans.interval_spans(label, intervals, min(starts))
+    ]
+
+
 def _collect_tables(
     name: str,
     attributes: Mapping[str, Attribute],
@@ -272,6 +284,7 @@ def _collect_tables(
     fingers = taxels.taxels_from_streams(streams)
     marks = [span for table in streams.values() for span in spans.label_spans(table)]
     marks += [span for table in truth.values() for span in spans.label_spans(table)]
+    marks += _labelled_intervals(attributes, streams)
     if only_table is None:
         missing = [
             span for stream, table in streams.items() if not _is_cloud(table) for span in spans.gaps(stream, table)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tacpipe.datasets import intervals
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats import container
 from tacpipe.formats.table.layout import TREES
@@ -243,3 +244,35 @@ def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
         yield place, {str(name): value for name, value in labels.items()}
     if not entries:
         raise TacpipeError(f"{path} holds {excerpt(tree)}; write labels by the name of their recording.")
+
+
+INTERVAL_COLUMNS = ("recording", "interval", "from_s", "to_s")
+
+
+def read_intervals(path: Path) -> dict[str, dict[str, Attribute]]:
+    """Return the labels that keep the intervals of a CSV, by recording.
+
+    Each row has the name of a recording and of an interval, and its start and end in seconds; a row without times states
+    that there is none. Raises `UsageError` for other columns, and for an invalid interval.
+    """
+    rows = read_rows(path)
+    header = next(rows, (1, []))[1]
+    if sorted(header) != sorted(INTERVAL_COLUMNS):
+        raise UsageError(f"{path} has the columns {listed(header)}; it must have {', '.join(INTERVAL_COLUMNS)}.")
+    by_recording: dict[str, dict[str, list[intervals.Interval]]] = {}
+    for line, cells in rows:
+        row = dict(zip(header, cells, strict=True))
+        times = by_recording.setdefault(row["recording"], {}).setdefault(intervals.attribute(row["interval"]), [])
+        if not (row["from_s"] or row["to_s"]):
+            continue
+        try:
+            times.append(intervals.checked(float(row["from_s"]), float(row["to_s"])))
+        except ValueError as error:
+            raise UsageError(
+                f"{path}, line {line}: {excerpt(row['from_s'])} to {excerpt(row['to_s'])} is not an interval. Give seconds "
+                f"as numbers, or neither."
+            ) from error
+    return {
+        recording: {name: intervals.to_text(times) for name, times in by_name.items()}
+        for recording, by_name in by_recording.items()
+    }
