@@ -27,7 +27,7 @@ ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), Conta
 XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
 
 
-@stage(version=3, discover=ROSBAG.discover, preview=ROSBAG.preview, guess=ROSBAG.guess, why_unread=ROSBAG.why_unread)
+@ROSBAG.stage(version=3)
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
@@ -39,7 +39,7 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     return ROSBAG.read(params, files, values)
 
 
-@stage(version=3, discover=MCAP.discover, preview=MCAP.preview, guess=MCAP.guess, why_unread=MCAP.why_unread)
+@MCAP.stage(version=3)
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read MCAP files (ROS, JSON or protobuf messages).
 
@@ -51,7 +51,7 @@ def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     return MCAP.read(params, files, values)
 
 
-@stage(version=3, discover=HDF5.discover, preview=HDF5.preview, guess=HDF5.guess, why_unread=HDF5.why_unread)
+@HDF5.stage(version=3)
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
@@ -64,7 +64,7 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     return HDF5.read(params, files, values)
 
 
-@stage(version=1, discover=XDF.discover, preview=XDF.preview, guess=XDF.guess, why_unread=XDF.why_unread)
+@XDF.stage(version=1)
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 
@@ -76,9 +76,7 @@ def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     return XDF.read(params, files, values)
 
 
-@stage(
-    version=3, discover=LEROBOT.discover, preview=LEROBOT.preview, guess=LEROBOT.guess, why_unread=LEROBOT.why_unread
-)
+@LEROBOT.stage(version=3)
 def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
 
@@ -105,7 +103,7 @@ def preview_zarr(params: ZarrParams, source: Path) -> str:
         return ZARR.preview(params, source)
 
 
-@stage(version=3, discover=ZARR.discover, preview=preview_zarr, guess=ZARR.guess, why_unread=ZARR.why_unread)
+@ZARR.stage(version=3, preview=preview_zarr)
 def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
     """Read Zarr stores, such as replay buffers of UMI.
 

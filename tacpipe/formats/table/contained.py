@@ -6,13 +6,13 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
 from tacpipe.plugins.constraints import TomlFile
-from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values
+from tacpipe.plugins.stage import Files, P, R, RecordingOutput, Shared, Source, Stage, Values, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
@@ -39,19 +39,25 @@ class ContainerCommand:
 
         COMMAND = ContainerCommand("xdf")
 
-        @stage(
-            version=1,
-            discover=COMMAND.discover,
-            preview=COMMAND.preview,
-            guess=COMMAND.guess,
-            why_unread=COMMAND.why_unread,
-        )
+        @COMMAND.stage(version=1)
         def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
             \"\"\"Read recordings of LSL's LabRecorder (XDF).\"\"\"
             return COMMAND.read(params, files, values)
     """
 
     kind: layouts.Format
+
+    def stage(
+        self, *, version: int, preview: Callable[[Any, Path], str] | None = None
+    ) -> Callable[[Callable[P, R]], Stage[P, R]]:
+        """Declare the decorated function the stage of this format; ``preview`` replaces `preview`."""
+        return stage(
+            version=version,
+            discover=self.discover,
+            preview=preview or self.preview,
+            guess=self.guess,
+            why_unread=self.why_unread,
+        )
 
     def parsed(self, params: Params) -> layouts.Layout:
         """Return the parsed layout, or an empty one if none was given."""
