@@ -59,9 +59,8 @@ class Tested(Split):
         super().check()
         if self.val + self.calibration + self.test >= 1:
             raise UsageError(
-                f"val is {self.val:g}, calibration is {self.calibration:g} and test is {self.test:g}, which leave "
-                f"no recordings "
-                f"to train on; their sum must be below 1."
+                f"val is {self.val:g}, calibration is {self.calibration:g} and test is {self.test:g}, which leave no "
+                "recordings to train on; their sum must be below 1."
             )
 
 

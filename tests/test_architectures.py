@@ -237,10 +237,9 @@ def test_the_help_shows_it_in_a_panel_and_imports_nothing_heavy(
     model = text.split("Model:")[1].split("Training:")[0]
     assert "|plain]" in model and "--width" in model
     probe = (
-        "import sys; from tacpipe.cli import main; sys.argv = ['tacpipe', 'train', 'forward', '--help']\n"
-        "try:\n    main.main()\nexcept SystemExit:\n    pass\n"
-        "assert 'lab_architectures' in sys.modules\n"
-        "assert not {'torch', 'sklearn', 'pyarrow', 'pandas', 'numpy'} & set(sys.modules)\n"
+        "import sys; from tacpipe.cli import main; sys.argv = ['tacpipe', 'train', 'forward', '--help']\ntry:\n    "
+        "main.main()\nexcept SystemExit:\n    pass\nassert 'lab_architectures' in sys.modules\nassert not {'torch', "
+        "'sklearn', 'pyarrow', 'pandas', 'numpy'} & set(sys.modules)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(package))
     run_python(Path(), "-c", probe, check=True)

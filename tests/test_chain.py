@@ -231,11 +231,9 @@ def test_training_that_was_killed_resumes_and_ends_with_the_same_weights(
         if '"train.forward"' in text and '"seed":5' in text:
             path.unlink()
     script = (
-        "import os, sys; from tacpipe.training import loop; from tacpipe.cli import main as cli;"
-        f"sys.argv = ['tacpipe', *'{train} -o models/again'.split()];"
-        "honest = loop.write_checkpoint\n"
-        "def write(*given, **named):\n    honest(*given, **named); os._exit(9)\n"
-        "loop.write_checkpoint = write\ncli.main()"
+        "import os, sys; from tacpipe.training import loop; from tacpipe.cli import main as cli;sys.argv = ['tacpipe', "
+        f"*'{train} -o models/again'.split()];honest = loop.write_checkpoint\ndef write(*given, **named):\n    "
+        "honest(*given, **named); os._exit(9)\nloop.write_checkpoint = write\ncli.main()"
     )
     killed = subprocess.run([sys.executable, "-c", script], cwd=folder, check=False)
     assert killed.returncode == 9 and list(store.root.glob("checkpoints/*/*"))

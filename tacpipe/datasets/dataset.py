@@ -150,9 +150,8 @@ class Recording:
         existing = ", ".join(map(repr, columns_of_streams or self.streams))
         if not stream and not columns_of_streams:
             return UsageError(
-                f"Recording {self.name} has the streams {existing} and is not one table yet. Run `tacpipe "
-                f"synchronize` on it "
-                f"first, or name a stream."
+                f"Recording {self.name} has the streams {existing} and is not one table yet. Run `tacpipe synchronize` "
+                "on it first, or name a stream."
             )
         return UsageError(f"Recording {self.name} has no stream {stream!r}; it has {existing}.")
 

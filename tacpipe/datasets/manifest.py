@@ -310,8 +310,7 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
     if computed != declared:
         raise DamagedError(
             f"{source} was edited by hand: its content has the digest {computed[:12]}, it states "
-            f"{excerpt(declared)[1:13]}. "
-            f"Run the stage that made it again; labels are changed with `tacpipe label`."
+            f"{excerpt(declared)[1:13]}. Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     manifest.__dict__.update(content=content, content_digest=name, digest=declared)  # fills cached properties
     if not verified:  # checks all of its content

@@ -194,9 +194,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: ResultPlan) -> None
     if other_names and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
             f"{output} holds {len(other_names)} recordings that this source does not have "
-            f"({listed(other_names, _SHOWN)}), and they "
-            f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
-            f"together, or give -o another directory, {hint}"
+            f"({listed(other_names, _SHOWN)}), and they were made by version {before.version} of {before.stage} with "
+            f"{_params(before.params)}. Ingest all of them together, or give -o another directory, {hint}"
         )
 
 

@@ -138,9 +138,8 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
     shares = (scheme.val, scheme.calibration, scheme.test)
     if min(shares) < 0 or sum(shares) >= 1:
         raise TacpipeError(
-            f"val {scheme.val}, calibration {scheme.calibration} and test {scheme.test} leave no recordings to "
-            f"train on; each "
-            f"must be 0 or more, and their sum below 1."
+            f"val {scheme.val}, calibration {scheme.calibration} and test {scheme.test} leave no recordings to train "
+            "on; each must be 0 or more, and their sum below 1."
         )
     if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
         raise TacpipeError(
@@ -344,9 +343,8 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
     values_in_training = [value for value, folds in tested.items() if not folds]
     if values_in_training:
         raise TacpipeError(
-            f"The older split has no fold that tests all recordings of {scheme.apart} {values_in_training[0]}, "
-            f"so it did not keep "
-            f"{scheme.apart} apart. Make a new split, or leave apart as it was."
+            f"The older split has no fold that tests all recordings of {scheme.apart} {values_in_training[0]}, so it "
+            f"did not keep {scheme.apart} apart. Make a new split, or leave apart as it was."
         )
     return {value: min(folds) for value, folds in tested.items()}
 

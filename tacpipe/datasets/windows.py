@@ -262,8 +262,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             odd = sorted(set(names) ^ set(self.columns)) or list(names)
             raise UsageError(
                 f"Recording {recording.name} does not have the same channels as the others, or lacks one: {odd[0]}. "
-                f"Name the "
-                f"columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
+                f"Name the columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
             )
         matrix = arrays.Arrays(read.by_column, names)
         if self.rest_s is None:

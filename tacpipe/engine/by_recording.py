@@ -261,9 +261,8 @@ class ByRecording:
         advice = "fix these." if other_errors else "fix these, or leave them out with --skip-bad."
         raise error(
             max(failure.exit_code for failure in bad.values()),
-            f"{registry.stage_name(name)} could not read {len(bad)} {plural}:\n{lines}\nThe other recordings are "
-            f"kept in the store; "
-            f"{advice}",
+            f"{registry.stage_name(name)} could not read {len(bad)} {plural}:\n{lines}\nThe other recordings are kept "
+            f"in the store; {advice}",
         )
 
 

@@ -133,8 +133,7 @@ def refuse_newer(store: AnyStore, before: Root, seen_manifests: Collection[str |
     raise UsageError(
         f"{store.place} holds another {name} than this project had here: {manifest[:12]}, pushed on {date}. `tacpipe "
         f"store checkout {manifest[:12]} --remote {store.place} -o DIRECTORY` writes it to a directory. --replace "
-        f"pushes anyway, "
-        f"and keeps it as an earlier snapshot."
+        "pushes anyway, and keeps it as an earlier snapshot."
     )
 
 

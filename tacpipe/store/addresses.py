@@ -78,9 +78,8 @@ def parsed(text: str) -> BucketAddress | Path:
     if scheme not in SCHEMES:
         prefixes = ", ".join(f"{supported}://" for supported in SCHEMES)
         raise UsageError(
-            f"An address that begins with {scheme}:// is not supported. Give one that begins with {prefixes} "
-            f"or file://, or a "
-            f"path of the file system."
+            f"An address that begins with {scheme}:// is not supported. Give one that begins with {prefixes} or "
+            "file://, or a path of the file system."
         )
     path = location.rstrip("/")
     if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown, because it may contain a password

@@ -94,9 +94,8 @@ class RemoteStore:
         self.files.delete(tried)
         if replaced:
             raise UsageError(
-                f"The server of {self.place} replaces existing objects although the request forbids it "
-                f"(If-None-Match: *), so "
-                f"pushes could replace each other. Use one that supports conditional writes."
+                f"The server of {self.place} replaces existing objects although the request forbids it (If-None-Match: "
+                "*), so pushes could replace each other. Use one that supports conditional writes."
             )
 
     # ---- runs

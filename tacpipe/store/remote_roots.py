@@ -46,9 +46,8 @@ class RemoteRoots:
         for root_name, root in self._read(digest_of_name):
             if root is None:
                 raise DamagedError(
-                    f"The newest file in {self.files.place}/roots/{root_name} is damaged: two reads gave "
-                    f"the same bytes. "
-                    f"Delete it, and the previous one counts."
+                    f"The newest file in {self.files.place}/roots/{root_name} is damaged: two reads gave the same "
+                    "bytes. Delete it, and the previous one counts."
                 )
             return root
         return None

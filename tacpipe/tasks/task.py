@@ -193,8 +193,7 @@ def quantiles_of(uncertainty: Uncertain | None, requested: Sequence[int]) -> tup
     for percent in requested:
         if percent not in available:
             raise TacpipeError(
-                f"The model has the quantiles {','.join(map(str, available))}, not {percent}. Give --quantiles "
-                f"of these, or run "
-                f"`tacpipe calibrate` with others."
+                f"The model has the quantiles {','.join(map(str, available))}, not {percent}. Give --quantiles of "
+                "these, or run `tacpipe calibrate` with others."
             )
     return uncertainty, [available.index(percent) for percent in requested]

@@ -54,9 +54,8 @@ class Writer:
             for label, unit, value in labels
         )
         text = (
-            f"<?xml version='1.0'?><info><name>{name}</name><type>{type_}</type><channel_count>{channels}</channel_count>"
-            f"<nominal_srate>{rate_hz:g}</nominal_srate><channel_format>{kind}</channel_format><source_id>s{number}</source_id>"
-            f"<desc><channels>{described}</channels></desc></info>"
+            "<?xml "
+            f"version='1.0'?><info><name>{name}</name><type>{type_}</type><channel_count>{channels}</channel_count><nominal_srate>{rate_hz:g}</nominal_srate><channel_format>{kind}</channel_format><source_id>s{number}</source_id><desc><channels>{described}</channels></desc></info>"
         )
         self.parts.append(chunk(2, text.encode(), number))
 

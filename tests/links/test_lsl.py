@@ -215,8 +215,7 @@ def test_an_address_that_names_no_stream_is_refused(place: str) -> None:
 
 def test_a_description_among_packets_is_recognised_with_its_options() -> None:
     text = (
-        "<info><name>w</name><type>Force</type><channel_count>3</channel_count><channel_format>float32</channel_format>"
-        "<nominal_srate>200</nominal_srate><desc><channels>"
+        "<info><name>w</name><type>Force</type><channel_count>3</channel_count><channel_format>float32</channel_format><nominal_srate>200</nominal_srate><desc><channels>"
         + "".join(f"<channel><label>F{axis}</label><unit>newtons</unit></channel>" for axis in "xyz")
         + "</channels></desc></info>"
     )

@@ -76,15 +76,13 @@ def test_whatever_fails_of_small_commands_nothing_is_torn(cases: Any, plugin: Pa
 
 BREAKS = {
     "a file is written in its place": (
-        "def write(path, content, draft, *, mode=0o666, exclusive=False):\n"
-        "    Path(path).parent.mkdir(parents=True, exist_ok=True)\n"
-        "    return bool(Path(path).write_bytes(content if isinstance(content, bytes) else b''.join(content)))\n"
-        "store.write_whole = directory.write_whole = write\n"
+        "def write(path, content, draft, *, mode=0o666, exclusive=False):\n    Path(path).parent.mkdir(parents=True, "
+        "exist_ok=True)\n    return bool(Path(path).write_bytes(content if isinstance(content, bytes) else "
+        "b''.join(content)))\nstore.write_whole = directory.write_whole = write\n"
     ),
     "nothing is synced": (
-        "class System:\n"
-        "    __getattr__ = lambda self, name: (lambda handle: None) if name == 'fsync' else getattr(os, name)\n"
-        "files.os = System()\n"
+        "class System:\n    __getattr__ = lambda self, name: (lambda handle: None) if name == 'fsync' else getattr(os, "
+        "name)\nfiles.os = System()\n"
     ),
 }
 
@@ -93,10 +91,9 @@ BREAKS = {
 @pytest.mark.parametrize("broken", BREAKS)
 def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tmp_path: Path) -> None:
     script = (
-        "import os; from pathlib import Path; from tacpipe.datasets import directory; from tacpipe.io import files\n"
-        "from tacpipe.store import store\n"
-        f"{BREAKS[broken]}"
-        "from tests.promises import operations_trials; operations_trials.main()"
+        "import os; from pathlib import Path; from tacpipe.datasets import directory; from tacpipe.io import "
+        f"files\nfrom tacpipe.store import store\n{BREAKS[broken]}from tests.promises import operations_trials; "
+        "operations_trials.main()"
     )
     (trial,) = run_trials(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
     assert trial["problems"]

@@ -67,12 +67,9 @@ def test_an_optimiser_that_takes_over_the_state_of_another_continues_with_the_sa
 
 def test_a_training_imports_no_compiler() -> None:
     program = (
-        "import sys, torch\n"
-        "from tacpipe.training.loop import Adam\n"
-        "weight = torch.ones(3, requires_grad=True)\n"
-        "weight.square().sum().backward()\n"
-        "Adam([weight], 0.1).step()\n"
-        "print([name for name in ('torch._dynamo', 'torch._inductor') if name in sys.modules])\n"
+        "import sys, torch\nfrom tacpipe.training.loop import Adam\nweight = torch.ones(3, "
+        "requires_grad=True)\nweight.square().sum().backward()\nAdam([weight], 0.1).step()\nprint([name for name in "
+        "('torch._dynamo', 'torch._inductor') if name in sys.modules])\n"
     )
 
     process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -120,9 +120,8 @@ class LabelTable:
                 labels_by_name[name] = dict(row.labels)
         if unknown:
             raise UsageError(
-                f"{self.path} names recordings that are not there: {listed(unknown, 10)} (column "
-                f"{plain(self.key)}); there are {listed(attributes_by_name, 6)}. Correct these names, or "
-                "choose the column with --key."
+                f"{self.path} names recordings that are not there: {listed(unknown, 10)} (column {plain(self.key)}); "
+                f"there are {listed(attributes_by_name, 6)}. Correct these names, or choose the column with --key."
             )
         return labels_by_name
 

@@ -21,8 +21,7 @@ _DATE = rf"(?<!\d)(?:{_ISO_DATE}|[0-3]\d(?P<point>[-_.])[01]\d(?P=point)(?:19|20
 _CLOCK = r"(?:[-_ T]{1,3}[0-2]\d(?P<colon>[-_.h]?)[0-5]\d(?:(?P=colon)[0-5]\d)?(?!\d))?"
 _SLOT = re.compile(rf"(?P<date>{_DATE}{_CLOCK})|\d+")
 _COUNTED = (  # words before numbers that count recordings rather than parts of a sensor
-    "trial|run|session|take|episode|day|subject|participant|person|user|object|obj|item|grasp|slide|press|contact|exp|"
-    "experiment|test|rep|repetition|set|series|recording|rec|sample|demo|sequence|seq|log|measurement|file|cycle"
+    "trial|run|session|take|episode|day|subject|participant|person|user|object|obj|item|grasp|slide|press|contact|exp|experiment|test|rep|repetition|set|series|recording|rec|sample|demo|sequence|seq|log|measurement|file|cycle"
 )
 _COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
 _Token = tuple[str, str]  # kind (each letter of a name is its own kind) and text

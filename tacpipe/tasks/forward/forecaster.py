@@ -287,10 +287,9 @@ class Forecaster:
         wrong = np.flatnonzero(medians > FARTHEST * largest)
         if largest > 0 and len(wrong):
             raise TacpipeError(
-                f"Window {wrong[0]} holds counts of {medians[wrong[0]]:.0f} in the median of its channels; in "
-                f"training hardly "
-                f"a channel was further from rest than {largest:.0f}. Subtract each channel's level at rest, as "
-                f"model.windows(recording) does."
+                f"Window {wrong[0]} holds counts of {medians[wrong[0]]:.0f} in the median of its channels; in training "
+                f"hardly a channel was further from rest than {largest:.0f}. Subtract each channel's level at rest, as "
+                "model.windows(recording) does."
             )
 
     @torch.no_grad()

@@ -399,7 +399,6 @@ def _check_pose(start: Forecaster, pose: Pose) -> None:
     if start.pose != pose:
         read, recorded = (", ".join(pose_read.columns) or "no arm" for pose_read in (start.pose, pose))
         raise TacpipeError(
-            f"The model of --init reads {read} and the recordings hold {recorded}. Give recordings of the same "
-            f"arm, or begin "
-            f"without --init."
+            f"The model of --init reads {read} and the recordings hold {recorded}. Give recordings of the same arm, or "
+            "begin without --init."
         )

@@ -241,8 +241,7 @@ def _require_same_space(start: Classifier, frozen_sensor: str, config: MaterialC
     if list(start.classes) != config["classes"] or start.naming != Naming.from_json(config):
         raise TacpipeError(
             f"The model of --init names {listed(map(start.naming.name, start.classes))} and the recordings have "
-            f"{listed(map(Naming.from_json(config).name, config['classes']))}; "
-            f"a known space is that of the same ones."
+            f"{listed(map(Naming.from_json(config).name, config['classes']))}; a known space is that of the same ones."
         )
 
 

@@ -59,8 +59,7 @@ class ForwardSettings(TaskSettings):
             missing = absent if present in settings.places else option(absent)
             raise UsageError(
                 f"{settings.name_in_errors(present)} also needs {missing}, because thresholds of alarms are set on "
-                f"recordings, "
-                f"as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
+                "recordings, as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
             )
         if self.split and not self.alarms_on:
             raise UsageError(f"{settings.name_in_errors('split')} has no effect without {option('alarms_on')}.")

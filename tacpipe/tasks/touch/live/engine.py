@@ -64,9 +64,8 @@ def requested_cloud(record: Any, folder: str, previous: Cloud | None) -> Cloud:
 def _file(name: str, folder: str) -> Cloud:
     if not folder:
         raise TacpipeError(
-            f"The request names the file {excerpt(name)}, but files are read only from the folder in the option "
-            f"folder of the sensor "
-            f"grasps. Set it in the rig file, or send the points."
+            f"The request names the file {excerpt(name)}, but files are read only from the folder in the option folder "
+            "of the sensor grasps. Set it in the rig file, or send the points."
         )
     inside = Path(folder).resolve()
     path = (inside / name).resolve()
