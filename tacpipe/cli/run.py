@@ -126,7 +126,7 @@ class _Together:
     def run(self) -> None:
         """Run all stages."""
         while self._waiting or self._processes.busy:
-            while self._processes.free and (stage := self._ready()) is not None:
+            while self._processes.free and (stage := next(self._ready_stages(), None)) is not None:
                 self._waiting.remove(stage)
                 outcome = _without_running(stage, self._chain, self.became)
                 if outcome is None:
@@ -137,11 +137,8 @@ class _Together:
             if self._processes.busy:
                 self._end(*self._processes.next(before=self._announce))
 
-    def _ready(self) -> ChainStage | None:
-        """Return the next stage whose dependencies are done."""
-        return next(self._ready_stages(), None)
-
     def _ready_stages(self) -> Iterator[ChainStage]:
+        """Yield the stages whose dependencies are done."""
         finished = self.became.keys()
         return (stage for stage in self._waiting if self._chain.after[stage.name] <= finished)
 

@@ -215,16 +215,13 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
 
 def _split_text(value: ShownSplit) -> list[str]:
     """Return the number of recordings with each role, one line per fold."""
-    roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
+    existing = {role for counts in value["folds"].values() for role in counts}
+    roles = [*(role for role in ROLES if role in existing), *sorted(existing.difference(ROLES))]
     widths = {role: max(8, len(role) + 2) for role in roles}
     lines = [f"{'fold':<6}" + "".join(f"{role:>{width}}" for role, width in widths.items())]
     for fold, counts in value["folds"].items():
         lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>{width}}" for role, width in widths.items()))
     return [*lines, f"params: {model_overview.flat(value['params'])}"]
-
-
-def _role_order(role: str) -> tuple[int, str]:
-    return (ROLES.index(role) if role in ROLES else len(ROLES)), role
 
 
 class _Values:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import operator
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -217,7 +218,8 @@ class Dataset:
         return True
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopened, (self.source, self._read, tuple(self.recordings), self.path, self._opener)
+        reopen = functools.partial(Dataset, directory=self.path, opener=self._opener)
+        return reopen, (self.source, self._read, tuple(self.recordings))
 
     def __repr__(self) -> str:
         from tacpipe.datasets import overview
@@ -468,16 +470,6 @@ class _Recordings(Mapping[str, Recording]):
 
     def __len__(self) -> int:
         return len(self._names)
-
-
-def _reopened(
-    manifest: Manifest,
-    read: Reader,
-    names: Iterable[str],
-    directory: Path | None,
-    opener: Callable[[Path | str], Dataset] | None,
-) -> Dataset:
-    return Dataset(manifest, read, names, directory=directory, opener=opener)
 
 
 Model = Dataset  # a dataset whose files contain weights and configuration

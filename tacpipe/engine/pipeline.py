@@ -27,7 +27,7 @@ from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ORIGINALS, ROLES, Values
+from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import Content, RecordingEntry, RunIdentity, StageIdentity, Step, StoredResult
@@ -204,7 +204,10 @@ class _RequestRun:
         request, stage = self.request, self.stage
         empty = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
         if not stage.mapped:
-            identity = keys.identity(request.name, stage.version, request.params, self._whole_inputs())
+            inputs = {
+                name: self._whole_input(name, kind) for name, kind in stage.arguments.items() if kind != "Workspace"
+            }
+            identity = keys.identity(request.name, stage.version, request.params, inputs)
             if stage.part is not None:
                 files = {**self._run_whole(request.name, identity, counted=False)["files"], **self._parts.files}
                 return replace(empty, files={**files, **self._originals()}, skipped=self._skipped)
@@ -301,11 +304,6 @@ class _RequestRun:
                     read(shard["digest"], path)  # adopts or recomputes the shard
                 originals[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
         return originals
-
-    def _whole_inputs(self) -> Values:
-        return {
-            name: self._whole_input(name, kind) for name, kind in self.stage.arguments.items() if kind != "Workspace"
-        }
 
     def _whole_input(self, name: str, kind: str) -> Any:
         inputs, reads = self.inputs, self.stage.reads

@@ -100,9 +100,9 @@ def part(
     columns, rows = [], []
     for name in recording.streams:
         table = recording.columns(name)
-        described = _describe_columns(table.schema)
         columns += [
-            (name, column.name, column.type, json.dumps(dict(column.about), sort_keys=True)) for column in described
+            (name, field.name, str(field.type), json.dumps(field_metadata(field), sort_keys=True))
+            for field in table.schema
         ]
         t_ns = table.column(TIME).to_numpy() if TIME in table.column_names and table.num_rows else None
         rate_hz = streams.rate_hz(table)
@@ -258,10 +258,6 @@ def field_metadata(field: pa.Field) -> dict[str, str]:
     """Return the metadata of a field as text, without those that Parquet adds."""
     metadata = field.metadata or {}
     return {key.decode(): value.decode() for key, value in metadata.items() if not key.startswith(b"PARQUET:")}
-
-
-def _describe_columns(schema: pa.Schema) -> list[Column]:
-    return [Column(field.name, str(field.type), field_metadata(field)) for field in schema]
 
 
 def _columns_by_stream(rows: Iterable[ColumnRow]) -> dict[str, tuple[Column, ...]]:

@@ -126,7 +126,8 @@ def _open_error(error: Exception, kind: str, channel: str, bitrate: int | None, 
             f"{name}: there is no CAN interface {channel}; there {'are' if len(interfaces) > 1 else 'is'} "
             f"{', '.join(interfaces) or 'none'}. Plug the adapter in, or correct the transport."
         )
-    return DeviceError(f"{name}: {channel} cannot be opened: {error}. {_bring_up(channel, bitrate)}")
+    advice = f"Run `sudo ip link set {channel} up type can bitrate {bitrate or 1_000_000}`."
+    return DeviceError(f"{name}: {channel} cannot be opened: {error}. {advice}")
 
 
 def _hardware_type(interface: Path) -> str:
@@ -134,10 +135,6 @@ def _hardware_type(interface: Path) -> str:
         return (interface / "type").read_text().strip()
     except OSError:
         return ""
-
-
-def _bring_up(channel: str, bitrate: int | None) -> str:
-    return f"Run `sudo ip link set {channel} up type can bitrate {bitrate or 1_000_000}`."
 
 
 class CanLink(OpenLink):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import threading
@@ -177,6 +178,9 @@ class OpenLink:
         """Release the resources of the link."""
 
 
+MAX_READ = 1 << 16  # bytes per read
+
+
 class DescriptorLink(OpenLink):
     """A link over a non-blocking file descriptor. Each wake-up of ``poll`` is followed by one read."""
 
@@ -195,6 +199,18 @@ class DescriptorLink(OpenLink):
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         """Return the queued entries. ``ready`` has (descriptor, event) pairs of ``poll``."""
         raise NotImplementedError
+
+    def _read_available(self, end: str, *check: str, max_bytes: int = MAX_READ) -> bytes:
+        """Return the bytes that have arrived. Raises `LinkLostError` at their end, with ``end`` as its reason."""
+        try:
+            data = os.read(self._fileno, max_bytes)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self.lost(end if error.errno == errno.EIO else error.strerror or str(error)) from error
+        if not data:
+            raise self.lost(end, *check)
+        return data
 
     def _send(self, data: bytes) -> None:
         remaining, start_s = memoryview(data), time.monotonic()

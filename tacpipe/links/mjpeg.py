@@ -156,17 +156,12 @@ class MjpegLink(DescriptorLink):
         return self._entries(images) if images else super()._receive(timeout_s)
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
-        try:
-            data = self.socket.recv(READ_BYTES)
-        except BlockingIOError:
-            return []
-        except OSError as error:
-            raise self.lost(error.strerror or str(error)) from error
-        if not data:
-            raise self.lost("the server ended the connection", "the program that serves the images")
-        images = self._parser.feed(data)
+        server = "the program that serves the images"
+        images = self._parser.feed(
+            self._read_available("the server ended the connection", server, max_bytes=READ_BYTES)
+        )
         if self._parser.fault:
-            raise self.lost(self._parser.fault, "the program that serves the images")
+            raise self.lost(self._parser.fault, server)
         return self._entries(images)
 
     def _entries(self, images: list[tuple[Head, bytes]]) -> Arrived:

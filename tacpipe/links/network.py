@@ -293,9 +293,6 @@ class UdpLink(DescriptorLink):
         super()._release()
 
 
-MAX_READ = 1 << 16  # bytes per read
-
-
 def open_tcp(target: str, sensor: Sensor, name: str) -> TcpLink:
     """Open a TCP connection. Raises `DeviceError` if the host is unknown, unreachable, or refuses the connection."""
     host, port = parse_host_port("tcp", target)
@@ -318,15 +315,8 @@ class TcpLink(DescriptorLink):
         self.socket = connection
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
-        try:
-            data = self.socket.recv(MAX_READ)
-        except BlockingIOError:
-            return []
-        except OSError as error:
-            raise self.lost(error.strerror or str(error)) from error
-        if not data:
-            raise self.lost("the other end closed the connection")
-        return [(time.monotonic_ns(), data)]
+        data = self._read_available("the other end closed the connection")
+        return [(time.monotonic_ns(), data)] if data else []
 
     def _release(self) -> None:
         self.socket.close()

@@ -179,7 +179,6 @@ def _name(process: Path) -> str:
         return "a process"
 
 
-MAX_READ = 1 << 16  # bytes per read; the kernel's buffer has 4 KiB
 PSEUDO = "/dev/pts/"  # pseudo-terminals: one program may have both ends open
 
 
@@ -274,15 +273,8 @@ class SerialLink(DescriptorLink):
         self.port = port
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
-        try:
-            data = os.read(self._fileno, MAX_READ)
-        except BlockingIOError:
-            return []
-        except OSError as error:
-            raise self.lost("it was unplugged" if error.errno == errno.EIO else str(error.strerror)) from error
-        if not data:  # a readable port without data is at its end
-            raise self.lost("it was unplugged")
-        return [(time.monotonic_ns(), data)]
+        data = self._read_available("it was unplugged")  # a readable port without data is at its end
+        return [(time.monotonic_ns(), data)] if data else []
 
     def _release(self) -> None:
         self.port.close()

@@ -107,7 +107,9 @@ def push(
                 local_store.roots.note_pushed(dataset.directory.absolute(), dataset.digest)
         pushed_roots = pushed.roots(target)
         transferred.datasets += [
-            pushed.label(root, pushed_roots) for root in pushed_roots if _is_root_of(root, owner, name)
+            pushed.label(root, pushed_roots)
+            for root in pushed_roots
+            if project_id(root) == owner.id and root["path"] == name
         ]
     return transferred
 
@@ -220,10 +222,6 @@ def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> 
             f"Another push of {name} to {target.place} ended at the same time and replaced this one, because there are no "
             f"locks. Run the same command again, one push at a time."
         )
-
-
-def _is_root_of(root: Root, owner: Project, name: str) -> bool:
-    return project_id(root) == owner.id and root["path"] == name
 
 
 def _find_dataset(path: Path, source: AnyStore) -> tuple[manifest_of.Found, str]:

@@ -202,7 +202,7 @@ def read(union: Any, values: StoredParams, place: str) -> Any:
     if kind is None:
         name = _tag_name(members)
         allowed = [str(choice) for member in members for choice in choices(member, name)]
-        tag_text = excerpt(values.get(_stored_name(members[0], name)))
+        tag_text = excerpt(values.get(_stored_as(members[0], name).name))
         raise TacpipeError(f"{place}: {name} is {tag_text}; it must be one of {', '.join(allowed)}.")
     architectures.warn_of_version(values, kind)
     annotations = fields_of.hints(kind)
@@ -230,10 +230,6 @@ def _of_type(value: Any, annotation: Any, name: str, place: str) -> Any:
 def _stored_as(kind: Kind, name: str) -> StoredAs:
     marks = [mark for mark in fields_of.metadata(fields_of.hints(kind)[name]) if isinstance(mark, StoredAs)]
     return marks[0] if marks else StoredAs(name)
-
-
-def _stored_name(kind: Kind, name: str) -> str:
-    return _stored_as(kind, name).name
 
 
 def _stored(kind: Kind, values: StoredParams) -> dict[str, Any]:

@@ -107,13 +107,8 @@ def run(
             if plan.tare:
                 recorder.tare()
             starts, stops = _triggers(recorder, plan, pressed, tap)
-            _wait_for_start(
-                recorder,
-                starts,
-                stopping,
-                view,
-                f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}",
-            )
+            waiting = f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}"
+            recorder.run(lambda: stopping() or starts(), lambda: view.show(waiting))  # noqa: B023
             if stopping():
                 break
             recording, lost = _record(recorder, store, plan, trial, stops, view, stopping)
@@ -126,12 +121,6 @@ def run(
 def _keys(plan: RecordingPlan) -> contextlib.AbstractContextManager[triggers.Keys]:
     """Return the keyboard's keys if a key starts or stops trials. Otherwise other programs can use the terminal."""
     return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
-
-
-def _wait_for_start(
-    recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: RigView, state: str
-) -> None:
-    recorder.run(lambda: stopping() or starts(), lambda: view.show(state))
 
 
 def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:

@@ -247,7 +247,8 @@ class Paxini(Sensor):
                 f"The board ({_text(_data(version))}) has {_module_list(connected)}; the rig file declares "
                 f"{_module_list(self.points)}. Correct the rig file: {_suggestion(connected)}."
             )
-        reply = yield _write_request(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "the reply to setting the data type")
+        request, is_reply = write(DATA_TYPE, bytes([DATA_TYPES[self.data]])), _reply_finder(WRITE_FUNCTION, DATA_TYPE)
+        reply = yield Ask(request, until=is_reply, what="the reply to setting the data type")
         if _data(reply)[:1] not in (b"", b"\x00"):
             raise DeviceError(
                 f'The board does not support data = "{self.data}": error {_data(reply)[0]}. Choose another value.'
@@ -302,10 +303,6 @@ class Paxini(Sensor):
 
 def _read_request(register: int, length: int, description: str) -> Ask:
     return Ask(read(register, length), until=_reply_finder(READ_FUNCTION, register), what=description)
-
-
-def _write_request(register: int, data: bytes, description: str) -> Ask:
-    return Ask(write(register, data), until=_reply_finder(WRITE_FUNCTION, register), what=description)
 
 
 def _reply_finder(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:

@@ -108,7 +108,7 @@ class Directory:
     def __init__(self, root: Path | str, draft: Callable[[], str] | None = None) -> None:
         self.place = str(root)
         self._root = Path(root)
-        self._draft = draft or self._nobodys
+        self._draft = draft or (lambda: f"{self.place}/tmp/.{uuid.uuid4().hex}")
 
     def path(self, name: str) -> str:
         """Return the path of a name."""
@@ -191,6 +191,3 @@ class Directory:
             raise StorageError(
                 f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
             )
-
-    def _nobodys(self) -> str:
-        return f"{self.place}/tmp/.{uuid.uuid4().hex}"

@@ -286,7 +286,8 @@ def _client(address: str) -> Iterator[Client]:
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Silence Dask's log within the block; lost workers and schedulers are reported as errors of tacpipe."""
-    loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
+    dask_names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *dask_names)]
     before = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
@@ -295,10 +296,6 @@ def quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)
-
-
-def _dask_loggers() -> list[str]:
-    return [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
 
 
 def _is_here(address: str) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,7 +18,7 @@ from tacpipe.sensors.camera import Camera, unpack_frame
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, gel
 from tacpipe.simulation.emulation.network import HOST, Connection, Tcp
-from tacpipe.simulation.emulation.source import BLOCK_S, CACHED, Timing
+from tacpipe.simulation.emulation.source import Sampled, Timing
 from tacpipe.simulation.emulation.world import Cycle, World
 from tacpipe.video import files
 from tacpipe.video.decoding import jpeg_images
@@ -54,27 +53,17 @@ def complete_camera(sensor: Camera, video: str) -> Camera:
     return replace(sensor, width_px=width_px, height_px=height_px, pixel_format=pixel_format, stamps="server")
 
 
-class CameraSource:
+class CameraSource(Sampled):
     """The images of one camera, from its start on: of the gel of a finger in the rig's world, or of a video, repeated."""
 
     def __init__(
         self, sensor: Camera, world: World, timing: Timing, seed: Sequence[int], finger: int, video: str
     ) -> None:
-        self.sensor: Sensor = sensor
-        self.timing, self.world, self.finger = timing, world, finger
-        self.rows = max(1, round(timing.rate_hz * BLOCK_S))
+        super().__init__(sensor, timing)
+        self.world, self.finger = world, finger
         self._format = jpeg_format(sensor.width_px, sensor.height_px, None, sensor.pixel_format)
         self._images = list(_video_images(video)) if video else []
         self._camera = gel.GelCamera(np.random.default_rng([*seed, 1]))
-        self._samples = functools.lru_cache(CACHED)(self._generate)
-
-    def block(self, number: int) -> Samples:
-        """Return the images of block ``number``, `rows` of them."""
-        return self._samples(number)
-
-    def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's images, counted from 0 through the stream (image,)."""
-        return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
     def _generate(self, block: int) -> Samples:
         numbers = self.numbers(block)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -64,47 +64,44 @@ class Timing:
         return max(0, int(np.floor((t_ns - self.start_ns) * (1 + self.clock.skew) * self.rate_hz / 1e9)) + 1)
 
 
-class Sampled(Protocol):
-    """A source of samples of an emulated sensor, in blocks."""
+class Sampled:
+    """A source of samples of an emulated sensor, in blocks. The latest blocks stay in memory."""
 
-    sensor: Sensor
-    timing: Timing
-    rows: int  # frames per block
-
-    def block(self, number: int) -> Samples:
-        """Return the samples of block ``number``."""
-
-    def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's frames (frame,), counted from 0 at the start of the stream."""
-
-
-class SampleSource:
-    """The samples of a sensor in the simulated world."""
-
-    def __init__(
-        self, sensor: Sensor, world: World, timing: Timing, seed: Sequence[int] = (0,), finger: int = 0
-    ) -> None:
-        self.sensor, self.world, self.timing, self.finger = sensor, world, timing, finger
-        self.fields = sensor.fields()
-        self.rows = max(1, round(timing.rate_hz * BLOCK_S))
-        self._seed = list(seed)
-        self._groups = _group_by_quantity(self.fields)
-        self._widths = _widths(sensor, self.fields)
-        self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # drift of a uSkin at the start of each block
-        self._samples = functools.lru_cache(CACHED)(self._generate)
-        rng = np.random.default_rng([*seed, 0])
-        self._first = [
-            _first_count(timing, sensor.step, modulus or UNUSED_MODULUS, rng)
-            for modulus in (sensor.counter, sensor.device_counter)
-        ]
+    def __init__(self, sensor: Sensor, timing: Timing, cached_blocks: int = CACHED) -> None:
+        self.sensor, self.timing = sensor, timing
+        self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # frames per block
+        self._samples = functools.lru_cache(cached_blocks)(self._generate)
 
     def block(self, number: int) -> Samples:
         """Return the samples of block ``number``."""
         return self._samples(number)
 
     def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's samples (sample,), counted from 0 at the start of the stream."""
+        """Return the numbers of a block's frames (frame,), counted from 0 at the start of the stream."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
+
+    def _generate(self, block: int) -> Samples:
+        raise NotImplementedError
+
+
+class SampleSource(Sampled):
+    """The samples of a sensor in the simulated world."""
+
+    def __init__(
+        self, sensor: Sensor, world: World, timing: Timing, seed: Sequence[int] = (0,), finger: int = 0
+    ) -> None:
+        super().__init__(sensor, timing)
+        self.world, self.finger = world, finger
+        self.fields = sensor.fields()
+        self._seed = list(seed)
+        self._groups = _group_by_quantity(self.fields)
+        self._widths = _widths(sensor, self.fields)
+        self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # drift of a uSkin at the start of each block
+        rng = np.random.default_rng([*seed, 0])
+        self._first = [
+            _first_count(timing, sensor.step, modulus or UNUSED_MODULUS, rng)
+            for modulus in (sensor.counter, sensor.device_counter)
+        ]
 
     def _generate(self, block: int) -> Samples:
         numbers = self.numbers(block)
@@ -209,23 +206,13 @@ def _blocks(widths: Sequence[int], columns: Columns) -> tuple[AnyArray, ...]:
 CLOUD_STEP = 16  # every n-th of the camera's 300,000 points is used
 
 
-class CloudSource:
-    """The clouds of a camera, like `SampleSource` but with many rows per frame."""
+class CloudSource(Sampled):
+    """The clouds of a camera, with many rows per frame: ``rows`` of the samples has the index of each point's cloud."""
 
     def __init__(self, sensor: Sensor, timing: Timing, seed: Sequence[int]) -> None:
-        self.sensor, self.timing = sensor, timing
-        self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # clouds per block
+        super().__init__(sensor, timing, 2)
         self._seed = seed[0]
         self._coloured = len(sensor.fields()) > 3
-        self._samples = functools.lru_cache(2)(self._generate)
-
-    def block(self, number: int) -> Samples:
-        """Return the points of the clouds of block ``number``. ``rows`` has the index of the cloud of each point."""
-        return self._samples(number)
-
-    def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's clouds (cloud,), counted from 0 at the start of the stream."""
-        return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
     def _generate(self, block: int) -> Samples:
         points, colours = zip(*(self._view(int(number)) for number in self.numbers(block)), strict=True)
@@ -247,28 +234,22 @@ class CloudSource:
 CACHED_TRIALS = 3
 
 
-class SlideSource:
+class SlideSource(Sampled):
     """The samples of a BioTac that slides over materials."""
 
     def __init__(self, sensor: Sensor, timing: Timing, seed: int, rig: SlideRig | None = None) -> None:
         """Create the source of a BioTac. Raises `UsageError` for any other sensor."""
         if not isinstance(sensor, BioTac):
             raise UsageError("emulate: slides is only for the sensor biotac; remove it for others.")
-        self.sensor: Sensor = sensor
-        self.timing, self._fingers = timing, sensor.fingers
-        self.rows = max(1, round(timing.rate_hz * BLOCK_S))
+        super().__init__(sensor, timing)
+        self._fingers = sensor.fingers
         self._seed, self._rig = seed, rig or SlideRig(arm_every=0)
         self._fields = [field.name for field in BioTac().fields()]
         self._ends = [0]  # end of each trial in samples from the start
-        self._trial = functools.lru_cache(CACHED_TRIALS)(self._generate)
+        self._trial = functools.lru_cache(CACHED_TRIALS)(self._readings)
 
-    def numbers(self, block: int) -> Int64s:
-        """Return the numbers of a block's samples (sample,), counted from 0 at the start of the stream."""
-        return block * self.rows + np.arange(self.rows, dtype=np.int64)
-
-    def block(self, number: int) -> Samples:
-        """Return the samples of block ``number``."""
-        numbers = self.numbers(number)
+    def _generate(self, block: int) -> Samples:
+        numbers = self.numbers(block)
         while self._ends[-1] <= numbers[-1]:
             self._ends.append(self._ends[-1] + len(self._trial(len(self._ends) - 1)))
         trials = np.searchsorted(self._ends, numbers, side="right") - 1
@@ -277,7 +258,7 @@ class SlideSource:
         device_ns = faults.device_stamps(self.timing.sample_ns(numbers), self.timing.clock)
         return Samples((readings,), numbers % (self.sensor.counter or 1), device_ns)
 
-    def _generate(self, number: int) -> Ints:
+    def _readings(self, number: int) -> Ints:
         """Return the readings of a trial (sample, 44)."""
         table = simulate_trial(self._seed, len(SENSORS) * number, self._rig).streams[SENSORS[0]]
         return np.column_stack([table.column(name).to_numpy() for name in self._fields]).astype(np.uint16)
