@@ -413,13 +413,9 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
 
 
 def test_reports_name_an_architecture_as_its_class_states_it_and_others_by_their_choice(package: Path) -> None:
-    from tacpipe.plugins import architectures
-    from tacpipe.tasks.material.params import MaterialModelParams
+    from tacpipe.tasks.material.params import kind_of
 
-    titles = [
-        architectures.title(MaterialModelParams, name)
-        for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")
-    ]
+    titles = [kind_of(name).TITLE or name for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")]
     assert titles == ["RAEC", "X-LSTM", "statistics", "nearest", "uninstalled"]
 
 

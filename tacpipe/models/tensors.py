@@ -1,4 +1,4 @@
-"""Select tensors by a prefix of their names, and limit torch and numpy to one thread."""
+"""Select tensors by their names, check what architectures build, and limit the threads of torch and numpy."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
+from torch import nn
+
+from tacpipe.errors import TacpipeError
 
 Value = TypeVar("Value")
 
@@ -17,6 +20,25 @@ Value = TypeVar("Value")
 def tensors_under(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the entries whose name starts with ``prefix``, with the prefix removed."""
     return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
+
+
+def require_network(built: object, architecture: str) -> nn.Module:
+    """Return the network that an architecture built. Raises `TacpipeError` if it built anything else."""
+    if not isinstance(built, nn.Module):
+        raise TacpipeError(
+            f"The architecture {architecture} built {type(built).__name__}; it must build a torch.nn.Module."
+        )
+    return built
+
+
+def require_output(output: object, shape: tuple[int, ...], architecture: str, rows: str, axes: str) -> None:
+    """Raise `TacpipeError` unless a network's output for these ``rows`` is a tensor of ``shape``, called ``axes``."""
+    if not isinstance(output, torch.Tensor) or tuple(output.shape) != shape:
+        returned = str(tuple(output.shape)) if isinstance(output, torch.Tensor) else type(output).__name__
+        raise TacpipeError(
+            f"The network of the architecture {architecture} returns {returned} for {rows}; it must return {axes}, "
+            f"here {shape}."
+        )
 
 
 _is_limited: ContextVar[bool] = ContextVar("within", default=False)

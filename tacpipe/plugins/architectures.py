@@ -79,11 +79,6 @@ def load(base: Kind, name: str) -> Kind:
     return kind
 
 
-def title(base: Any, architecture: str) -> str:
-    """Return an architecture's name in reports: ``TITLE`` of its class, or ``architecture`` if it has none."""
-    return str(getattr(find(base, architecture), "TITLE", architecture))
-
-
 def find(base: Any, architecture: str) -> Kind | None:
     """Return the class of an architecture that extends ``base``, or None if its package is not installed."""
     return next((kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG)), None)

@@ -20,6 +20,7 @@ from tacpipe.models import forecasts
 from tacpipe.models import windows as windows_of
 from tacpipe.models.change import PlainForecast
 from tacpipe.models.forecasts import Ensemble
+from tacpipe.models.tensors import require_network, require_output
 from tacpipe.models.windows import ARM, POSE, ForecastShape, ForecastWindows
 from tacpipe.tasks.forward.params import ForwardModelParams
 from tacpipe.tasks.forward.tracks import Levels, Track
@@ -173,11 +174,7 @@ def build(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
 def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
     """Return one network that fits its own scales; wraps a plain network in scales."""
     sizes = shape(params, codec)
-    network = params.build(sizes)
-    if not isinstance(network, nn.Module):
-        raise TacpipeError(
-            f"The architecture {params.architecture} built {type(network).__name__}; it must build a torch.nn.Module."
-        )
+    network = require_network(params.build(sizes), params.architecture)
     scaling_methods = [name for name in METHODS if hasattr(network, name)]
     if not scaling_methods:
         return PlainForecast(network, sizes, loss=forecasts.resolve_loss("auto", changes=sizes.increments))
@@ -199,14 +196,8 @@ def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindo
     features_ahead = network.eval()(sample)
     network.train(training)
     expected = (params.horizon, sample.touch.shape[1], features)
-    if not isinstance(features_ahead, Tensor) or tuple(features_ahead.shape) != expected:
-        returned = (
-            str(tuple(features_ahead.shape)) if isinstance(features_ahead, Tensor) else type(features_ahead).__name__
-        )
-        raise TacpipeError(
-            f"The network of the architecture {params.architecture} returns {returned} for {expected[1]} windows; it must "
-            f"return (horizon, window, feature), here {expected}."
-        )
+    axes = "(horizon, window, feature)"
+    require_output(features_ahead, expected, params.architecture, f"{expected[1]} windows", axes)
 
 
 # number of windows on which network and trace must agree; the first calls of a trace profile and optimize it

@@ -29,7 +29,7 @@ from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
-from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, MaterialConfig, Params
+from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, MaterialConfig, NetworkParams, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import SlideLayout, Slides, describe_difference
 from tacpipe.tasks.recordings import OpenedChain
@@ -75,6 +75,10 @@ class Reader(ABC):
 
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of latents by another sensor's classifier; requires a reader with latents."""
+        return partner.scores_of(latents)
+
+    def scores_of(self, latents: Float32s) -> Float32s:
+        """Return the scores (slide, class) of latents, possibly of another sensor, by this sensor's classifier."""
         raise NotImplementedError
 
 
@@ -103,11 +107,6 @@ class NetworkReader(Reader):
                 scores.append(output.scores.cpu().numpy())
                 latents.append(output.latents.cpu().numpy())
         return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
-
-    def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
-        """Return the scores (slide, class) of this sensor's latents by a partner's classifier."""
-        assert isinstance(partner, NetworkReader)
-        return partner.scores_of(latents)
 
     def scores_of(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of latents, possibly of another sensor, by this sensor's classifier."""
@@ -388,7 +387,7 @@ class StoredClassifier:
             for name, layout in self.layouts.items()
         }
 
-    def networks(self, params: Params) -> dict[str, Reader]:
+    def networks(self, params: NetworkParams) -> dict[str, Reader]:
         """Return the networks by sensor, built by ``params``."""
         tensors = model_files.tensors(self.files[self.weights], self.weights)
         readers: dict[str, Reader] = {}

@@ -22,10 +22,11 @@ from torch import Tensor, nn
 from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import AutoencoderShape, PlainClassifier
+from tacpipe.models.tensors import require_network, require_output
 from tacpipe.plugins import extras
 from tacpipe.printable import listed, plain
 from tacpipe.tasks.material.losses import Network
-from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
+from tacpipe.tasks.material.params import Estimator, NetworkParams
 
 SCHEMA = "schema.json"
 MODIFICATION_TIME = (1980, 1, 1, 0, 0, 0)  # modification time of all archive members
@@ -199,18 +200,14 @@ def _renumber_file_name(name: str, numbers: dict[Any, int]) -> str:
     return f"{numbers.setdefault(int(stem), len(numbers) + 1)}{dot}{ending}" if stem.isdigit() else name
 
 
-def build_network(params: MaterialModelParams, shape: AutoencoderShape) -> Network:
+def build_network(params: NetworkParams, shape: AutoencoderShape) -> Network:
     """Return the network of ``params`` for a sensor, with random weights.
 
     A plain network is wrapped in the common interface.
 
     Raises `TacpipeError` if the params build anything else.
     """
-    network = params.build(shape) if isinstance(params, NetworkParams) else None
-    if not isinstance(network, nn.Module):
-        raise TacpipeError(
-            f"The architecture {params.architecture} built {type(network).__name__}; it must build a torch.nn.Module."
-        )
+    network = require_network(params.build(shape), params.architecture)
     return cast(Network, network if hasattr(network, "classify") else PlainClassifier(network))
 
 
@@ -221,9 +218,4 @@ def check_network(network: nn.Module, params: NetworkParams, slides: Tensor, cla
     output = network.eval()(slides[:TRIAL_SLIDES].transpose(0, 1).contiguous(), decode=False)
     network.train(training)
     scores, shape = getattr(output, "scores", None), (len(slides[:TRIAL_SLIDES]), classes)
-    if not isinstance(scores, Tensor) or tuple(scores.shape) != shape:
-        returned = str(tuple(scores.shape)) if isinstance(scores, Tensor) else type(scores).__name__
-        raise TacpipeError(
-            f"The network of the architecture {params.architecture} returns {returned} for {shape[0]} slides; it must "
-            f"return scores (slide, class), here {shape}."
-        )
+    require_output(scores, shape, params.architecture, f"{shape[0]} slides", "scores (slide, class)")

@@ -56,6 +56,7 @@ class MaterialModelParams(ABC):
     """Params of all classifiers of materials."""
 
     ARCHITECTURES: ClassVar[str] = "material"  # name of the task in entry points
+    TITLE: ClassVar[str] = ""  # name in reports; empty: the architecture
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # default of the param ``quantities``
     ALIGNS_SENSORS: ClassVar[bool] = False  # True if networks can be aligned to the frozen one of the --init model
     IS_READOUT: ClassVar[bool] = False  # True for one linear readout per sensor, fitted in closed form
@@ -105,9 +106,9 @@ class MaterialModelParams(ABC):
         """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
         return 0
 
+    @abstractmethod
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return the fitted reader of each sensor; networks, unless an architecture overrides it."""
-        return stored.networks(self)
+        """Return the fitted reader of each sensor. `Estimator` and `NetworkParams` implement it."""
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
         """Return the stored baselines by name and sensor, without the mean level."""
@@ -268,6 +269,10 @@ class NetworkParams(MaterialModelParams, ABC):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of one network per sensor, trained by the shared loop."""
         return slides.train_networks(self)
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return the networks by sensor."""
+        return stored.networks(self)
 
     @property
     def dropped_beyond(self) -> int:
@@ -446,6 +451,11 @@ class XLSTM(NetworkParams):
 
 
 Params = MaterialModelParams  # params of any architecture
+
+
+def kind_of(architecture: str) -> type[Params]:
+    """Return the class of an architecture, or of all architectures if its package is not installed."""
+    return architectures.find(Params, architecture) or Params
 
 
 class StoredNaming(TypedDict):

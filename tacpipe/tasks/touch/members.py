@@ -19,6 +19,7 @@ from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.models.point_networks import PointNetworkShape
+from tacpipe.models.tensors import require_network
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Arrays, require_colours
 from tacpipe.tasks.touch.params import PointNetwork
@@ -210,12 +211,8 @@ def network(params: PointNetwork, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network. Raises `TacpipeError` if the params build anything else."""
     values = sum(biotac_sp.width(target) for target in targets)
     inputs = params.point_inputs
-    module = params.build(PointNetworkShape(inputs.channels, inputs.grasp_numbers, values))
-    if not isinstance(module, nn.Module):
-        raise TacpipeError(
-            f"The architecture {params.architecture} built {type(module).__name__}; it must build a torch.nn.Module."
-        )
-    return module
+    built = params.build(PointNetworkShape(inputs.channels, inputs.grasp_numbers, values))
+    return require_network(built, params.architecture)
 
 
 def check_sizes(params: PointNetwork) -> None:

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict
 
+from tacpipe.plugins import architectures
 from tacpipe.plugins.constraints import (
     CommaList,
     Dropout,
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
     from tacpipe.models.point_networks import PointNetworkShape
     from tacpipe.tasks.touch.inputs import CloudInputs, PatchOptions
+    from tacpipe.tasks.touch.members import Member
+    from tacpipe.tasks.touch.predictor import StoredMember
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
 Draws = Annotated[int, Range(1, 100_000)]
@@ -42,6 +45,7 @@ class TouchModelParams(ABC):
     """Params of all touch models."""
 
     ARCHITECTURES: ClassVar[str] = "touch"  # name of the task in entry points
+    TITLE: ClassVar[str] = ""  # name in reports; empty: the architecture
     architecture: str = "tree-ensemble"
     targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
     # name of this run in a report, to distinguish runs of the same method, such as blocked
@@ -77,11 +81,23 @@ class TouchModelParams(ABC):
         """Whether validation grasps select a network's epoch or stop its training."""
         return False
 
+    @classmethod
+    def report_names(cls, architecture: str, *, coloured: bool) -> list[str]:
+        """Return the name of a model in reports, and of its inputs if they differ from the usual ones."""
+        return [cls.TITLE or architecture, *([] if coloured else ["without colour"])]
+
     @abstractmethod
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
         """Train on ``grasps`` and add the members, their tensors and their history to ``model``.
 
         `Patches` and `Pointnet` implement it for the networks that an architecture builds.
+        """
+
+    @abstractmethod
+    def load_member(self, stored: StoredMember) -> Member:
+        """Return a member of a model. Raises `ValueError` if ``stored``, which is untrusted, is not one of these params.
+
+        `Patches` and `Pointnet` implement it for networks.
         """
 
 
@@ -116,6 +132,17 @@ class Trees(TouchModelParams):
         """Add one forest per target and, in a tree-ensemble, one of all targets."""
         grasps.grow_forests(self, model)
 
+    def load_member(self, stored: StoredMember) -> Member:
+        """Return the forests of some targets."""
+        return stored.forests()
+
+    @classmethod
+    def report_names(cls, architecture: str, *, coloured: bool) -> list[str]:
+        """Return the inputs as the name of separate trees."""
+        if architecture == "trees":
+            return ["trees on geometry and colour" if coloured else "trees on geometry"]
+        return super().report_names(architecture, coloured=coloured)
+
 
 @dataclass(frozen=True)
 class PointNetwork(TouchModelParams, ABC):
@@ -148,6 +175,14 @@ class PointNetwork(TouchModelParams, ABC):
     @abstractmethod
     def point_inputs(self) -> CloudInputs | PatchOptions:
         """Inputs of the network from a cloud, defined by `Patches` and `Pointnet`."""
+
+    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
+        """Add networks trained by the shared loop: one for all targets or one for each."""
+        grasps.train_networks(self, model)
+
+    def load_member(self, stored: StoredMember) -> Member:
+        """Return the network of some targets."""
+        return stored.network(self)
 
     @abstractmethod
     def build(self, shape: PointNetworkShape) -> nn.Module:
@@ -191,10 +226,6 @@ class Patches(PointNetwork):
         from tacpipe.tasks.touch.inputs import PatchOptions
 
         return PatchOptions(self.points, self.radius_mm / 1000, self.inputs == "rgb", self.place)
-
-    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
-        """Add networks trained by the shared loop: one for all targets or one for each."""
-        grasps.train_networks(self, model)
 
     def build(self, shape: PointNetworkShape) -> nn.Module:
         """Return the patch network."""
@@ -251,10 +282,6 @@ class Pointnet(PointNetwork):
 
         return CloudInputs(self.inputs, self.points, self.normalisation, self.rotation_deg, self.wrist)
 
-    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
-        """Add networks trained by the shared loop: one for all targets or one for each."""
-        grasps.train_networks(self, model)
-
     def build(self, shape: PointNetworkShape) -> nn.Module:
         """Return the paper's network."""
         from tacpipe.models.point_networks import HEADS, PointNet
@@ -263,6 +290,13 @@ class Pointnet(PointNetwork):
 
 
 Params = TouchModelParams  # params of any architecture
+
+
+def kind_of(architecture: str) -> type[Params]:
+    """Return the class of an architecture, or of all architectures if its package is not installed."""
+    return architectures.find(Params, architecture) or Params
+
+
 DEFAULT = TouchModelParams.architecture  # default architecture
 PAPER = Pointnet.architecture  # architecture of the paper
 

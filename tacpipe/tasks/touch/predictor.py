@@ -220,7 +220,7 @@ class Predictor:
         device = devices.kind()
         with model_files.validated("the model"):
             loaded_members = [
-                _load_member(params, description, tensors_under(f"{number}.", tensors), device)
+                params.load_member(StoredMember(description, tensors_under(f"{number}.", tensors), device))
                 for number, description in enumerate(config["members"])
             ]
             baselines = None
@@ -290,14 +290,26 @@ class Predictor:
         ]
 
 
-def _load_member(
-    params: Params, description: MemberDescription, tensors: dict[str, Tensor], device: str
-) -> members.Member:
-    targets = tuple(description["targets"])
-    width = sum(biotac_sp.width(target) for target in targets)
-    if description["kind"] == FOREST:
+@dataclass(frozen=True)
+class StoredMember:
+    """A member in the files of a model, and the loaders that the task offers to architectures."""
+
+    description: MemberDescription
+    tensors: Mapping[str, Tensor]
+    device: str
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The targets that it predicts."""
+        return tuple(self.description["targets"])
+
+    def forests(self) -> members.ForestMember:
+        """Return the forests of groups of targets. Raises `ValueError` if it is anything else."""
+        description, targets = self.description, self.targets
+        if description["kind"] != FOREST:
+            raise ValueError(f"a member is a {excerpt(description['kind'])}")
         forests = tuple(
-            (tuple(group), Forest.from_tensors(tensors_under(f"{number}.", tensors)))
+            (tuple(group), Forest.from_tensors(tensors_under(f"{number}.", self.tensors)))
             for number, group in enumerate(description["groups"])
         )
         for group, forest in forests:
@@ -307,11 +319,15 @@ def _load_member(
         return members.ForestMember(
             targets, forests, description["coloured"], description["placed"], tuple(description["features"])
         )
-    scale = Affine.from_tensors({name: value.numpy() for name, value in tensors_under("scale.", tensors).items()})
-    if scale.offset.shape != (width,) or scale.scale.shape != (width,):
-        raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
-    if not isinstance(params, PointNetwork):
-        raise ValueError(f"the architecture {params.architecture} has a network")
-    network = model_files.filled(lambda: members.network(params, targets), tensors_under("network.", tensors))
-    members.check_sizes(params)
-    return members.NetworkMember(targets, network.to(device).eval(), scale, params)
+
+    def network(self, params: PointNetwork) -> members.NetworkMember:
+        """Return the network that ``params`` build. Raises `ValueError` if its sizes do not fit."""
+        width = sum(biotac_sp.width(target) for target in self.targets)
+        stored_scale = tensors_under("scale.", self.tensors)
+        scale = Affine.from_tensors({name: value.numpy() for name, value in stored_scale.items()})
+        if scale.offset.shape != (width,) or scale.scale.shape != (width,):
+            raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
+        weights = tensors_under("network.", self.tensors)
+        network = model_files.filled(lambda: members.network(params, self.targets), weights)
+        members.check_sizes(params)
+        return members.NetworkMember(self.targets, network.to(self.device).eval(), scale, params)

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.comparison.runs import ComparedRun, Kind, Method, PredictorErrors, Question, Settings, marks
-from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.headline import MaterialMetrics
-from tacpipe.tasks.material.params import MaterialConfig, MaterialModelParams
+from tacpipe.tasks.material.params import MaterialConfig, kind_of
 from tacpipe.tasks.material.report import predictions
 from tacpipe.tasks.material.report.predictions import (
     LAST,
@@ -80,7 +79,7 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
     def learned(self) -> Mapping[str, int]:
         """Number of training slides by sensor; readouts may also learn from validation slides."""
         params = self.params
-        is_readout = getattr(architectures.find(MaterialModelParams, self.architecture), "IS_READOUT", False)
+        is_readout = kind_of(self.architecture).IS_READOUT
         if is_readout and params.get("use_validation") and params.get("labels") != "permuted":
             watched = self.config["counts"].get("val", {})
             return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
@@ -196,12 +195,13 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
 def base_name(settings: Settings, variants: bool = True) -> str:
     """Return the base name of a method, without suffixes that distinguish it from similar ones."""
     architecture = str(settings["architecture"])
-    name = architectures.title(MaterialModelParams, architecture)
+    kind = kind_of(architecture)
+    name = kind.TITLE or architecture
     if settings["frozen_sensor"]:
         name = "mapping to known space"
     elif settings["joint"]:
         name += " joint"
-    elif getattr(architectures.find(MaterialModelParams, architecture), "ALIGNS_SENSORS", False):
+    elif kind.ALIGNS_SENSORS:
         name += " independent"
     if not variants:
         return name

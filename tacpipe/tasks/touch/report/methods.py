@@ -15,13 +15,12 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, Settings, distinct_names, marks
 from tacpipe.io import Scalar
 from tacpipe.metrics import regression
-from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
 from tacpipe.report import blocks, context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
-from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, TouchModelParams
+from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, kind_of
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
@@ -166,14 +165,9 @@ def predicted_targets(*methods: Method) -> tuple[str, ...]:
 
 def _first_names(settings: Settings) -> list[str]:
     """Return the model names based on inputs; suffixes that distinguish methods follow them."""
-    architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
-    if architecture == "trees":
-        return ["trees on geometry and colour" if coloured else "trees on geometry"]
-    name = architectures.title(TouchModelParams, architecture)
-    return [
-        f"{name} ({settings[SHORTENED]})" if SHORTENED in settings else name,
-        *([] if coloured else ["without colour"]),
-    ]
+    architecture, coloured = str(settings["architecture"]), bool(settings.get("colour", True))
+    name, *inputs = kind_of(architecture).report_names(architecture, coloured=coloured)
+    return [f"{name} ({settings[SHORTENED]})" if SHORTENED in settings else name, *inputs]
 
 
 def _most_common_settings(settings_and_runs: Sequence[tuple[Settings, int]]) -> list[tuple[str, Scalar]]:
@@ -327,7 +321,7 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
         name,
         run.settings,
         questions,
-        family=architectures.title(TouchModelParams, run.architecture),
+        family=kind_of(run.architecture).TITLE or run.architecture,
         seed=run.params.get("seed"),
         simulated=run.simulated,
         published=run.published,
