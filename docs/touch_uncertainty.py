@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import tacpipe
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics.calibration import Band
+from tacpipe.metrics.calibration import COVERAGE_FILE, Band
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import training as touch_training
-from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report.quantiles import measure_bands
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def main(data: Path, folder: Path, draws: int) -> None:
             for fold, one in _folds(grasps, split):
                 parts.append(_evaluated(one, draw).assign(draw=draw, fold=fold))
                 print(f"draw {draw} {name} fold {fold}", file=sys.stderr, flush=True)
-                pd.concat(parts).to_parquet(folder / COVERAGE)
+                pd.concat(parts).to_parquet(folder / COVERAGE_FILE)
     print(table(pd.concat(parts)))
 
 
@@ -74,7 +74,7 @@ def _evaluated(parts: Mapping[str, Any], seed: int) -> pd.DataFrame:
     with tempfile.TemporaryDirectory() as workspace:
         model = touch_training.train(params, parts["train"], parts["val"], Path(workspace))
     model = touch_model.calibrate(model, ASKED, parts["train"], parts["val"])
-    found: pd.DataFrame = from_parquet(touch_evaluation.evaluate(model, parts["test"]).files[COVERAGE]).to_pandas()
+    found: pd.DataFrame = from_parquet(touch_evaluation.evaluate(model, parts["test"]).files[COVERAGE_FILE]).to_pandas()
     return found
 
 

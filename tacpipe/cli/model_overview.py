@@ -14,7 +14,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Found, InputDataset
 from tacpipe.errors import TacpipeError
-from tacpipe.io import terminal
+from tacpipe.io import Scalar, terminal
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import StoredParams, Values
@@ -39,6 +39,9 @@ def is_result(opened: Dataset) -> bool:
     return METRICS in opened.files
 
 
+Figures = Mapping[str, Scalar | Mapping[str, Scalar]]  # counts or measures by name, or by role and sensor
+
+
 class ModelOrigin(TypedDict):
     """Task and current architecture name of a configuration."""
 
@@ -50,7 +53,7 @@ class TrainingCounts(TypedDict):
     """Numbers of recordings that a model was trained on."""
 
     recordings: int | None  # number of recordings for training and validation
-    roles: Values  # number by role, or by role and sensor
+    roles: Figures  # number by role, or by role and sensor
 
 
 class ModelDescription(ModelOrigin):
@@ -72,7 +75,7 @@ class ModelOverview(ModelDescription):
 
     parameters: int | None
     epochs: int | None
-    validation: Values | BestEpoch | None
+    validation: Figures | BestEpoch | None
     params: StoredParams
     inputs: dict[str, list[str]]  # paths and digests by argument name
     chain: list[str]
@@ -83,8 +86,8 @@ class ResultOverview(ModelOrigin):
 
     headline: list[Values] | None
     baselines: list[str]
-    evaluated_on: Values
-    by_part: dict[str, Values]
+    evaluated_on: Figures
+    by_part: dict[str, Figures]
     fold: int | None
     role: str | None
     trained_on: TrainingCounts

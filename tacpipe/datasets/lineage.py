@@ -15,7 +15,7 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import Attribute, StoredParams
+from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
 from tacpipe.printable import listed
 from tacpipe.store import records
 from tacpipe.store.location import locate
@@ -261,7 +261,7 @@ def _leaves(params: StoredParams) -> StoredParams:
     >>> _leaves({"gap_ms": 50, "layout": '{"time": {"unit": "ns"}, "columns": [{"match": "x"}]}'})
     {'gap_ms': 50, 'layout.time.unit': 'ns', 'layout.columns.0.match': 'x'}
     """
-    leaves: dict[str, Any] = {}
+    leaves: dict[str, ParamValue] = {}
     for name, value in params.items():
         parts = _nested(value) or {str(place): row for place, row in enumerate(_rows(value))}
         leaves |= {f"{name}.{part}": leaf for part, leaf in _leaves(parts).items()} if parts else {name: value}

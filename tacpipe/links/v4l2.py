@@ -195,7 +195,7 @@ class Capture:
     rate_hz: float
     read_back: str  # controls with their values
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, str | float]:
         """Return the values for the sensor's options."""
         return {
             "rate_hz": self.rate_hz,

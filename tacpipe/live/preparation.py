@@ -23,6 +23,7 @@ from tacpipe.recording.rig import Rig, RigStream
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.sensors.sensor import Options
 
 CONFIG = "config.json"
 PATHS = ("model", "alarms_on", "split")
@@ -102,7 +103,7 @@ def with_absolute_paths(settings: Settings) -> Settings:
     return replace(settings, model=str(Path(settings.model).absolute()), task=replace(settings.task, **task))
 
 
-def add_streams(rig: Rig, streams: Mapping[str, SettingValues]) -> Rig:
+def add_streams(rig: Rig, streams: Mapping[str, Options]) -> Rig:
     """Return a rig with additional streams of the sensor ``live``, given by their options, at free local ports.
 
     Raises `UsageError` if the rig already has a stream of that name, and for messages too large for a packet.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Sensor
+    from tacpipe.sensors.sensor import Options, Sensor
     from tacpipe.tasks.task import PredictionRequest
 
 SettingValues = Mapping[str, Scalar | Sequence[Scalar] | None]  # values by name, from a rig file or options
@@ -190,7 +190,7 @@ class SessionPlan:
 
     rig: Rig  # includes additional streams that the engine needs
     settings: TaskSettings  # completed
-    streams: Mapping[str, SettingValues]  # recorded streams with the options of the sensor ``live``
+    streams: Mapping[str, Options]  # recorded streams with the options of the sensor ``live``
     attributes: Mapping[str, Attribute] = field(default_factory=dict)  # further attributes of the recording
 
 

@@ -12,6 +12,7 @@ the fraction of true values between the lowest and the highest quantile; a good 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -25,6 +26,7 @@ from tacpipe.metrics.intervals import Estimate
 if TYPE_CHECKING:
     import pandas as pd
 
+COVERAGE_FILE = "coverage.parquet"  # how often the bands of a calibrated model held, as `measure_bands` reads it
 BINS = 10  # bins of confidence, equally wide
 MIN_PROBABILITY = 1e-12
 RANGE = 8.0  # range of the logarithm of a temperature, relative to the spread of scores
@@ -137,9 +139,12 @@ def check_levels(percents: tuple[int, ...]) -> None:
         )
 
 
-def pinball(above: AnyFloats, levels: AnyFloats) -> AnyFloats:
-    """Return the pinball loss (..., level); ``above`` (..., level) is the true value minus the quantile."""
-    return np.maximum(levels * above, (levels - 1) * above)
+def pinball(above: Any, levels: Any, maximum: Callable[[Any, Any], Any] = np.maximum) -> Any:
+    """Return the pinball loss (..., level); ``above`` (..., level) is the true value minus the quantile.
+
+    ``maximum`` is that of numpy, or of torch for tensors.
+    """
+    return maximum(levels * above, (levels - 1) * above)
 
 
 @dataclass(frozen=True)
@@ -242,7 +247,7 @@ class Band:
 def measure_bands(rows: pd.DataFrame, group: str, cluster: str, baseline: str) -> dict[tuple[Any, str], Band]:
     """Return the quality of each predictor's band for each ``group``, a column of targets or steps.
 
-    ``rows`` are those of ``coverage.parquet``: ``covered``, ``width`` and ``pinball`` of single values, or their sums
+    ``rows`` are those of `COVERAGE_FILE`: ``covered``, ``width`` and ``pinball`` of single values, or their sums
     over ``values``. Intervals are over the groups in the column ``cluster``.
     """
     columns = ["covered", "width", "pinball", "values"]

@@ -28,7 +28,7 @@ from tacpipe.links import link
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import excerpt, plain
-from tacpipe.sensors.sensor import Sensor
+from tacpipe.sensors.sensor import Options, Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 RESERVED = (EVENTS, "truth")  # streams of a recording that no sensor may use
@@ -43,8 +43,8 @@ class RigStream:
     kind: str  # the sensor's registered name
     sensor: Sensor
     address: link.Address
-    options: Values = field(default_factory=dict)  # options of the sensor, as written
-    emulate: Values = field(default_factory=dict)  # options of `tacpipe sensors emulate`
+    options: Options = field(default_factory=dict)  # options of the sensor, as written
+    emulate: Options = field(default_factory=dict)  # options of `tacpipe sensors emulate`
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Rig:
     streams: Mapping[str, RigStream]
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
-    emulate: Values = field(default_factory=dict)
+    emulate: Options = field(default_factory=dict)
     live: Values = field(default_factory=dict)  # options of `tacpipe live`, as written
     text: str = ""  # the text of the file, which is stored with every recording
 

@@ -14,14 +14,18 @@ import numpy as np
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
 from tacpipe.datasets.selection import PUBLISHED
+from tacpipe.io.parquet import from_parquet
+from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts
-from tacpipe.report.blocks import Block, table
+from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, fold, notes, table
 from tacpipe.report.charts import Curve
 from tacpipe.training.following import Line, read_history
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.datasets.manifest import ManifestJson
@@ -178,6 +182,28 @@ def loss_chart(
         lines.append(Curve(name, range(1, length + 1), mean))
     single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value does not make a line
     return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
+
+
+def read_coverage(results: Sequence[Dataset]) -> pd.DataFrame | None:
+    """Return the rows of the coverage files of results, joined; None if no result is of a calibrated model."""
+    import pandas as pd
+
+    files = [result.files[COVERAGE_FILE] for result in results if COVERAGE_FILE in result.files]
+    return pd.concat([from_parquet(file).to_pandas() for file in files]) if files else None
+
+
+def band_fold(
+    levels: Sequence[int],
+    drawn: Sequence[Chart],
+    explained: str,
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str | Cell]],
+    *more: Block,
+    about: str = "",
+) -> list[Fold]:
+    """Return the section on bands between the outer ``levels`` in percent: charts of coverage, a table, and ``more``."""
+    title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
+    return fold("Uncertainty", Charts(drawn), notes(explained), table(title, heads, rows), *more, about=about)
 
 
 def without_gaps(values: Sequence[float | None]) -> list[float]:

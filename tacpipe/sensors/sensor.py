@@ -85,7 +85,15 @@ class Device:
         return 0
 
 
-OptionValue = str | float | bool | Sequence[str] | Mapping[str, str | float | bool] | Sequence[Mapping[str, str]]
+OptionValue = (
+    str
+    | float
+    | bool
+    | Sequence[str]
+    | Sequence[float]
+    | Mapping[str, str | float | bool]
+    | Sequence[Mapping[str, str]]
+)
 Options = Mapping[str, OptionValue]  # options of a sensor, as a rig file states them
 
 

@@ -100,7 +100,7 @@ def _json_object(text: str) -> Values:
     return value if isinstance(value, dict) else {}
 
 
-def _texts(values: Values) -> dict[str, str]:
+def _texts(values: Mapping[str, Attribute]) -> dict[str, str]:
     return {str(key): str(value) for key, value in values.items()}
 
 

@@ -276,11 +276,11 @@ def _leaves(names: Any) -> list[str]:
     return leaves
 
 
-def _episode_name(index: int, extra_values: Values) -> str:
+def _episode_name(index: int, extra_values: Mapping[str, Attribute]) -> str:
     return str(extra_values[NAME]) if extra_values.get(NAME) else f"episode_{index:06d}"
 
 
-def _plain_attributes(values: Values) -> dict[str, Attribute]:
+def _plain_attributes(values: Mapping[str, Attribute]) -> dict[str, Attribute]:
     extra_values = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
     return dict(plain_attributes(extra_values))
 

@@ -18,7 +18,7 @@ from tacpipe.io import terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.metrics import calibration, headline
-from tacpipe.metrics.calibration import Sums
+from tacpipe.metrics.calibration import COVERAGE_FILE, Sums
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks
 from tacpipe.tasks.forward.alarms import Loads
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 UNCONDITIONAL = "model_unconditional"  # the model's forecast with constant error quantiles from calibration recordings
-COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
+EXAMPLES = "bands.json"
 SHOWN = 2  # number of recordings whose forecast is drawn with its band
 MAX_ROWS = 600  # maximum number of drawn rows per recording
 STEP = 10  # step that is drawn, or the last one if the model predicts fewer
@@ -128,7 +128,7 @@ class QuantileSums:
                     row |= {"covered": sums.covered[at], "width": sums.width[at], "pinball": sums.pinball[at].mean()}
                     rows.append(row)
         drawn = (json.dumps(self.examples) + "\n").encode()
-        return {COVERAGE: to_parquet(pa.Table.from_pylist(rows, _COLUMNS)), EXAMPLES: drawn}
+        return {COVERAGE_FILE: to_parquet(pa.Table.from_pylist(rows, _COLUMNS)), EXAMPLES: drawn}
 
 
 _COLUMNS = pa.schema(

@@ -21,7 +21,7 @@ from torch.nn import functional
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Float32s, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.calibration import conformal_quantile, promised_quantile
+from tacpipe.metrics.calibration import conformal_quantile, pinball, promised_quantile
 from tacpipe.models.tensors import tensors_under
 from tacpipe.models.windows import POSE, ForecastWindows, without_plan
 from tacpipe.tasks import task
@@ -135,7 +135,7 @@ def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, pas
             rows = torch.randint(len(x), (BATCH,))
             quantiles = _ordered_tensor(network(x[rows]).view(BATCH, steps, len(levels)), middle)
             above = y[rows][..., None] - quantiles
-            lost = torch.maximum(p * above, (p - 1) * above).mean()
+            lost: torch.Tensor = pinball(above, p, torch.maximum).mean()
             optimiser.zero_grad()
             lost.backward()  # type: ignore[no-untyped-call]
             optimiser.step()

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict
 
-from tacpipe.errors import UsageError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Scalar
 from tacpipe.plugins import architectures, fields
 from tacpipe.plugins.constraints import (
@@ -106,9 +106,9 @@ class MaterialModelParams(ABC):
         """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
         return 0
 
-    @abstractmethod
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
         """Return the fitted reader of each sensor. `Estimator` and `NetworkParams` implement it."""
+        raise TacpipeError(f"The architecture {self.architecture} has no method readers, so its models cannot be used.")
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
         """Return the stored baselines by name and sensor, without the mean level."""

@@ -18,6 +18,7 @@ from tacpipe.datasets import selection
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
 from tacpipe.metrics import headline, regression
+from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
@@ -25,7 +26,6 @@ from tacpipe.tasks.touch import quantiles
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.headline import (
     CONSTANT,
-    COVERAGE,
     GRASPS,
     MODEL,
     NEAREST_IN_TIME,
@@ -190,7 +190,7 @@ def _evaluation_result(
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     if predictor.quantiles is not None:
-        files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
+        files[COVERAGE_FILE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
     streams[GRASPS] = _grasp_table(grasps, in_training, is_known)
     attributes = selection.combine_origins(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)

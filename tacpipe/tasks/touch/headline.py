@@ -92,7 +92,6 @@ def measure(range_counts: float, cluster: str) -> Measure:
     )
 
 
-COVERAGE = "coverage.parquet"  # each value of each grasp, with its band predicted by a calibrated model
 PREDICTIONS = "predictions"  # recording with one stream per name below; all streams have the same grasps as rows
 GRASPS, TRUE, MODEL = "grasps", "true", "model"
 CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # baselines

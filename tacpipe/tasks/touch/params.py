@@ -93,12 +93,9 @@ class TouchModelParams(ABC):
         `Patches` and `Pointnet` implement it for the networks that an architecture builds.
         """
 
-    @abstractmethod
     def load_member(self, stored: StoredMember) -> Member:
-        """Return a member of a model. Raises `ValueError` if ``stored``, which is untrusted, is not one of these params.
-
-        `Patches` and `Pointnet` implement it for networks.
-        """
+        """Return a member of a model, forests by default. Raises `ValueError` if ``stored`` is untrusted and invalid."""
+        return stored.forests()
 
 
 @dataclass(frozen=True)
@@ -131,10 +128,6 @@ class Trees(TouchModelParams):
     def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
         """Add one forest per target and, in a tree-ensemble, one of all targets."""
         grasps.grow_forests(self, model)
-
-    def load_member(self, stored: StoredMember) -> Member:
-        """Return the forests of some targets."""
-        return stored.forests()
 
     @classmethod
     def report_names(cls, architecture: str, *, coloured: bool) -> list[str]:

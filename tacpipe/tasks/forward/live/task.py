@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Sensor
+    from tacpipe.sensors.sensor import Options, Sensor
     from tacpipe.tasks.forward.live.alarms import Alarms
     from tacpipe.tasks.forward.live.engine import CausalChain
     from tacpipe.tasks.forward.params import ForwardConfig
@@ -103,8 +103,8 @@ class ForwardLive(LiveTask):
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
         unit = str(config["inputs"].get("unit", "count"))
-        forecast: SettingValues = {"channels": config["inputs"]["tactile"], "steps": list(steps), "unit": unit}
-        streams: dict[str, SettingValues] = {
+        forecast: Options = {"channels": config["inputs"]["tactile"], "steps": list(steps), "unit": unit}
+        streams: dict[str, Options] = {
             FORECAST: {**forecast, **({"quantiles": list(levels)} if levels else {})},
             ALARM: {"alarms": list(NAMES)},
             "latency": {},

@@ -11,14 +11,13 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import ComparisonRow
 from tacpipe.comparison.runs import MODEL, Method
-from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics import calibration, intervals, pairing
-from tacpipe.metrics.calibration import Band
+from tacpipe.metrics.calibration import COVERAGE_FILE, Band
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, fold, interval, number, table
 from tacpipe.report.charts import Curve
-from tacpipe.report.context import Context
+from tacpipe.report.context import Context, band_fold, read_coverage
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE, PARTS, Parts
 from tacpipe.tasks.forward.report import methods
@@ -145,7 +144,7 @@ def skill_in_situation(method: Method, situation: str) -> dict[str, float] | Non
     }
 
 
-COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
+EXAMPLES = "bands.json"
 NAMES = {
     "model": "quantiles of the model",
     "model_unconditional": "model, one band for all moments",
@@ -160,7 +159,7 @@ EXPLAINED = (
 
 def band_folds(context: Context) -> list[Fold]:
     """Return how good quantiles are, of the results of calibrated models; nothing without any."""
-    runs = [run for run in context.runs if COVERAGE in run.details.dataset.files]
+    runs = [run for run in context.runs if COVERAGE_FILE in run.details.dataset.files]
     if not runs:
         return []
     levels = sorted({tuple(run.details.metrics.quantiles.description["levels"]) for run in runs})[0]
@@ -169,36 +168,29 @@ def band_folds(context: Context) -> list[Fold]:
     drawn: list[Chart] = []
     rows: list[Sequence[Any]] = []
     for method in methods:
-        read = _read_coverage([run for run in runs if run.method == method])
+        fresh = _fresh_rows([run for run in runs if run.method == method])
         for known_objects in (True, False):
-            part = read[read.known == known_objects]
+            part = fresh[fresh.known == known_objects]
             if len(part):
                 title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known_objects])))
                 bands = calibration.measure_bands(part, "step", "unit", BASELINE)
                 drawn.append(_coverage_chart(title, bands, level))
                 rows += _coverage_rows(title, bands)
     heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")
-    title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
-    return fold(
-        "Uncertainty",
-        Charts(drawn),
-        blocks.notes(EXPLAINED),
-        table(title, heads, rows),
-        *([Charts(_example_charts(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []),
-    )
+    examples = [Charts(_example_charts(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []
+    return band_fold(levels, drawn, EXPLAINED, heads, rows, *examples)
 
 
 Bands = Mapping[tuple[Any, str], Band]  # (step, predictor) -> band
 
 
-def _read_coverage(runs: Sequence[ComparedRun]) -> pd.DataFrame:
+def _fresh_rows(runs: Sequence[ComparedRun]) -> pd.DataFrame:
     """Return the sums of recordings that were not seen: one row per run, predictor, recording and step.
 
     The column ``unit`` is what intervals are over: recordings, and objects where these are unseen.
     """
-    import pandas as pd
-
-    read = pd.concat([from_parquet(run.details.dataset.files[COVERAGE]).to_pandas() for run in runs])
+    read = read_coverage([run.dataset for run in runs])
+    assert read is not None, "each run has a coverage file"
     read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
     fresh: pd.DataFrame = read[~read.seen]
     return fresh

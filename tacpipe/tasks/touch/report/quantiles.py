@@ -10,14 +10,14 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
-from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics import calibration
 from tacpipe.metrics.calibration import Band
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, number
 from tacpipe.report.charts import Dot
+from tacpipe.report.context import band_fold, read_coverage
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report import figures
 from tacpipe.tasks.touch.report.methods import FINGER_NAMES, describe_split, ordered_splits
 
@@ -41,7 +41,7 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
         len(ordered_splits([electrode_chart for method in methods for electrode_chart in method.details])) > 1
     )
     for method in methods:
-        coverage_rows = _read_coverage(method)
+        coverage_rows = read_coverage([run.dataset for run in method.runs])
         if coverage_rows is None:
             continue
         levels = method.details[0].config["quantiles"]["levels"]
@@ -50,7 +50,6 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
             (known_objects, coverage_rows[coverage_rows.known == known_objects]) for known_objects in (True, False)
         ]
         evaluated = [(known_objects, rows) for known_objects, rows in parts if len(rows)]
-        title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
         heads = (
             "",
             "values",
@@ -59,22 +58,17 @@ def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
             "pinball loss (counts)",
             "below the constant's (%)",
         )
-        folds += fold(
-            "Uncertainty",
-            Charts([_coverage_chart(rows, known_objects, level) for known_objects, rows in evaluated]),
-            blocks.notes(EXPLAINED),
-            table(
-                title, heads, [row for known_objects, rows in evaluated for row in _coverage_rows(rows, known_objects)]
-            ),
-            Charts(
-                [
-                    electrode_chart
-                    for known_objects, rows in evaluated
-                    if (electrode_chart := _electrode_chart(rows, known_objects, level))
-                ]
-            ),
+        electrode_charts = [_electrode_chart(rows, known_objects, level) for known_objects, rows in evaluated]
+        split = str(method.settings["split"]), bool(method.settings["simulated"])
+        folds += band_fold(
+            levels,
+            [_coverage_chart(rows, known_objects, level) for known_objects, rows in evaluated],
+            EXPLAINED,
+            heads,
+            [row for known_objects, rows in evaluated for row in _coverage_rows(rows, known_objects)],
+            Charts([chart for chart in electrode_charts if chart]),
             blocks.notes(ELECTRODES),
-            about=method.name + (f", {describe_split(*_split_of(method))}" if has_several_splits else ""),
+            about=method.name + (f", {describe_split(*split)}" if has_several_splits else ""),
         )
     return folds
 
@@ -89,19 +83,6 @@ def coverage_by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
     model_rows = rows[(rows.target == target) & (rows.predictor == MODEL)]
     coverage: AnyFloats = model_rows.groupby("value")["covered"].mean().sort_index().to_numpy(float)
     return coverage
-
-
-def _split_of(method: Method) -> tuple[str, bool]:
-    """Return the split of a method's grasps, and whether they were simulated."""
-    return str(method.settings["split"]), bool(method.settings["simulated"])
-
-
-def _read_coverage(method: Method) -> pd.DataFrame | None:
-    """Return one row per value, predictor, grasp and run of a method; None if none of its runs has a calibrated model."""
-    import pandas as pd
-
-    files = [result.dataset.files[COVERAGE] for result in method.details if COVERAGE in result.dataset.files]
-    return pd.concat([from_parquet(file).to_pandas() for file in files]) if files else None
 
 
 def _coverage_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart:
