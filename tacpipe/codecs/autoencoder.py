@@ -17,14 +17,6 @@ from safetensors.numpy import save as save_tensors
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.codecs import codec, measures
-from tacpipe.codecs.codec import (
-    DESCRIPTION,
-    TENSORS,
-    check_channels,
-    description,
-    encode_finite,
-    latent_names,
-)
 from tacpipe.datasets import model_files
 
 if TYPE_CHECKING:
@@ -51,16 +43,16 @@ class Autoencoder:
     @property
     def latents(self) -> tuple[str, ...]:
         """The names of the latents; their order has no meaning."""
-        return latent_names(len(self.encoder[-1][1]))
+        return codec.latent_names(len(self.encoder[-1][1]))
 
     def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
         """Return the latents (time, latent), float32, of counts above rest (time, channel).
 
         Raises `TacpipeError` unless ``channels`` are those of the fit, in the same order.
         """
-        check_channels(self.channels, channels)
+        codec.check_channels(self.channels, channels)
         inputs = codec.codec_inputs(values, begins, self.representation, self.frames)
-        return encode_finite(self.project, inputs, len(self.latents))
+        return codec.encode_finite(self.project, inputs, len(self.latents))
 
     def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent), float32, of finite rows (row, frames * channel), newest frame last."""
@@ -91,12 +83,12 @@ class Autoencoder:
             for index, (weight, bias) in enumerate(layers):
                 tensors[f"{part}.{index}.weight"] = np.ascontiguousarray(weight)
                 tensors[f"{part}.{index}.bias"] = np.ascontiguousarray(bias)
-        return {TENSORS: save_tensors(tensors), DESCRIPTION: description(content)}
+        return {codec.TENSORS: save_tensors(tensors), codec.DESCRIPTION: codec.description(content)}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Autoencoder:
         """Return the codec that `to_files` stored."""
-        content, tensors = json.loads(files[DESCRIPTION]), model_files.arrays(files[TENSORS], TENSORS)
+        content, tensors = json.loads(files[codec.DESCRIPTION]), model_files.arrays(files[codec.TENSORS], codec.TENSORS)
         encoder, decoder = (
             tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(content["layers"][part]))
             for part in ("encoder", "decoder")

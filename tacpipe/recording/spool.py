@@ -36,16 +36,6 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, sync_folder, write_whole
 from tacpipe.recording import spool_folders
-from tacpipe.recording.spool_folders import (
-    COMPLETED,
-    FOLDER,
-    INTERRUPTED,
-    RECOVERED,
-    ClockReading,
-    RecordingHeader,
-    SpoolHeader,
-    refuse_link,
-)
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
@@ -118,7 +108,7 @@ TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival in ns
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice if the disk is full
 
 
-def read_clocks() -> ClockReading:
+def read_clocks() -> spool_folders.ClockReading:
     """Return the time of the monotonic clock and of UTC at one instant, in ns. The quickest of five readings is used."""
     readings = []
     for _ in range(5):
@@ -131,15 +121,15 @@ def read_clocks() -> ClockReading:
 class Spool:
     """A spool that is being written. One thread appends; the threads that read links call `tally` for their streams."""
 
-    def __init__(self, store: Path, header: RecordingHeader, streams: Sequence[str]) -> None:
-        self.folder = store / FOLDER / uuid.uuid4().hex
+    def __init__(self, store: Path, header: spool_folders.RecordingHeader, streams: Sequence[str]) -> None:
+        self.folder = store / spool_folders.FOLDER / uuid.uuid4().hex
         self.streams = {name: number for number, name in enumerate(streams)}
         self.clock = read_clocks()
-        refuse_link(store)
+        spool_folders.refuse_link(store)
         with readable_errors(store):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             self.folder.mkdir(mode=0o700)
-            entry: SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
+            entry: spool_folders.SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # no other process recovers a locked spool
             self._tally = _tally(self.folder, len(streams))
@@ -253,7 +243,7 @@ class Spooled:
                 content = file.read(MAX_HEADER_BYTES + 1)
             if len(content) > MAX_HEADER_BYTES:
                 raise ValueError(f"it has more than {MAX_HEADER_BYTES:,} bytes")
-            self.header: SpoolHeader = json.loads(content)
+            self.header: spool_folders.SpoolHeader = json.loads(content)
             self.streams: list[str] = [str(name) for name in self.header["streams"]]
         except FileNotFoundError:
             raise TacpipeError(
@@ -271,7 +261,7 @@ class Spooled:
     def ended(self) -> str:
         """How the recording ended, from the notes that `blocks` has read. Without such a note it was recovered."""
         entry = next((note.detail for note in self._notes if note.what == ENDED), "")
-        return entry if entry in (COMPLETED, INTERRUPTED) else RECOVERED
+        return entry if entry in (spool_folders.COMPLETED, spool_folders.INTERRUPTED) else spool_folders.RECOVERED
 
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | StreamNote]]:
         """Yield the chunks and notes of one stream, or of all streams, in the order in which they were appended.

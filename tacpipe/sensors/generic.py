@@ -27,18 +27,6 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing, PacketFramer
-from tacpipe.sensors.layout import (
-    Board,
-    Clock,
-    DescribedSensor,
-    Length,
-    Number,
-    NumberSpan,
-    Order,
-    Sequence,
-    Sum,
-    device_ns,
-)
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -48,21 +36,21 @@ MAX_SIZE = 4096  # bytes of a frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generic(DescribedSensor):
+class Generic(layout.DescribedSensor):
     """A board whose binary frames the rig file describes."""
 
     summary: ClassVar[str] = "Custom boards with binary frames that the rig file describes."
     links: ClassVar[tuple[str, ...]] = ("serial", "tcp", "udp", "hid")
 
     rate_hz: float  # frames per second
-    numbers: tuple[Number, ...]  # the numbers between marker and tail, in order, without gaps
+    numbers: tuple[layout.Number, ...]  # the numbers between marker and tail, in order, without gaps
     marker: str = ""  # first bytes of each frame, in hexadecimal: "AA 55"
     tail: str = ""  # last bytes of each frame, in hexadecimal: "0D 0A"
-    order: Order = "little"  # byte order of numbers
-    sum: Sum | None = None  # the checksum of a frame, and the number that contains it
-    sequence: Sequence | None = None  # the number that counts the frames
-    clock: Clock | None = None  # the number that contains the device's time
-    length: Length | None = (
+    order: layout.Order = "little"  # byte order of numbers
+    sum: layout.Sum | None = None  # the checksum of a frame, and the number that contains it
+    sequence: layout.Sequence | None = None  # the number that counts the frames
+    clock: layout.Clock | None = None  # the number that contains the device's time
+    length: layout.Length | None = (
         None  # the number that contains the size of a frame; if absent, all frames have the same size
     )
     packets: bool = False  # each packet of the link is one frame (udp, hid), so no marker is needed
@@ -127,7 +115,7 @@ class Generic(DescribedSensor):
                 )
 
     @functools.cached_property
-    def _spans(self) -> dict[str, NumberSpan]:
+    def _spans(self) -> dict[str, layout.NumberSpan]:
         return layout.number_spans(self.numbers, len(_bytes("marker", self.marker)), self.order)
 
     @functools.cached_property
@@ -137,7 +125,7 @@ class Generic(DescribedSensor):
         return last + len(_bytes("tail", self.tail))
 
     @functools.cached_property
-    def _channels(self) -> list[NumberSpan]:
+    def _channels(self) -> list[layout.NumberSpan]:
         roles = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
         return [
             span
@@ -145,7 +133,7 @@ class Generic(DescribedSensor):
             if name not in roles and not span.number.skip and span.number.equals is None
         ]
 
-    def _counter_option(self) -> tuple[Sequence, int] | None:
+    def _counter_option(self) -> tuple[layout.Sequence, int] | None:
         return None if self.sequence is None else (self.sequence, self._spans[self.sequence.number].value_count)
 
     def fields(self) -> list[pa.Field]:
@@ -194,7 +182,7 @@ class Generic(DescribedSensor):
         if self.sum is not None:
             span = self._spans[self.sum.number]
             summed = layout.summed_bytes(self.sum, span, self.size)
-            moved = NumberSpan(span.number, span.start + extra, span.order)
+            moved = layout.NumberSpan(span.number, span.start + extra, span.order)
             stop = summed.stop + extra
             if moved.start < 0 or stop <= summed.start:
                 return np.zeros(len(frames), dtype=bool)
@@ -227,13 +215,13 @@ class Generic(DescribedSensor):
             seq = self._spans[self.sequence.number].read(frames)[:, 0].astype(np.int64)
         if self.clock is not None:
             ticks = self._spans[self.clock.number].read(frames)[:, 0]
-            t_device_ns = device_ns(ticks, self.clock.unit)
+            t_device_ns = layout.device_ns(ticks, self.clock.unit)
         return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
 
     @functools.cached_property
-    def _blocks(self) -> list[list[NumberSpan]]:
+    def _blocks(self) -> list[list[layout.NumberSpan]]:
         """Groups of adjacent channels of one type."""
-        blocks: list[list[NumberSpan]] = []
+        blocks: list[list[layout.NumberSpan]] = []
         for span in self._channels:
             if blocks and blocks[-1][0].dtype == span.dtype:
                 blocks[-1].append(span)
@@ -287,10 +275,10 @@ class Generic(DescribedSensor):
     def device(self) -> Device:
         """Return an emulated board that streams from the start, or between the commands ``start`` and ``stop``."""
         start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
-        return Board(streaming=not start, start=start, stop=stop)
+        return layout.Board(streaming=not start, start=start, stop=stop)
 
 
-def _names(number: Number) -> list[tuple[str, dict[str, str]]]:
+def _names(number: layout.Number) -> list[tuple[str, dict[str, str]]]:
     """Return (name, metadata) of each channel of a number."""
     metadata = {"unit": number.unit, "quantity": number.quantity}
     channels: list[tuple[str, dict[str, str]]] = []

@@ -29,17 +29,6 @@ from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import require_colours
 from tacpipe.tasks.touch.members import PointSampler, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.params import MemberDescription, Params, PointNetwork, TouchConfig, Trees
-from tacpipe.tasks.touch.predictor import (
-    BASELINES,
-    CONFIG,
-    FOREST,
-    HISTORY,
-    NETWORK,
-    SHRINKAGE,
-    TASK,
-    WEIGHTS,
-    Baselines,
-)
 from tacpipe.training import devices, loop
 from tacpipe.training.following import Line, NetworkLabels, history_bytes
 from tacpipe.training.scaling import Affine
@@ -106,20 +95,20 @@ def train(
     model = FittedModel(_config(params, targets, training_grasps, validation_grasps))
     params.fit(TrainingGrasps(training_grasps, validation_grasps, targets, workspace), model)
     config = model.config
-    files = {WEIGHTS: save_tensors(model.tensors)}
+    files = {predictor.WEIGHTS: save_tensors(model.tensors)}
     if model.history:
-        files[HISTORY] = history_bytes(model.history)
+        files[predictor.HISTORY] = history_bytes(model.history)
     if params.baselines:
         config["learned_objects"] = list(training_grasps.objects)
-        files[BASELINES] = save_arrays(Baselines.from_grasps(training_grasps).tensors())
-    return {CONFIG: model_files.to_json(config), **files}
+        files[predictor.BASELINES] = save_arrays(predictor.Baselines.from_grasps(training_grasps).tensors())
+    return {predictor.CONFIG: model_files.to_json(config), **files}
 
 
 def _config(params: Params, targets: Sequence[str], training: Grasps, validation: Grasps | None) -> TouchConfig:
     """Return the initial configuration of a model, before training."""
     stored = params_of.to_json(params)
     return {
-        "task": TASK,
+        "task": predictor.TASK,
         "architecture": stored["architecture"],
         "params": stored,
         "split": params.run_label,
@@ -151,7 +140,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
         groups.append(tuple(targets))
     forests, leaves = _fit_forests(params, rows, readings, groups)
     description: MemberDescription = {
-        "kind": FOREST,
+        "kind": predictor.FOREST,
         "targets": list(targets),
         "groups": [*map(list, groups)],
         "features": list(names),
@@ -175,7 +164,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
         shrunk = predictor.fit_shrinkage(readings, training.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
         model.tensors.update(
-            {f"{SHRINKAGE}{name}": torch.from_numpy(array) for name, array in shrunk.tensors().items()}
+            {f"{predictor.SHRINKAGE}{name}": torch.from_numpy(array) for name, array in shrunk.tensors().items()}
         )
 
 
@@ -239,7 +228,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
             )
             weights = trained.weights if params.select == "best" else trained.last
             parameters += _parameter_count(params, group)
-            description: MemberDescription = {"kind": NETWORK, "targets": list(group)}
+            description: MemberDescription = {"kind": predictor.NETWORK, "targets": list(group)}
             tensors = {f"network.{name}": value for name, value in weights.items()}
             tensors |= {
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
