@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import (
@@ -58,6 +58,11 @@ class Params:
     clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # maximum skew of a device's own clock
 
 
+def _rig_options(params: Params | MaterialParams | TouchParams | GelParams) -> dict[str, Any]:
+    """Return the params without the number of trials and the seed, which are the options of a rig."""
+    return {name: value for name, value in asdict(params).items() if name not in ("trials", "seed")}
+
+
 @stage(version=2)
 def forward(params: Params, trial: Trial) -> RecordingOutput:
     """Simulate grasp-lift-move trials, with ground truth.
@@ -68,10 +73,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
     """
     from tacpipe.simulation.pick_and_move import PickRig, simulate_trial
 
-    values = asdict(params)
-    del values["trials"]
-    seed = values.pop("seed")
-    return simulate_trial(seed, trial, PickRig(**values))
+    return simulate_trial(params.seed, trial, PickRig(**_rig_options(params)))
 
 
 @dataclass(frozen=True)
@@ -110,10 +112,7 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
     """
     from tacpipe.simulation.slide import SlideRig, simulate_trial
 
-    values = asdict(params)
-    del values["trials"]
-    seed = values.pop("seed")
-    return simulate_trial(seed, trial, SlideRig(**values))
+    return simulate_trial(params.seed, trial, SlideRig(**_rig_options(params)))
 
 
 @dataclass(frozen=True)
@@ -153,10 +152,7 @@ def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
     from tacpipe.simulation.grasp import simulate_trial
     from tacpipe.simulation.grasp_scene import GraspRig
 
-    values = asdict(params)
-    del values["trials"]
-    seed = values.pop("seed")
-    return simulate_trial(seed, trial, GraspRig(**values))
+    return simulate_trial(params.seed, trial, GraspRig(**_rig_options(params)))
 
 
 @dataclass(frozen=True)
@@ -189,7 +185,4 @@ def gel(params: GelParams, trial: Trial) -> RecordingOutput:
     """
     from tacpipe.simulation.gel import GelRig, simulate_trial
 
-    values = asdict(params)
-    del values["trials"]
-    seed = values.pop("seed")
-    return simulate_trial(seed, trial, GelRig(**values))
+    return simulate_trial(params.seed, trial, GelRig(**_rig_options(params)))

@@ -126,11 +126,8 @@ def _changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None
     previous = None if root is None else root.get("previous")
     if previous is None:
         return None
-    try:
-        before = manifest_of.stored(store, previous, "the manifest before")
-    except StorageError:
-        raise
-    except TacpipeError:
+    before = manifest_of.stored_or_none(store, previous)
+    if before is None:
         return ["the manifest of the run before is no longer in the store"]
     return changes(store, before, now)
 

@@ -13,7 +13,7 @@ from tacpipe.datasets import pages as pages_of
 from tacpipe.datasets import paths
 from tacpipe.datasets.pages import Item, ObjectReader, Page, PageJson, PageReader, Pages, StoredPages
 from tacpipe.datasets.paths import MANIFEST, shard_path
-from tacpipe.errors import DamagedError, UsageError
+from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import files as files_of
 from tacpipe.io import regular
 from tacpipe.io.files import read_error
@@ -346,6 +346,16 @@ def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[
 def stored(store: ObjectReader, name: str, source: str = "") -> Manifest:
     """Return the manifest with this digest from a store. Raises `MissingError`, and the errors of `parse`."""
     return parse(store.read(name, regular.JSON_BYTES), source or name, StoredPages(store), verified=True)
+
+
+def stored_or_none(store: ObjectReader, name: str) -> Manifest | None:
+    """Return the manifest with this digest, or None if it is missing or damaged. Raises `StorageError`."""
+    try:
+        return stored(store, name)
+    except StorageError:
+        raise
+    except TacpipeError:
+        return None
 
 
 def _inline_digest(manifest: Manifest) -> str:

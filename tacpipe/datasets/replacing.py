@@ -108,14 +108,7 @@ def occupant(store: Store, output: Path) -> Manifest | None:
 def former(store: Store, output: Path) -> Manifest | None:
     """Return the manifest that was last written at ``output``, whatever is there now, or None if the store has none."""
     root = store.roots.get(output.absolute())
-    try:
-        if root is not None:
-            return manifest_of.stored(store, root["manifest"], "the stored manifest")
-    except StorageError:
-        raise
-    except TacpipeError:
-        pass
-    return None
+    return None if root is None else manifest_of.stored_or_none(store, root["manifest"])
 
 
 def irreplaceable(manifest: Manifest) -> bool:
@@ -283,13 +276,8 @@ def returning_labels(
     names = [root["manifest"], *(version["manifest"] for version in root.get("history", []) if version["lasting"])]
     labels: dict[str, Mapping[str, Attribute]] = {}
     for name in names if before is None else [name for name in names if name != before.content_digest]:
-        try:
-            former_manifest = manifest_of.stored(store, name, "the stored manifest")
-        except StorageError:
-            raise
-        except TacpipeError:
-            continue
-        if former_manifest.stage == result.stage:
+        former_manifest = manifest_of.stored_or_none(store, name)
+        if former_manifest is not None and former_manifest.stage == result.stage:
             back = {
                 recording
                 for recording in coming & set(former_manifest.recordings)

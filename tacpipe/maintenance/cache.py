@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TypedDict
@@ -10,7 +11,7 @@ from typing import TypedDict
 from tacpipe import printable
 from tacpipe.datasets import manifest
 from tacpipe.engine import execution
-from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.errors import TacpipeError
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import garbage, pushed, remote_upkeep, repair
@@ -102,17 +103,15 @@ def repair_damaged(store: CachedStore) -> Soundness:
             store.bucket.quarantine(name)
         paths, directories = _local_objects(store)
         read = execution.reader(store, tuple(directories))
+
+        def restore(name: str) -> None:
+            read(name, paths.get(name, name[:12]))
+            store.send([name])
+
         absent, tried = {*damaged, *soundness.missing}, set[str]()
         while absent:
             for name in sorted(absent):
-                try:
-                    read(name, paths.get(name, name[:12]))
-                    store.send([name])
-                    soundness.repaired.append(name)
-                except StorageError as error:
-                    soundness.unread[name] = str(error)
-                except TacpipeError as error:
-                    soundness.lost[name] = str(error)
+                soundness.note_repair(name, functools.partial(restore, name))
             tried |= absent
             absent = remote_upkeep.missing(store.bucket) - tried  # restored manifests name more objects
         soundness.missing = []

@@ -14,7 +14,7 @@ from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import StoredPages
 from tacpipe.engine import execution
-from tacpipe.errors import StorageError, TacpipeError, UsageError
+from tacpipe.errors import StorageError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.maintenance import cache, copying, pushed, transfer
@@ -55,12 +55,9 @@ def list_manifests(store: AnyStore) -> list[Known]:
         versions: list[WrittenManifest] = [root, *root.get("history", [])]
         for entry in versions:
             name, path = entry["manifest"], str(root["path"])
-            try:
-                manifest = manifest_of.stored(store, name)
-            except StorageError:
-                raise
-            except TacpipeError:
-                continue  # collected or damaged
+            manifest = manifest_of.stored_or_none(store, name)
+            if manifest is None:  # collected or damaged
+                continue
             earlier = EARLIER if root["kind"] == PUSHED else REPLACED
             state = _state(root, name) if entry is root else earlier
             by_label[name, root_label] = Known(
@@ -148,15 +145,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
 
 def _is_manifest(store: AnyStore, name: str) -> bool:
     """Return whether ``name`` is the full digest of a manifest in the store."""
-    if not DIGEST.fullmatch(name) or not store.has(name):
-        return False
-    try:
-        manifest_of.stored(store, name)
-    except StorageError:
-        raise
-    except TacpipeError:
-        return False
-    return True
+    return bool(DIGEST.fullmatch(name)) and store.has(name) and manifest_of.stored_or_none(store, name) is not None
 
 
 def _manifest_digest(store: AnyStore, name: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
-from tacpipe.errors import StorageError, TacpipeError, UsageError
+from tacpipe.errors import UsageError
 from tacpipe.printable import listed
 from tacpipe.store.projects import Project
 from tacpipe.store.remote import RemoteStore
@@ -139,13 +139,8 @@ def refuse_newer(store: AnyStore, before: Root, seen_manifests: Collection[str |
 
 def lasting(store: AnyStore, manifest: str) -> bool:
     """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
-    try:
-        pushed_manifest = manifest_of.stored(store, manifest)
-    except StorageError:
-        raise
-    except TacpipeError:
-        return True
-    return replacing.lasting(pushed_manifest)
+    pushed_manifest = manifest_of.stored_or_none(store, manifest)
+    return pushed_manifest is None or replacing.lasting(pushed_manifest)
 
 
 def forget(store: AnyStore, requested: str, *, dry_run: bool = False) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import time
 import uuid
@@ -91,6 +92,16 @@ class Soundness:
         """Whether everything was read, and nothing is damaged or missing."""
         return not (self.damaged or self.missing or self.lost or self.unread)
 
+    def note_repair(self, name: str, repair: Callable[[], object]) -> None:
+        """Call ``repair`` for an object, and note that it was repaired, or the reason why not."""
+        try:
+            repair()
+            self.repaired.append(name)
+        except StorageError as error:
+            self.unread[name] = str(error)
+        except TacpipeError as error:
+            self.lost[name] = str(error)
+
     def to_text(self, *, changed: bool = True) -> str:
         """Return the findings as text. ``changed``: whether damaged files were moved to quarantine."""
         if not self.there:
@@ -167,13 +178,7 @@ def repair(store: Store) -> Soundness:
         paths_by_digest = _absent_objects(store, soundness)
         read = execution.reader(store, tuple(root["path"] for root in roots))
         for name, path in sorted(paths_by_digest.items()):
-            try:
-                read(name, path)
-                soundness.repaired.append(name)
-            except StorageError as error:
-                soundness.unread[name] = str(error)
-            except TacpipeError as error:
-                soundness.lost[name] = str(error)
+            soundness.note_repair(name, functools.partial(read, name, path))
         soundness.missing = []
     return soundness
 

@@ -85,14 +85,7 @@ class QuantileSums:
         uncertainty = self.forecaster.quantiles
         if uncertainty is None:
             return None
-        fresh = [trial for trial in trials if not trial.seen and trial.name in self.sums]
-        parts = {
-            "known": [trial for trial in fresh if trial.known],
-            "unseen": [trial for trial in fresh if not trial.known],
-        }
-        if not all(parts.values()):
-            parts = {}
-        parts["seen"] = [trial for trial in trials if trial.seen and trial.name in self.sums]
+        fresh, parts = metrics.divide([trial for trial in trials if trial.name in self.sums])
         described = self.forecaster.config["quantiles"]
         measures = {name: self._measures(part, uncertainty.percents) for name, part in parts.items() if part}
         return QuantileMetrics(described, self._measures(fresh, uncertainty.percents) if fresh else {}, measures)

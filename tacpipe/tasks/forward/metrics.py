@@ -116,6 +116,19 @@ def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     return groups
 
 
+def divide(trials: Sequence[Trial]) -> tuple[list[Trial], dict[str, list[Trial]]]:
+    """Return the recordings that the model has not seen, and the parts ``known``, ``unseen`` and ``seen`` of all.
+
+    Without recordings of both known and new objects, the only part is ``seen``.
+    """
+    fresh = [trial for trial in trials if not trial.seen]
+    by_object = {
+        "known": [trial for trial in fresh if trial.known],
+        "unseen": [trial for trial in fresh if not trial.known],
+    }
+    return fresh, {**(by_object if all(by_object.values()) else {}), "seen": [trial for trial in trials if trial.seen]}
+
+
 def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardMetrics:
     """Return the metrics of all predictors.
 
@@ -123,14 +136,7 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     seen are in ``fresh``, and those that it has seen in ``seen``. If there are recordings of both known and new
     objects, ``known`` and ``unseen`` contain the two subsets of ``fresh``.
     """
-    fresh = [trial for trial in trials if not trial.seen]
-    parts = {
-        "known": [trial for trial in fresh if trial.known],
-        "unseen": [trial for trial in fresh if not trial.known],
-    }
-    if not all(parts.values()):
-        parts = {}
-    parts["seen"] = [trial for trial in trials if trial.seen]
+    fresh, parts = divide(trials)
     return ForwardMetrics(
         _scores(fresh, groups, horizon, channel_scale),
         {name: _scores(part, groups, horizon, channel_scale) for name, part in parts.items() if part},
