@@ -38,11 +38,11 @@ class Params:
     live: bool = added(False)
 
 
-def _as_given(params: Params) -> bool:
+def _is_live(params: Params) -> bool:
     return params.live
 
 
-@stage(version=7, headline=headline.FILE, as_given=_as_given)
+@stage(version=7, headline=headline.FILE, as_given=_is_live)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings with the metrics of its task."""
     from tacpipe.datasets import model_files

@@ -74,7 +74,7 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
             )
         return _stream(columns, _difference_fields(params), _differences(columns, video_format, params))
 
-    return _with_channels(recording, compute)
+    return _replace_frames(recording, compute)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
         return _stream(columns, _marker_fields(params), _displacements(place, columns, video_format, params))
 
-    return _with_channels(recording, compute)
+    return _replace_frames(recording, compute)
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fit
     from tacpipe.codecs import frame_autoencoder
 
     encode = frame_autoencoder.read_encoder(codec[frame_autoencoder.WEIGHTS])
-    return _with_channels(
+    return _replace_frames(
         recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
     )
 
@@ -203,12 +203,12 @@ def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
     if not params.weights:
         raise UsageError("weights names no file. Give the file with the weights of the encoder.")
     encode = registry.load_encoder(params.encoder)(Path(params.weights))
-    return _with_channels(
+    return _replace_frames(
         recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
     )
 
 
-def _with_channels(
+def _replace_frames(
     recording: Recording, compute: Callable[[str, Columns, VideoFormat], pa.RecordBatchReader]
 ) -> RecordingOutput:
     """Return a recording with its streams of frames replaced by ``compute``, whose first argument is the name for errors."""
@@ -220,7 +220,7 @@ def _with_channels(
         columns = recording.columns(name)
         video_format = read_format(columns)
         if video_format is None:
-            streams[name] = _copied(columns)
+            streams[name] = _copy_stream(columns)
         else:
             has_frames = True
             streams[name] = compute(f"Recording {recording.name}, stream {name}", columns, video_format)
@@ -232,7 +232,7 @@ def _with_channels(
     return RecordingOutput(streams)
 
 
-def _copied(columns: Columns) -> pa.RecordBatchReader:
+def _copy_stream(columns: Columns) -> pa.RecordBatchReader:
     """Return an unchanged stream as batches."""
     import pyarrow as pa
 
@@ -393,7 +393,7 @@ def _difference_fields(params: Params) -> list[pa.Field]:
         pa.field(
             f"taxel{row:02d}{column:02d}_{colour}",
             pa.float32(),
-            metadata={"unit": "count", **_place(row, column, params.columns), "component": colour},
+            metadata={"unit": "count", **_cell_metadata(row, column, params.columns), "component": colour},
         )
         for row in range(1, params.rows + 1)
         for column in range(1, params.columns + 1)
@@ -410,7 +410,7 @@ def _marker_fields(params: MarkerParams) -> list[pa.Field]:
         pa.field(
             f"taxel{row:02d}{column:02d}_{axis}",
             pa.float32(),
-            metadata={"unit": unit, **_place(row, column, params.columns), "axis": axis},
+            metadata={"unit": unit, **_cell_metadata(row, column, params.columns), "axis": axis},
         )
         for row in range(1, params.rows + 1)
         for column in range(1, params.columns + 1)
@@ -419,6 +419,6 @@ def _marker_fields(params: MarkerParams) -> list[pa.Field]:
     return [*displacements, pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})]
 
 
-def _place(row: int, column: int, columns: int) -> dict[str, str]:
+def _cell_metadata(row: int, column: int, columns: int) -> dict[str, str]:
     """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
     return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}

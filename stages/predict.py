@@ -42,11 +42,11 @@ class Params:
     probabilities: bool = added(False)
 
 
-def _as_given(params: Params) -> bool:
+def _is_causal(params: Params) -> bool:
     return params.causal
 
 
-@stage(version=1, as_given=_as_given)
+@stage(version=1, as_given=_is_causal)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     """Return each recording's predictions, with the time at which each was available."""
     from tacpipe.datasets import model_files
@@ -58,11 +58,11 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     if params.causal:
         return _predict_causally(task, model, recordings, request)
     with model_files.validated("the model"):
-        _refuse_unstated(task, request)
+        _require_uncertainty(task, request)
         return task.predict(model, recordings, request)
 
 
-def _refuse_unstated(task: Task, request: PredictionRequest) -> None:
+def _require_uncertainty(task: Task, request: PredictionRequest) -> None:
     """Raise `UsageError` for a kind of uncertainty that the task's models do not provide."""
     from tacpipe.errors import UsageError
 

@@ -119,7 +119,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         if stream in fixed:
             limits.append(Thresholds(params.on_count, params.off_count))
         else:
-            limits.append(_with_given_levels(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
+            limits.append(_fixed_thresholds(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
         zero = tare_level(params.tare, next(blocks()), level, axes)
         rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
     stacked = np.array(loads)  # (sensor, time)
@@ -160,7 +160,7 @@ def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Co
         )
 
 
-def _with_given_levels(params: Params, thresholds: Thresholds) -> Thresholds:
+def _fixed_thresholds(params: Params, thresholds: Thresholds) -> Thresholds:
     """Return the thresholds of a stream that is not in counts: those in the params, or otherwise ``thresholds``."""
     from tacpipe.signals.contact import OFF_FRACTION
 

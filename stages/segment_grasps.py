@@ -97,14 +97,14 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
             colours = None if scene.colours is None else scene.colours[rows]
             streams["cloud"] = Cloud(scene.points_m[rows], colours).table()
         if "biotac_sp" in streams:
-            reading["reading"], attributes["contact_ns"] = _reading(params, streams.pop("biotac_sp"))
+            reading["reading"], attributes["contact_ns"] = _reading_at_touch(params, streams.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     output_streams = {name: table for name, table in streams.items() if table.num_rows == 1 or name == "cloud"}
     return RecordingOutput({**output_streams, **reading}, attributes)
 
 
-def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
+def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     """Return the reading after both fingers closed, as one row, and the time when both first touched."""
     import numpy as np
 

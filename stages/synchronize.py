@@ -131,7 +131,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
             stream, wrapped = streams.unwrap_counts(stream, storage.put_aside)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
         gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
-        columns += _on_grid(params, stream, grid_ns, exact, gap_ns, storage.put_aside)
+        columns += _stream_on_grid(params, stream, grid_ns, exact, gap_ns, storage.put_aside)
         if not stream.truth:
             if not hold_values:
                 ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
@@ -159,7 +159,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput(result, attributes, masks.describe_gaps(pa.table(gaps)))
 
 
-def _on_grid(
+def _stream_on_grid(
     params: Params, stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
 ) -> list[tuple[pa.Field, Any]]:
     """Return fields and values of a stream's channels on the grid, and of its masks; ground truth has no masks."""

@@ -222,7 +222,7 @@ def test_a_footer_declares_the_same_whether_its_usual_forms_are_matched_or_each_
     schema = pq.ParquetFile(io.BytesIO(content)).schema
     matched = parquet_claims.Claims(schema, content).count(content)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parquet_claims, "_usual", lambda *_: None)
+        patch.setattr(parquet_claims, "_read_common_form", lambda *_: None)
         patch.setattr(parquet_claims, "_USUAL", re.compile(rb"(?!)"))
         assert parquet_claims.Claims(schema, content).count(content) == matched
 

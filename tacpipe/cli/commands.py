@@ -315,7 +315,7 @@ def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_j
         if as_json:
             terminal.result_json({**value, "recordings": sorted(changes), "labels": changes})
         else:
-            terminal.result(_described(current, changes, len(current), unmatched))
+            terminal.result(_describe_changes(current, changes, len(current), unmatched))
         return
     changed = labels.change_each(dataset, labels_for) if changes else None
     if unmatched:
@@ -327,7 +327,7 @@ def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_j
     terminal.result(dataset if changed is None else changed.directory)
 
 
-def _described(
+def _describe_changes(
     current: Mapping[str, Mapping[str, Attribute]],
     changes: Mapping[str, Mapping[str, Attribute]],
     count: int,
@@ -336,7 +336,10 @@ def _described(
     """Return one line per recording whose labels would change, and a line with the number of recordings."""
     lines = [
         f"{plain(name)}: "
-        + ", ".join(f"{plain(key)} {_shown(current[name].get(key))} → {_shown(value)}" for key, value in labels.items())
+        + ", ".join(
+            f"{plain(key)} {_format_value(current[name].get(key))} → {_format_value(value)}"
+            for key, value in labels.items()
+        )
         for name, labels in sorted(changes.items())[:SHOWN]
     ]
     lines += [f"… and {len(changes) - SHOWN} more"] if len(changes) > SHOWN else []
@@ -344,5 +347,5 @@ def _described(
     return "\n".join([*lines, f"{len(changes)} of {count} recordings would change"])
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return "none" if value is None else excerpt(value)

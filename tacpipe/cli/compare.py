@@ -93,7 +93,7 @@ class Compared:
         all_rows = list(rows)
         names = dict.fromkeys(name for row in all_rows for name in row.differing)
         columns = {name: [_text(row.differing.get(name, "")) for row in all_rows] for name in names}
-        columns["data"] = [_listed(self._data(run.dataset) for run in row.method.runs) for row in all_rows]
+        columns["data"] = [_join_values(self._data(run.dataset) for run in row.method.runs) for row in all_rows]
         if not self.pooled:
             columns["result"] = [_below(self.paths(row)[0], list(self.results)) for row in all_rows]
         return {name: cells for name, cells in columns.items() if len(set(cells)) > 1}
@@ -245,7 +245,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     for path, result in results.items():
         if METRICS not in result.files:
             raise UsageError(f"{path} was made by {result.source.stage}; give results of `tacpipe evaluate`.")
-    compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
+    compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _paths_by_digest(paths))
     if not compared.comparisons:
         raise UsageError(
             "These results do not hold the errors of single recordings. Run `tacpipe evaluate` again, or give "
@@ -279,7 +279,7 @@ def _style(row: engine.ComparisonRow) -> str:
     return {headline.BETTER: "green", headline.WORSE: "red"}.get(row.gain.verdict, "")
 
 
-def _places(results: Sequence[Path]) -> dict[str, str]:
+def _paths_by_digest(results: Sequence[Path]) -> dict[str, str]:
     """Return the paths of the store's datasets by manifest digest, relative to the working directory."""
     paths = {str(root["manifest"]): Path(root["path"]) for root in locate(*results).roots.all()}
     here = Path.cwd()
@@ -301,7 +301,7 @@ def _below(path: str, paths: Sequence[str]) -> str:
     return str(Path(path).relative_to(common)) if len(paths) > 1 else path
 
 
-def _listed(values: Iterable[str]) -> str:
+def _join_values(values: Iterable[str]) -> str:
     unique = sorted(set(values))
     return ", ".join(unique) if len(unique) <= _LISTED else f"{len(unique)} datasets"
 

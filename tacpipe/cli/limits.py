@@ -121,11 +121,11 @@ def _bounds(low: float, high: float) -> str:
 def _cell(estimate: Estimate) -> str:
     if math.isnan(estimate.mean):
         return "-"
-    bounds = "" if math.isnan(estimate.low) else f" ({_fixed(estimate.low)} to {_fixed(estimate.high)})"
-    return _fixed(estimate.mean) + bounds
+    bounds = "" if math.isnan(estimate.low) else f" ({_format_fixed(estimate.low)} to {_format_fixed(estimate.high)})"
+    return _format_fixed(estimate.mean) + bounds
 
 
-def _fixed(value: float) -> str:
+def _format_fixed(value: float) -> str:
     return f"{value:.2f}"
 
 

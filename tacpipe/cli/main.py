@@ -107,7 +107,7 @@ def main() -> None:
         terminal.prepare()
         memory.guard()
         termination.install_handlers()
-        code = _printed(answer(sys.argv[1:]))
+        code = _flush_output(answer(sys.argv[1:]))
     except KeyboardInterrupt:  # Interrupted before the command started or after it ended
         termination.report()
     except (MemoryError, RuntimeError) as error:  # Raised before a command was selected, or outside of all commands
@@ -119,7 +119,7 @@ def main() -> None:
     sys.exit(termination.finish(code))
 
 
-def _printed(code: int) -> int:
+def _flush_output(code: int) -> int:
     """Flush the output of a command and return its exit code, or `FAILED` if the output could not be written."""
     failure = terminal.unprinted()
     if failure is None or code != DONE:

@@ -99,7 +99,7 @@ def of_model(opened: Dataset, store: Store) -> ModelOverview:
     """Return the overview of a model: task, architecture, training data, params and validation."""
     config, history = _tree(opened, CONFIG), _history(opened)
     return {
-        **_learned(config),
+        **_describe_config(config),
         "parameters": config.get("parameters") or _parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
@@ -124,7 +124,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
         },
         "fold": None if identity is None else identity.get("fold"),
         "role": ((identity and identity.get("role")) or "test") if "split" in opened.source.inputs else None,
-        "trained_on": _learned(config)["trained_on"],
+        "trained_on": _describe_config(config)["trained_on"],
         "params": params_of.with_current_names(f"train.{config.get('task')}", config.get("params", {})),
         "inputs": _inputs(opened.source.inputs, store),
     }
@@ -136,7 +136,7 @@ def model_text(value: ModelOverview) -> list[str]:
         ("task", value["task"]),
         ("architecture", value["architecture"]),
         ("parameters", f"{value['parameters']:,}" if value["parameters"] else None),
-        *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
+        *(("trained on" if not at else "", text) for at, text in enumerate(_describe_training(value["trained_on"]))),
         ("epochs", value["epochs"]),
         ("validation", flat(value["validation"]) if value["validation"] else None),
         *value["about"].items(),
@@ -144,7 +144,7 @@ def model_text(value: ModelOverview) -> list[str]:
         ("behind", ", then ".join(value["chain"]) or None),
         *_input_rows(value["inputs"]),
     ]
-    return [_summary(value), "", *_aligned(described)]
+    return [_summary(value), "", *_align_columns(described)]
 
 
 def _summary(value: ModelOverview) -> str:
@@ -174,10 +174,10 @@ def result_text(value: ResultOverview) -> list[str]:
         ("role", f"{value['role']}{fold}" if value["role"] else None),
         ("baselines", ", ".join(value["baselines"]) or None),
         ("params", flat(value["params"]) if value["params"] else None),
-        *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
+        *(("trained on" if not at else "", text) for at, text in enumerate(_describe_training(value["trained_on"]))),
         *_input_rows(value["inputs"]),
     ]
-    return [*lines, "", *_aligned(described)]
+    return [*lines, "", *_align_columns(described)]
 
 
 def flat(value: Any) -> str:
@@ -210,7 +210,7 @@ def _architecture(config: Values) -> ModelOrigin:
     return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
 
 
-def _learned(config: Values) -> ModelDescription:
+def _describe_config(config: Values) -> ModelDescription:
     """Return the task, architecture, training data and other short entries of a configuration."""
     trained = config.get("trained_on")
     return {
@@ -223,12 +223,12 @@ def _learned(config: Values) -> ModelDescription:
         "about": {
             name.replace("_", " "): described
             for name, entry in config.items()
-            if name not in _APART and (described := _short(entry)) is not None
+            if name not in _APART and (described := _short_text(entry)) is not None
         },
     }
 
 
-def _short(value: Any) -> str | None:
+def _short_text(value: Any) -> str | None:
     """Return a configuration entry as short text, or None if it is empty or long."""
     if isinstance(value, Mapping):
         if all(not isinstance(item, Mapping | list) for item in value.values()) and len(value) <= SHOWN:
@@ -244,7 +244,7 @@ def _short(value: Any) -> str | None:
     return flat(value) if value not in (None, "") else None
 
 
-def _trained(trained: TrainingCounts) -> list[str]:
+def _describe_training(trained: TrainingCounts) -> list[str]:
     lines = [
         f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
         for role, counts in trained["roles"].items()
@@ -306,20 +306,22 @@ def _parameters(opened: Dataset) -> int | None:
     return count or None
 
 
-def _aligned(described: list[tuple[str, Any]]) -> list[str]:
+def _align_columns(described: list[tuple[str, Any]]) -> list[str]:
     """Return names and values in two aligned columns, with long values wrapped and values of None omitted."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0) + 2
     room = max(terminal.width_of(sys.stdout) - width, 20)
     return [
-        f"{'' if at else name:<{width}}{line}" for name, value in shown for at, line in enumerate(_wrapped(value, room))
+        f"{'' if at else name:<{width}}{line}"
+        for name, value in shown
+        for at, line in enumerate(_wrap_at_commas(value, room))
     ]
 
 
-def _wrapped(text: str, width: int) -> list[str]:
+def _wrap_at_commas(text: str, width: int) -> list[str]:
     """Return text wrapped after commas.
 
-    >>> _wrapped("epochs 2, learning rate 0.002, seed 0", 20)
+    >>> _wrap_at_commas("epochs 2, learning rate 0.002, seed 0", 20)
     ['epochs 2,', 'learning rate 0.002,', 'seed 0']
     """
     unbroken = text.replace(" ", "\0").replace(",\0", ", ")
@@ -337,10 +339,10 @@ def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
     """
     names = [f"{name} {_size(size)}" for name, size in files.items()]
     if full or len(names) <= FILES + 1:
-        return _aligned([("files", ", ".join(names))])
+        return _align_columns([("files", ", ".join(names))])
     total = _size(sum(files.values()))
     text = f"{len(names)}, together {total}: {', '.join(names[:FILES])} and {len(names) - FILES} more"
-    return _aligned([("files", f"{text} (--full)")])
+    return _align_columns([("files", f"{text} (--full)")])
 
 
 def _size(count: int) -> str:

@@ -81,7 +81,7 @@ def _run(chain: Chain, *, quiet: bool) -> int:
     became: dict[str, Became] = {}
     first = DONE
     for stage in chain.stages:
-        outcome = _without_running(stage, chain, became)
+        outcome = _skip_outcome(stage, chain, became)
         if outcome is not None:
             became[stage.name] = outcome
             continue
@@ -97,7 +97,7 @@ def _run(chain: Chain, *, quiet: bool) -> int:
     return first
 
 
-def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
+def _skip_outcome(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
     """Return the outcome of a stage that must not run, because a dependency failed or it is frozen; otherwise None."""
     missing = sorted(name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED))
     if missing:
@@ -128,7 +128,7 @@ class _Together:
         while self._waiting or self._processes.busy:
             while self._processes.free and (stage := next(self._ready_stages(), None)) is not None:
                 self._waiting.remove(stage)
-                outcome = _without_running(stage, self._chain, self.became)
+                outcome = _skip_outcome(stage, self._chain, self.became)
                 if outcome is None:
                     self._announce(f"{stage.name}:")
                     self._advance(stage, list(stage.commands), Became.UNCHANGED)
@@ -147,7 +147,7 @@ class _Together:
         while commands:
             command = commands.pop(0)
             words = _words(command)
-            if words is not None and _answered(words[1:]):
+            if words is not None and _report_if_current(words[1:]):
                 continue
             self._announce(f"{stage.name} begins: {command}")
             self._at_work[stage.name] = stage, commands
@@ -193,7 +193,7 @@ def _stage(stage: ChainStage) -> tuple[Became, int]:
     became = Became.UNCHANGED
     for command in stage.commands:
         words = _words(command)
-        if words is not None and _answered(words[1:]):
+        if words is not None and _report_if_current(words[1:]):
             continue
         became = Became.RAN
         code = _process(command if words is None else [*PROGRAM, *words[1:]])
@@ -221,7 +221,7 @@ def _words(command: str) -> list[str] | None:
     return expanded
 
 
-def _answered(arguments: Sequence[str]) -> bool:
+def _report_if_current(arguments: Sequence[str]) -> bool:
     """Return whether a command was up to date, in which case its report was printed.
 
     The command's own process reports any other outcome.

@@ -172,11 +172,17 @@ def _stanza(report: Report) -> list[str]:
         f'name = "{candidate.kind.replace("-", "_")}"',
         f'sensor = "{candidate.kind}"',
         f'transport = "{report.address}"',
-        *(_described(options, notes) if notes else [f"options = {config_text.toml_value(options)}"] if options else []),
+        *(
+            _format_options(options, notes)
+            if notes
+            else [f"options = {config_text.toml_value(options)}"]
+            if options
+            else []
+        ),
     ]
 
 
-def _described(options: Options, notes: Mapping[str, str]) -> list[str]:
+def _format_options(options: Options, notes: Mapping[str, str]) -> list[str]:
     """Return options with their notes as a TOML table, one per line; lists of tables span several lines."""
     lines = ["", "[stream.options]"]
     for name, value in options.items():

@@ -113,7 +113,7 @@ def of(path: Path, *, most: int | None = None) -> Shown:
         "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
         if most is None
         else RecordingAttributes(opened),
-        "excluded": _excluded(opened),
+        "excluded": _exclusion_reasons(opened),
     }
 
 
@@ -143,7 +143,7 @@ def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
     return folds
 
 
-def _excluded(opened: Dataset) -> dict[str, str]:
+def _exclusion_reasons(opened: Dataset) -> dict[str, str]:
     return {name: str(reason) for name, reason in opened.source.excluded.items()}
 
 

@@ -236,7 +236,7 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
     tactile = [field.name for field in columns.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
     integers = [name for name in tactile if pa.types.is_integer(columns.schema.field(name).type)]
     if integers and columns.num_rows > 1:
-        figures["held_share"], figures["saturated"] = _repeated_and_saturated(columns, integers)
+        figures["held_share"], figures["saturated"] = _count_repeats_and_limits(columns, integers)
     return figures
 
 
@@ -255,7 +255,7 @@ def gaps_text(figures: StreamFigures) -> str:
     return f"{figures['gaps']:,}" if "gaps" in figures else ""
 
 
-def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
+def _count_repeats_and_limits(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
     """Return the fraction of rows that repeat the previous row, and the number of values at a limit of their type.
 
     Only the first `SAMPLED_ROWS` rows are read. A missing value does not count as repeated.

@@ -25,7 +25,7 @@ EXAMPLE = "Example: "  # Start of the last paragraph of a stage's docstring
 
 def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
     """Return the parameters of a stage's command; ``fields`` are the fields of its params by name."""
-    return [*_arguments(stage), *_shared(stage), *_options(stage, fields), *_looks(stage)]
+    return [*_arguments(stage), *_shared_parameters(stage), *_options(stage, fields), *_looks(stage)]
 
 
 def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
@@ -41,7 +41,7 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     return [_parameter(name, kind, typer.Argument(default, help=text)) for name, kind, text in arguments]
 
 
-def _shared(stage: AnyStage) -> list[inspect.Parameter]:
+def _shared_parameters(stage: AnyStage) -> list[inspect.Parameter]:
     output = typer.Option(None, "-o", "--output", help="Directory to write.", rich_help_panel=REQUIRED)
     parameters = [_parameter("output", Path | None, output)]
     if stage.reads_split:

@@ -93,7 +93,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         block=options["block"],
         preset=options["preset"],
         sets=options["set_"] or (),
-        options={field: _parsed(options[field], params_of.fields(stage)[field]) for field in param_names},
+        options={field: _parse_option(options[field], params_of.fields(stage)[field]) for field in param_names},
     )
     if options["print_params"]:
         terminal.result(json.dumps(params_of.to_input(params), indent=1))
@@ -208,7 +208,7 @@ def _params_file(options: dict[str, Any]) -> Path | None:
     return default if options["block"] is not None or default.exists() else None
 
 
-def _parsed(value: Any, annotation: Any) -> Any:
+def _parse_option(value: Any, annotation: Any) -> Any:
     """Return an option's value, converted to its annotation if possible."""
     if isinstance(value, list):
         return [fields_of.parsed(text, get_args(fields_of.bare(annotation))[0]) for text in value]

@@ -283,7 +283,7 @@ def push(
     from tacpipe.maintenance import transfer
 
     transferred = transfer.push(remote, datasets, ancestors=ancestors, verify=verify, replace=replace, project=project)
-    _print(asdict(transferred), as_json=as_json, text=_moved("pushed", transferred))
+    _print(asdict(transferred), as_json=as_json, text=_describe_transfer("pushed", transferred))
 
 
 def pull(
@@ -303,10 +303,10 @@ def pull(
     from tacpipe.maintenance import transfer
 
     transferred = transfer.pull(remote, datasets, ancestors=ancestors, replace=replace)
-    _print(asdict(transferred), as_json=as_json, text=_moved("pulled", transferred))
+    _print(asdict(transferred), as_json=as_json, text=_describe_transfer("pulled", transferred))
 
 
-def _moved(verb: str, transferred: Any) -> str:
+def _describe_transfer(verb: str, transferred: Any) -> str:
     names = plain(", ".join(transferred.datasets), 1000)
     text = (
         f"{verb} {names}: {transferred.objects} objects ({transferred.bytes / 1e6:.1f} MB); "

@@ -33,7 +33,7 @@ def of_parts() -> Versions:
         library = re.match(r"[\w.-]+", requirement)
         if name in ("all", "dev", "docs", "fuzz") or library is None:
             continue
-        parts.setdefault(name, {})[library.group()] = _installed(library.group())
+        parts.setdefault(name, {})[library.group()] = _installed_version(library.group())
     return {
         "schema_version": SCHEMA_VERSION,
         "tacpipe": metadata.version("tacpipe"),
@@ -52,7 +52,7 @@ def to_text(versions: Versions) -> str:
     return "\n".join(lines)
 
 
-def _installed(name: str) -> str | None:
+def _installed_version(name: str) -> str | None:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

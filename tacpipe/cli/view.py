@@ -65,7 +65,7 @@ def view(
     """Show recordings on one time axis."""
     _require(save, web=web, port=port)
     extras.require("tacpipe view", "rerun", "rerun_cli")
-    chosen = _chosen(dataset, recording or [], where or [], split, role, fold)
+    chosen = _select_recordings(dataset, recording or [], where or [], split, role, fold)
     recordings = list(chosen)[:limit]
     if save is not None and len(recordings) > 1 and save.suffix.lower() == ENDING:
         raise UsageError(
@@ -77,15 +77,15 @@ def view(
     with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.explain_missing("tacpipe view"):
         from tacpipe.viewer import session
 
-        drawn = _drawn(recordings, _predictions(predictions))
+        drawn = _collect_contents(recordings, _predictions(predictions))
         files = session.write(drawn, Path(folder), str(dataset), with_list=len(recordings) > 1, all_rows=all_rows)
         if save is not None:
             _save(files, save)
             terminal.result(save)
         elif web:
-            _in_browser(files, port)
+            _show_in_browser(files, port)
         else:
-            _in_window(files)
+            _show_in_window(files)
 
 
 def _require(save: Path | None, *, web: bool, port: int | None) -> None:
@@ -121,7 +121,7 @@ def conditions(where: Sequence[str]) -> dict[str, Attribute]:
     return conditions_by_name
 
 
-def _chosen(
+def _select_recordings(
     path: Path, names: Sequence[str], label_texts: Sequence[str], split: Path | None, role: str | None, fold: int
 ) -> Dataset:
     import tacpipe
@@ -133,7 +133,7 @@ def _chosen(
     return opened.select(*names, split=split, role=role, fold=fold, labels=required_labels)
 
 
-def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[DrawnContents]:
+def _collect_contents(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[DrawnContents]:
     """Yield the contents of each recording. Raises `UsageError` for a recording with nothing to draw."""
     from tacpipe.viewer import contents
 
@@ -187,7 +187,7 @@ def _save(files: Sequence[Path], save: Path) -> None:
             write_whole(str(place), file.read_bytes(), f"{place}.draft")
 
 
-def _in_window(files: Sequence[Path]) -> None:
+def _show_in_window(files: Sequence[Path]) -> None:
     from tacpipe.viewer import session
 
     terminal.note("The viewer is open; close it or press Ctrl-C to end.")
@@ -199,7 +199,7 @@ def _in_window(files: Sequence[Path]) -> None:
         )
 
 
-def _in_browser(files: Sequence[Path], port: int | None) -> None:
+def _show_in_browser(files: Sequence[Path], port: int | None) -> None:
     import time
     import webbrowser
 

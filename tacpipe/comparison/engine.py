@@ -145,12 +145,14 @@ def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]
     """Return one comparison per question and unit of its errors, with questions in the order of the runs."""
     questions = questions_of([run for method in methods for run in method.runs])
     answers = [
-        compare_on(task, alike, question) for question in questions for alike in _by_unit(methods, question).values()
+        compare_on(task, alike, question)
+        for question in questions
+        for alike in _group_by_unit(methods, question).values()
     ]
     return [comparison for comparison in answers if comparison.rows]
 
 
-def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Method]]:
+def _group_by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Method]]:
     """Return the methods with a run on a question by error unit, because errors in different units cannot be compared."""
     methods_by_unit: dict[str, list[Method]] = {}
     for method in methods:
@@ -195,7 +197,7 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
                 entries.append((name, kind, predictor, evaluated_method))
             elif evaluated_method is sources[predictor]:
                 entries.append((task.predictor_name(predictor), kind, predictor, evaluated_method))
-    ranked = [_ranked(task, method, source, question, predictor) for _, _, predictor, method in entries]
+    ranked = [_rank_baselines(task, method, source, question, predictor) for _, _, predictor, method in entries]
     picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
               if kind == "model" and pairs]  # fmt: skip
     rows = [_row(*entry, question, measure, pairs, picked) for entry, pairs in zip(entries, ranked, strict=True)]
@@ -226,7 +228,7 @@ def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
     rivals = (
         [row_of_model for row_of_model in comparison.models if row_of_model is not row] if row.kind == "model" else []
     )
-    ranked = [_ranked(task, rival.method, source, question, rival.predictor) for rival in rivals]
+    ranked = [_rank_baselines(task, rival.method, source, question, rival.predictor) for rival in rivals]
     return pairing.headline(
         comparison.task,
         row.name,
@@ -248,7 +250,9 @@ def difference(first: Method, second: Method, question: Question, predictors: tu
     return pairing.difference(measure, first_sums, second_sums, _clusters(first, question))
 
 
-def _ranked(task: TaskReport, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
+def _rank_baselines(
+    task: TaskReport, method: Method, source: Method, question: Question, predictor: str
+) -> dict[str, Pair]:
     """Return a predictor of a method paired with each baseline, the best baseline first.
 
     Empty for other kinds of predictors.

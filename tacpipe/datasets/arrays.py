@@ -72,7 +72,7 @@ class Arrays:
         rows = max(map(len, self.by_column.values()), default=0)
         values = np.empty((rows, len(channels)), common)  # (time, channel)
         for index, (name, array) in enumerate(channels.items()):
-            if common.kind == "f" and array.dtype.kind in "iu" and _beyond(array):
+            if common.kind == "f" and array.dtype.kind in "iu" and _exceeds_exact_range(array):
                 raise UsageError(
                     f"The channel {name} ({array.dtype}) holds integers beyond 2^53, which {common} would round, so "
                     f"there is no one matrix of these channels. Read it separately: arrays[{name!r}] has its own type."
@@ -140,7 +140,7 @@ def _array(column: pa.ChunkedArray) -> AnyArray:
     return masked
 
 
-def _beyond(array: AnyArray) -> bool:
+def _exceeds_exact_range(array: AnyArray) -> bool:
     values = np.ma.getdata(array)
     return values.dtype.itemsize == 8 and bool(((values > EXACT) | (values < -EXACT)).any())
 

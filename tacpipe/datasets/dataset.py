@@ -117,7 +117,7 @@ class Recording:
         stored = self.columns() if self.streams == ("",) else None
         names_by_stream = {} if stored is None else stored_columns(stored.schema)
         if stored is None or stream not in names_by_stream:
-            raise self._without(stream, [name for name in names_by_stream if name])
+            raise self._missing_stream_error(stream, [name for name in names_by_stream if name])
         names = names_by_stream[stream]
         if columns is not None:
             names = {name: names[name] for name in columns}
@@ -139,13 +139,13 @@ class Recording:
     def _content(self, stream: str) -> bytes | Path:
         """Return the verified bytes of a stream, or the path of a large one in the store, which need not fit in memory."""
         if stream not in self._shards:
-            raise self._without(stream, [])
+            raise self._missing_stream_error(stream, [])
         name, path = self._shards[stream]["digest"], shard_path(self.name, stream)
         large_file = getattr(self._read, "large_file", None)
         file: Path | None = large_file and large_file(name, path, LARGE_BYTES)
         return file or self._read(name, path)
 
-    def _without(self, stream: str, columns_of_streams: Sequence[str]) -> UsageError:
+    def _missing_stream_error(self, stream: str, columns_of_streams: Sequence[str]) -> UsageError:
         if self.streams == ("",) and not columns_of_streams:
             return UsageError(f"Recording {self.name} has no stream {stream!r}; it is one table.")
         existing = ", ".join(map(repr, columns_of_streams or self.streams))
@@ -206,7 +206,7 @@ class Dataset:
         """Return the recording with this name. Raises `UsageError` if there is none."""
         if name not in self.recordings:
             raise UsageError(
-                f"There is no recording {name!r} in {self._place}; it has {listed(self.recordings, _NAMED)}."
+                f"There is no recording {name!r} in {self._location}; it has {listed(self.recordings, _NAMED)}."
                 f"{suggestion(name, self.recordings)}"
             )
         return self.recordings[name]
@@ -232,7 +232,7 @@ class Dataset:
         return overview.html(self)
 
     @property
-    def _place(self) -> str:
+    def _location(self) -> str:
         return "this dataset" if self.path is None else str(self.path)
 
     @property

@@ -116,24 +116,24 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     ):  # files of an export are large copies, so correct ones are kept
         stale = dict(_stale(store, manifest, directory))
     if not current and relabelled:
-        stale, removed = _pages_compared(_current_manifest(directory), manifest, directory)
+        stale, removed = _compare_pages(_current_manifest(directory), manifest, directory)
     elif not current:  # existing files are kept, so a new recording costs only itself
         before = _current_manifest(directory)
-        unlike, removed = _compared(before, manifest, directory, is_complete=planned.is_complete)
+        unlike, removed = _compare_files(before, manifest, directory, is_complete=planned.is_complete)
         if before is None:  # its pages have other names than those of the previous manifest
-            removed |= _pages_compared(replacing.former(store, directory), manifest, directory)[1]
+            removed |= _compare_pages(replacing.former(store, directory), manifest, directory)[1]
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *removed})
     edited = []
     if manifest.exported or planned.replace:  # nothing else replaces an export
-        edited = _edited(store, manifest, directory, {*stale, *removed})
+        edited = _edited_files(store, manifest, directory, {*stale, *removed})
     if edited and not planned.replace:
         raise replacing.edited(directory, edited)
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
         lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
         if edited:
-            _keep_edited(store, manifest, directory, edited)
+            _store_edited_export(store, manifest, directory, edited)
             before, lasting = None, True
         if before is not None and lasting:
             _adopt(store, directory, before)
@@ -165,11 +165,11 @@ def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]
     """Return the edited files in ``directory`` that the export ``manifest`` would replace."""
     directory = directory.absolute()
     stale = dict(_stale(store, manifest, directory))
-    _, removed = _compared(_current_manifest(directory), manifest, directory, is_complete=False)
-    return _edited(store, manifest, directory, {*stale, *removed})
+    _, removed = _compare_files(_current_manifest(directory), manifest, directory, is_complete=False)
+    return _edited_files(store, manifest, directory, {*stale, *removed})
 
 
-def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
+def _edited_files(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
     """Return the files of an export that match neither what was last written there nor an object of the store."""
     current = _current_manifest(directory)
     if not (current or manifest).exported:  # shards are links, so a difference is damage
@@ -180,7 +180,7 @@ def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[s
     return [path for path, name in digests.items() if name != digests_written.get(path) and not store.has(name)]
 
 
-def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> None:
+def _store_edited_export(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> None:
     """Store the edited export as the dataset that was last written in ``directory``."""
     files = {}
     for path in paths:
@@ -255,7 +255,7 @@ def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[
     return (item for item in manifest.objects() if not _matches(f"{directory}/{item[0]}", store, item[1]))
 
 
-def _compared(
+def _compare_files(
     current: Manifest | None, manifest: Manifest, directory: Path, *, is_complete: bool
 ) -> tuple[dict[str, str], set[str]]:
     """Return path and digest of the files to place in ``directory``, and the paths to remove.
@@ -263,7 +263,7 @@ def _compared(
     Placed are files that are missing or have another size, and those that differ from ``current``, its current
     manifest. If all files of ``current`` exist (``is_complete``), pages in both manifests are skipped.
     """
-    stale, removed = _pages_compared(current, manifest, directory)
+    stale, removed = _compare_pages(current, manifest, directory)
     files = {} if current is None else current.files
     manifests = {} if current is None else current.recordings, manifest.recordings
     for name, before, now in pages.compared(*(pages.differing(*manifests) if is_complete else manifests)):
@@ -271,26 +271,26 @@ def _compared(
         removed.update(shard_path(name, stream) for stream in old if stream not in new)
         for stream, shard in new.items():
             path = shard_path(name, stream)
-            if not (_same(old.get(stream), shard) and _lies(directory, path, shard["bytes"])):
+            if not (_has_same_digest(old.get(stream), shard) and _is_in_place(directory, path, shard["bytes"])):
                 stale[path] = shard["digest"]
     removed.update(path for path in files if path not in manifest.files)
     for path, file in manifest.files.items():
-        if not (_same(files.get(path), file) and _lies(directory, path, file["bytes"])):
+        if not (_has_same_digest(files.get(path), file) and _is_in_place(directory, path, file["bytes"])):
             stale[path] = file["digest"]
     return stale, {path for path in removed if manifest.at(path) is None}
 
 
-def _pages_compared(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
-    """Return the result of `_compared` for the pages of a manifest only."""
+def _compare_pages(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
+    """Return the result of `_compare_files` for the pages of a manifest only."""
     before, now = (
         {} if side is None or side.pages is None else {page.path: page for page in side.pages.pages}
         for side in (current, manifest)
     )
-    lies = {path for path, page in now.items() if path in before and _lies(directory, path, page.bytes)}
+    lies = {path for path, page in now.items() if path in before and _is_in_place(directory, path, page.bytes)}
     return {path: page.digest for path, page in now.items() if path not in lies}, before.keys() - now.keys()
 
 
-def _same(before: Content | None, now: Content) -> bool:
+def _has_same_digest(before: Content | None, now: Content) -> bool:
     return before is not None and before["digest"] == now["digest"]
 
 
@@ -400,7 +400,7 @@ def _current(directory: Path, manifest: Manifest) -> bool:
         return False
 
 
-def _lies(directory: Path, path: str, size: int) -> bool:
+def _is_in_place(directory: Path, path: str, size: int) -> bool:
     """Return whether a path of a dataset is a regular file of this size."""
     try:
         status = os.lstat(f"{directory}/{path}")

@@ -145,16 +145,16 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
         for name in sorted({*old, *new})
         if old.get(name) != new.get(name)
     ]
-    lines += _compared("sources", *pages.differing(before.sources, now.sources))
+    lines += _compare_groups("sources", *pages.differing(before.sources, now.sources))
     for argument in sorted({*before.inputs, *now.inputs}):
         lines += _input_changes(store, argument, before.inputs.get(argument, []), now.inputs.get(argument, []))
-    lines += _compared("labels", *pages.differing(before.labels, now.labels))
-    if not lines and before.digest != now.digest and not _alike(before, now):
+    lines += _compare_groups("labels", *pages.differing(before.labels, now.labels))
+    if not lines and before.digest != now.digest and not _has_equal_content(before, now):
         lines.append("result: the same key gave other bytes")
     return lines
 
 
-def _alike(before: Manifest, now: Manifest) -> bool:
+def _has_equal_content(before: Manifest, now: Manifest) -> bool:
     """Return whether a manifest with pages and one without have the same content."""
     if (before.pages is None) == (now.pages is None) or len(before.recordings) != len(now.recordings):
         return False
@@ -176,11 +176,11 @@ def _input_changes(
         raise
     except TacpipeError:
         return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
-    lines = _recordings_compared(f"inputs.{argument}", *(_merged_recordings(manifests) for manifests in (old, new)))
+    lines = _compare_recordings(f"inputs.{argument}", *(_merged_recordings(manifests) for manifests in (old, new)))
     files = (
         {name: file for manifest in manifests for name, file in manifest.files.items()} for manifests in (old, new)
     )
-    return [*lines, *_compared(f"inputs.{argument}.files", *files)]
+    return [*lines, *_compare_groups(f"inputs.{argument}.files", *files)]
 
 
 def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, RecordingEntry]:
@@ -189,7 +189,7 @@ def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, RecordingE
     return {name: entry for manifest in manifests for name, entry in manifest.recordings.items()}
 
 
-def _recordings_compared(
+def _compare_recordings(
     subject: str, before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> list[str]:
     """Describe which recordings of two datasets differ; recordings in shared pages are equal."""
@@ -204,21 +204,21 @@ def _recordings_compared(
         shards += [name] if old["shards"] != entry["shards"] else []
         attributes += [name] if old["attributes"] != entry["attributes"] else []
     return [
-        *_counted(f"{subject}.shards", {"new": new, "gone": removed, "other": shards}),
-        *_counted(f"{subject}.attributes", {"other": attributes}),
+        *_count_groups(f"{subject}.shards", {"new": new, "gone": removed, "other": shards}),
+        *_count_groups(f"{subject}.attributes", {"other": attributes}),
     ]
 
 
-def _compared(subject: str, before: Mapping[str, V], now: Mapping[str, V]) -> list[str]:
+def _compare_groups(subject: str, before: Mapping[str, V], now: Mapping[str, V]) -> list[str]:
     groups = {
         "new": sorted(set(now) - set(before)),
         "gone": sorted(set(before) - set(now)),
         "other": sorted(name for name in set(before) & set(now) if before[name] != now[name]),
     }
-    return _counted(subject, groups)
+    return _count_groups(subject, groups)
 
 
-def _counted(subject: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
+def _count_groups(subject: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"{subject}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
 
 
@@ -237,7 +237,7 @@ def to_text(tree: LineageNode) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
-def _nested(value: Any) -> StoredParams | None:
+def _nested_params(value: Any) -> StoredParams | None:
     """Return a param with parts, such as a layout, which is stored as JSON, or None for a plain value."""
     if isinstance(value, str) and value.startswith("{"):
         try:
@@ -260,7 +260,7 @@ def _leaves(params: StoredParams) -> StoredParams:
     """
     leaves: dict[str, ParamValue] = {}
     for name, value in params.items():
-        parts = _nested(value) or {str(place): row for place, row in enumerate(_rows(value))}
+        parts = _nested_params(value) or {str(place): row for place, row in enumerate(_rows(value))}
         leaves |= {f"{name}.{part}": leaf for part, leaf in _leaves(parts).items()} if parts else {name: value}
     return leaves
 
@@ -307,7 +307,7 @@ def _lines(node: LineageNode | LostNode, depth: int, described: set[str], argume
         if node["recordings"]
         else _files(node)
     )
-    nested = {name: tree for name, value in node["params"].items() if (tree := _nested(value)) is not None}
+    nested = {name: tree for name, value in node["params"].items() if (tree := _nested_params(value)) is not None}
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items() if name not in nested)
     lines = [
         f"{place}  {content}",

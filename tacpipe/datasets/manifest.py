@@ -104,10 +104,10 @@ class Manifest:
         values = {name: getattr(self, name) for name in self.__dataclass_fields__} | {"digest": self.digest}
         if self.pages is None:
             inline = {name: dict(values[name]) for name in _PER_RECORDING}
-            return (_indented({**values, **inline, "format": FORMAT}) + "\n").encode()
+            return (_indent_json({**values, **inline, "format": FORMAT}) + "\n").encode()
         lines = ",\n".join(f"  {json.dumps(page.to_json(), sort_keys=True)}" for page in self.pages.pages)
         shared_values = {name: value for name, value in values.items() if name not in _PER_RECORDING}
-        head, empty, tail = _indented({**shared_values, "format": PAGED_FORMAT, "pages": []}).partition(
+        head, empty, tail = _indent_json({**shared_values, "format": PAGED_FORMAT, "pages": []}).partition(
             '\n "pages": []'
         )
         assert empty
@@ -172,9 +172,9 @@ class Manifest:
             )
         return replace(
             self,
-            recordings=_changed(self.recordings, {name: item and item.entry for name, item in items.items()}),
-            sources=_changed(self.sources, {name: item and item.sources for name, item in items.items()}),
-            labels=_changed(self.labels, {name: item and item.labels for name, item in items.items()}),
+            recordings=_apply_changes(self.recordings, {name: item and item.entry for name, item in items.items()}),
+            sources=_apply_changes(self.sources, {name: item and item.sources for name, item in items.items()}),
+            labels=_apply_changes(self.labels, {name: item and item.labels for name, item in items.items()}),
         )
 
     def item(self, name: str) -> Item:
@@ -269,7 +269,7 @@ class Manifest:
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
 
-def _changed(before: Mapping[str, V], changes: Mapping[str, V | None]) -> dict[str, V]:
+def _apply_changes(before: Mapping[str, V], changes: Mapping[str, V | None]) -> dict[str, V]:
     """Return values by name, sorted by name, with some added or replaced; None removes one."""
     return {name: value for name, value in sorted({**before, **changes}.items()) if value is not None}
 
@@ -279,7 +279,7 @@ def _same_pages(view: Mapping[str, Mapping[str, Attribute]], pages: Pages, count
     return getattr(view, "pages", None) is pages or (not view and not pages.total(count))
 
 
-def _indented(value: StoredParams) -> str:
+def _indent_json(value: StoredParams) -> str:
     return json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 

@@ -82,7 +82,7 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     if not isinstance(content, dict):
         raise TacpipeError(f"{name} holds {excerpt(content)}; it must be a mapping. Copy the model again.")
     for path, kind in (needed or {}).items():
-        _require(name, path, _at(content, path), kind)
+        _require(name, path, _value_at(content, path), kind)
     return content
 
 
@@ -165,7 +165,7 @@ def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
         )
 
 
-def _at(value: Any, path: str) -> Any:
+def _value_at(value: Any, path: str) -> Any:
     for part in path.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     return value

@@ -65,11 +65,11 @@ def stored_columns(schema: pa.Schema) -> dict[str, dict[str, str]]:
         signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
         if signal:
             stream = metadata.get(b"stream", b"").decode()
-            columns.setdefault(stream, {"t_ns": "t_ns"})[_recorded(field.name, stream)] = field.name
+            columns.setdefault(stream, {"t_ns": "t_ns"})[_recorded_name(field.name, stream)] = field.name
     return columns
 
 
-def _recorded(name: str, stream: str) -> str:
+def _recorded_name(name: str, stream: str) -> str:
     return name.removeprefix(f"{stream}_") if stream else name
 
 

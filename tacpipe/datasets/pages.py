@@ -229,10 +229,10 @@ class StoredPages:
         return copy
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _pages_at, (None if self._store is None else self._store.place, self._directory)
+        return _stored_pages, (None if self._store is None else self._store.place, self._directory)
 
 
-def _pages_at(place: str | None, directory: Path | None) -> StoredPages:
+def _stored_pages(place: str | None, directory: Path | None) -> StoredPages:
     return StoredPages(None if place is None else opened(place), directory)
 
 
@@ -540,7 +540,7 @@ def compared(
     before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> Iterator[tuple[str, RecordingEntry | None, RecordingEntry | None]]:
     """Yield name, old entry and new entry of all recordings of two datasets, sorted by name."""
-    before_items, now_items = (iter(_in_order(recordings)) for recordings in (before, now))
+    before_items, now_items = (iter(_sorted_entries(recordings)) for recordings in (before, now))
     old, new = next(before_items, None), next(now_items, None)
     while old is not None or new is not None:
         if new is None or (old is not None and old[0] < new[0]):
@@ -555,7 +555,7 @@ def compared(
             old, new = next(before_items, None), next(now_items, None)
 
 
-def _in_order(recordings: Mapping[str, RecordingEntry]) -> Iterator[tuple[str, RecordingEntry]]:
+def _sorted_entries(recordings: Mapping[str, RecordingEntry]) -> Iterator[tuple[str, RecordingEntry]]:
     return ((name, entry) for part in parts(recordings) for name, entry in sorted(part.items()))
 
 

@@ -61,13 +61,13 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     files.local(output)
     layout.refuse_within(output)
     for path in inputs:
-        if _same(output, path.parent if path.name == manifest_of.NAME else path):
+        if _is_same_path(output, path.parent if path.name == manifest_of.NAME else path):
             raise UsageError(
                 f"{output} is an input of this command, and writing there would replace it. Give -o another directory."
             )
 
 
-def _same(output: Path, path: Path) -> bool:
+def _is_same_path(output: Path, path: Path) -> bool:
     return output.resolve() == path.resolve()
 
 
@@ -173,7 +173,7 @@ def refuse_plan(before: Manifest | None, output: Path, plan: ResultPlan) -> None
     if before is None:
         return
     if before.stage != plan.stage:
-        raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
+        raise UsageError(f"{output} holds {_describe_dataset(before)}; {plan.stage} would replace it. {_KEEP}")
     sources = {name: (_raw(before.sources.get(name, source)), _raw(source)) for name, source in plan.sources.items()}
     changed = [name for name, (earlier, now) in sources.items() if earlier != now]
     hint = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
@@ -310,7 +310,7 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
     return manifest
 
 
-def _described(manifest: Manifest) -> str:
+def _describe_dataset(manifest: Manifest) -> str:
     count = len(manifest.recordings)
     recordings = f"{count} recording{'s' if count != 1 else ''}" if count else "files"
     labels = f" with labels set by hand on {len(manifest.labels)}" if manifest.labels else ""

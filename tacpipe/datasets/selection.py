@@ -94,7 +94,7 @@ def select_names(
                 f"No recording has the role {role or 'of any kind'} in this split; its roles are {existing}."
             )
     for label, condition in labels.items():
-        names = _labelled(dataset, names, label, condition)
+        names = _select_by_label(dataset, names, label, condition)
     return names
 
 
@@ -106,7 +106,7 @@ def unknown_label(dataset: Dataset, label: str) -> UsageError:
     )
 
 
-def _labelled(dataset: Dataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
+def _select_by_label(dataset: Dataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
     values = {name: dataset[name].attributes[label] for name in names if label in dataset[name].attributes}
     if not values:
         raise unknown_label(dataset, label)

@@ -82,9 +82,9 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     _check(attributes, scheme)
     fresh = sorted(set(attributes).difference(name for name, _ in keep))
     if scheme.name == "random":
-        folds = [_drawn(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
+        folds = [_draw_roles(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
     elif scheme.name == "blocked":
-        folds = [_blocked(fresh, attributes, scheme)]
+        folds = [_assign_blocks(fresh, attributes, scheme)]
     elif scheme.name == "authors":
         folds = _authors(fresh, attributes, scheme)
     elif scheme.name == "kfold":
@@ -170,13 +170,15 @@ def _check_options(scheme: Scheme) -> None:
         raise TacpipeError(f"few_of is {scheme.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
 
 
-def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+def _draw_roles(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int
+) -> dict[str, str]:
     """Return roles with the fractions of the scheme, with the values of ``stratify`` spread evenly over them."""
     order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
-    return _in_turn(order, scheme, ("test", "val", "calibration", "train"))
+    return _assign_in_order(order, scheme, ("test", "val", "calibration", "train"))
 
 
-def _in_turn(order: Sequence[str], scheme: Scheme, roles: Sequence[str]) -> dict[str, str]:
+def _assign_in_order(order: Sequence[str], scheme: Scheme, roles: Sequence[str]) -> dict[str, str]:
     """Return the role of each recording: the first recordings in ``order`` have the first role, and so on."""
     shares = {"val": scheme.val, "calibration": scheme.calibration, "test": scheme.test}
     counts = {role: round(share * len(order)) for role, share in shares.items()}
@@ -212,7 +214,7 @@ def _limit_training(
         groups.setdefault(_value(name, attributes, scheme.few_by) if scheme.few_by else "", []).append(name)
     unused: Roles = {}
     for fold in sorted({fold for _, fold in roles}):
-        for group in _ordered(set(groups)):
+        for group in _sort_naturally(set(groups)):
             trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
             fresh = [name for name in trained if (name, fold) not in older_roles]
             room = max(scheme.few - (len(trained) - len(fresh)), 0)
@@ -221,16 +223,18 @@ def _limit_training(
     return unused
 
 
-def _val_of(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+def _draw_validation(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int
+) -> dict[str, str]:
     """Return roles of recordings that are not tested: the shares ``val`` and ``calibration`` of them, the rest train."""
-    return _drawn(names, attributes, replace(scheme, test=0), draw)
+    return _draw_roles(names, attributes, replace(scheme, test=0), draw)
 
 
-def _blocked(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+def _assign_blocks(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
     roles: dict[str, str] = {}
     for stratum in _strata(names, attributes, scheme).values():
         order = stratum[::-1] if scheme.reverse else stratum
-        roles |= _in_turn(order, scheme, ("train", "calibration", "val", "test"))
+        roles |= _assign_in_order(order, scheme, ("train", "calibration", "val", "test"))
     return roles
 
 
@@ -249,7 +253,7 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
             )
         roles[name] = str(role)
     scheme = replace(scheme, val=0) if "val" in roles.values() else scheme
-    return [roles | _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)]
+    return [roles | _draw_validation([name for name in names if roles[name] == "train"], attributes, scheme, 0)]
 
 
 def _authors_folds(
@@ -269,10 +273,12 @@ def _authors_folds(
         turn = [name for name in names if name not in fixed and part[name] == fold]
         remaining = [name for name in names if name not in fixed and part[name] != fold]
         if published:
-            trained = _val_of(remaining, attributes, replace(scheme, val=0), fold + 1)
+            trained = _draw_validation(remaining, attributes, replace(scheme, val=0), fold + 1)
             folds.append(fixed | trained | dict.fromkeys(turn, "val"))
         else:
-            folds.append(fixed | _val_of(remaining, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
+            folds.append(
+                fixed | _draw_validation(remaining, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test")
+            )
     return folds
 
 
@@ -295,7 +301,7 @@ def _kfold(
     folds = []
     for fold in range(scheme.folds):
         tested = {name for name in names if fold in (part[name], unknown.get(name))}
-        roles = _val_of([name for name in names if name not in tested], attributes, scheme, fold + 1)
+        roles = _draw_validation([name for name in names if name not in tested], attributes, scheme, fold + 1)
         folds.append(roles | dict.fromkeys(tested, "test"))
     return folds
 
@@ -316,7 +322,7 @@ def _unknown(
     Values are shuffled, and each is assigned to the fold with the fewest; values of an older split keep their fold.
     """
     values = {name: _value(name, attributes, scheme.apart) for name in sorted(attributes)}
-    distinct = _ordered(set(values.values()))
+    distinct = _sort_naturally(set(values.values()))
     if len(distinct) < scheme.folds:
         raise TacpipeError(
             f"{len(distinct)} values of {scheme.apart} cannot be kept apart in {scheme.folds} folds, because a fold "
@@ -356,12 +362,12 @@ def _leave_one_out(
     values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
     old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
     left_out = [old[fold] for fold in sorted(old)]
-    left_out += [value for value in _ordered(set(values.values())) if value not in left_out]
+    left_out += [value for value in _sort_naturally(set(values.values())) if value not in left_out]
     if len(left_out) < 2:
         raise TacpipeError(f"All recordings have {scheme.by} {left_out[0]}; leaving it out leaves none to train on.")
     folds = []
     for fold, value in enumerate(left_out):
-        roles = _val_of([name for name in values if values[name] != value], attributes, scheme, fold + 1)
+        roles = _draw_validation([name for name in values if values[name] != value], attributes, scheme, fold + 1)
         folds.append(roles | {name: "test" for name in values if values[name] == value})
     return folds
 
@@ -388,7 +394,10 @@ def _strata(
     strata: dict[tuple[str, ...], list[str]] = {}
     for name in sorted(names):
         strata.setdefault(tuple(_value(name, attributes, attribute) for attribute in stratified), []).append(name)
-    return {values: strata[values] for values in sorted(strata, key=lambda values: [_place(value) for value in values])}
+    return {
+        values: strata[values]
+        for values in sorted(strata, key=lambda values: [_natural_key(value) for value in values])
+    }
 
 
 def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
@@ -402,10 +411,10 @@ def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> s
     return str(value)
 
 
-def _ordered(values: set[str]) -> list[str]:
+def _sort_naturally(values: set[str]) -> list[str]:
     """Sort text, with integers by value: 4, 10, bottle."""
-    return sorted(values, key=_place)
+    return sorted(values, key=_natural_key)
 
 
-def _place(value: str) -> tuple[int, int, str]:
+def _natural_key(value: str) -> tuple[int, int, str]:
     return (0, int(value), "") if value.isdecimal() else (1, 0, value)

@@ -244,13 +244,13 @@ class Windows(torch.utils.data.Dataset[Window]):
         return self._ends
 
     def _rows(self, name: str) -> _RecordingRows:
-        rows = self._cache.pop(name, None) or self._decoded(self.dataset[name])
+        rows = self._cache.pop(name, None) or self._decode_recording(self.dataset[name])
         self._cache[name] = rows  # moves it to the end as the most recently used
         while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
             self._cache.popitem(last=False)
         return rows
 
-    def _decoded(self, recording: Recording) -> _RecordingRows:
+    def _decode_recording(self, recording: Recording) -> _RecordingRows:
         table = recording.table(self.stream)
         t_ns = streams.times(table)
         read = arrays.arrays_of_table(table)

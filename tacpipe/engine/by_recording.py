@@ -80,10 +80,10 @@ class ByRecording:
                 continue
             group_entries = group.entries()
             pending = _RecordingGroup(keys.of_group(step, stage, group_entries), group_entries)
-            group_results = None if self.request.compare or self._reruns(name) else self._of_group(pending)
+            group_results = None if self.request.compare or self._reruns(name) else self._group_entries(pending)
             if group_results is None:
                 tasks = keys.shard_tasks(self.store, replace(source, recordings=group_entries), step, dataset_dirs)
-                group_records, lacking = self._stored(name, tasks)
+                group_records, lacking = self._find_stored(name, tasks)
                 if lacking:
                     stored |= group_records
                     missing += lacking
@@ -91,7 +91,7 @@ class ByRecording:
                     continue
                 group_results = self._remember_group(name, pending, group_records)
             answered.append(answer(_after(group_results, group_entries)))
-        computed = self._computed(name, missing, stored, len(entries))
+        computed = self._compute_missing(name, missing, stored, len(entries))
 
         def parts() -> Iterator[Answer]:
             for answer_or_pending in answered:
@@ -108,7 +108,7 @@ class ByRecording:
             return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
         return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
 
-    def _of_group(self, group: _RecordingGroup) -> Mapping[str, RecordingEntry] | None:
+    def _group_entries(self, group: _RecordingGroup) -> Mapping[str, RecordingEntry] | None:
         """Return the entries in a group's record, or None if there is no record or an object is missing."""
         record = self.store.record(digest(group.identity))
         if record is None or not records.complete(self.store, record):
@@ -136,10 +136,12 @@ class ByRecording:
 
     def _records(self, name: str, tasks: Sequence[WorkerTask]) -> dict[str, ComputedResult]:
         """Return the record of each task, by recording."""
-        stored, missing = self._stored(name, tasks)
-        return self._computed(name, missing, stored, len(tasks))
+        stored, missing = self._find_stored(name, tasks)
+        return self._compute_missing(name, missing, stored, len(tasks))
 
-    def _stored(self, name: str, tasks: Sequence[WorkerTask]) -> tuple[dict[str, ComputedResult], list[WorkerTask]]:
+    def _find_stored(
+        self, name: str, tasks: Sequence[WorkerTask]
+    ) -> tuple[dict[str, ComputedResult], list[WorkerTask]]:
         """Return the stored records by recording, and the tasks that must be computed."""
         stored: dict[str, ComputedResult] = {}
         missing: list[WorkerTask] = []
@@ -157,7 +159,7 @@ class ByRecording:
         self.outcome.reused += len(tasks) - len(missing)
         return stored, missing
 
-    def _computed(
+    def _compute_missing(
         self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, ComputedResult], count: int
     ) -> dict[str, ComputedResult]:
         """Compute the ``missing`` tasks and return their records with the ``stored`` ones; ``count`` is the total."""

@@ -41,7 +41,7 @@ def fill_template(value: Any, values: Values, place: str) -> Any:
     single = _FIELD.fullmatch(value)
     if single is not None:
         return _value(single["name"], values, place)
-    text = _FIELD.sub(lambda match: _as_text(match["name"], values, place), value)
+    text = _FIELD.sub(lambda match: _value_text(match["name"], values, place), value)
     return text.replace(r"\${", "${")
 
 
@@ -84,7 +84,7 @@ def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Values]]:
         yield "-".join(parts), {axis: item for axis, (_, item) in choice.items()}
 
 
-def _as_text(name: str, values: Values, place: str) -> str:
+def _value_text(name: str, values: Values, place: str) -> str:
     value = _value(name, values, place)
     if isinstance(value, Mapping | list):
         raise UsageError(f"{place}: ${{{name}}} is {excerpt(value)}, which `tacpipe run` does not put into a text.")
@@ -182,7 +182,7 @@ def load(file: Path, names: Sequence[str] = ()) -> Chain:
         ordered = list(TopologicalSorter(after).static_order())
     except CycleError as error:
         raise UsageError(f"{file}: these stages depend on each other: {' -> '.join(error.args[1])}.") from None
-    needed = _needed(by_name, after, names, file)
+    needed = _needed_stages(by_name, after, names, file)
     return Chain([by_name[name] for name in ordered if name in needed], after)
 
 
@@ -284,13 +284,13 @@ def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> V
             entry = _mapping(file.with_name(entry))
         if not isinstance(entry, Mapping):
             raise UsageError(f"{place}: vars has {excerpt(entry)}; `tacpipe run` reads mappings and YAML files there.")
-        values = _merged(values, entry)
+        values = _merge_values(values, entry)
     return values
 
 
-def _merged(before: Values, over: Values) -> Values:
+def _merge_values(before: Values, over: Values) -> Values:
     merged = {
-        key: _merged(before[key], value)
+        key: _merge_values(before[key], value)
         if isinstance(value, Mapping) and isinstance(before.get(key), Mapping)
         else value
         for key, value in over.items()
@@ -347,7 +347,7 @@ def _above(path: str) -> Iterator[str]:
         path = folder
 
 
-def _needed(
+def _needed_stages(
     stages: Mapping[str, ChainStage], after: Mapping[str, frozenset[str]], names: Sequence[str], file: Path
 ) -> set[str]:
     if not names:

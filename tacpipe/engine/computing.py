@@ -58,7 +58,7 @@ class _Computing:
                 stores[task.store, task.run] = opened(task.store, task.run)
         if len(tasks) >= _MANY and any(store.distant for store in stores.values()):
             try:
-                yield from _overlapped([(task, stores[task.store, task.run]) for task in tasks])
+                yield from _overlap_tasks([(task, stores[task.store, task.run]) for task in tasks])
             finally:
                 for store in stores.values():
                     store.close()
@@ -69,7 +69,7 @@ class _Computing:
 compute = _Computing()
 
 
-def _overlapped(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
+def _overlap_tasks(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
     """Yield the outcome of each task. Stages run only in this thread."""
     from concurrent.futures import ThreadPoolExecutor  # not loaded for a cache hit
 
@@ -107,16 +107,16 @@ def _begin(task: WorkerTask, store: Store) -> Callable[[], Done]:
     try:
         with ExitStack() as leases:
             with devices.use_device(task.device):
-                outcome = _computed(task, store, key, leases)
+                outcome = _compute_result(task, store, key, leases)
             if isinstance(outcome, _Made):
                 return _Sending(task, store, outcome, leases.pop_all())
     except TacpipeError as error:
-        outcome = _failed(task, store, error)
+        outcome = _failure(task, store, error)
     failure: Done = outcome
     return lambda: failure
 
 
-def _failed(task: WorkerTask, store: Store, error: TacpipeError) -> Done:
+def _failure(task: WorkerTask, store: Store, error: TacpipeError) -> Done:
     execution.remove_empty_workspace(store, digest(task.identity))
     return Done(task.recording, None, str(error), error.exit_code, at_fault=is_input_error(error))
 
@@ -153,11 +153,11 @@ class _Sending:
                 )
                 shutil.rmtree(execution.workspace(store, digest(task.identity)), ignore_errors=True)
         except TacpipeError as error:
-            return _failed(task, store, error)
+            return _failure(task, store, error)
         return Done(task.recording, record)
 
 
-def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Done | _Made:
+def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Done | _Made:
     if task.dry:
         result, _ = execution.execute(task, store, ScratchStore())
         return Done(task.recording, {"result": result, "provenance": provenance.describe_provenance(0.0)})
@@ -179,11 +179,11 @@ def _computed(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Do
         "notes": notes,
     }
     if stage.source:  # until a dataset's manifest exists, only the record marks this as a recording
-        _manifest_of(task, stage, result).keep(store, durable=True)
+        _single_manifest(task, stage, result).keep(store, durable=True)
     return _Made(result, origin, replace, stage.source)
 
 
-def _manifest_of(task: WorkerTask, stage: AnyStage, result: StoredResult) -> Manifest:
+def _single_manifest(task: WorkerTask, stage: AnyStage, result: StoredResult) -> Manifest:
     """Return a manifest with one recording that was read from published files."""
     (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
     files, values = inputs[stage.argument("Files") or ""], inputs.get(stage.argument("Values") or "")

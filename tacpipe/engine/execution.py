@@ -91,14 +91,14 @@ def execute(
     """
     stage, stage_name = registry.load_step(task.name), registry.stage_name(task.name)
     params = params_of.from_json(stage, task.identity["params"])
-    with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments if followed else {}):
+    with _arguments(stage, task, store) as arguments, _follow_training(task.name, stage, arguments if followed else {}):
         try:
             with (
                 memory.raising_shortage(),
                 extras.explain_missing(f"Stage {stage_name}", lambda: registry.package(stage_name)),
             ):
                 returned = _result(task.name, stage, stage(params, **arguments))
-                result = _stored(returned, sink, durable=stage.source)  # batches are read here
+                result = _store_returned(returned, sink, durable=stage.source)  # batches are read here
         except Exception as error:
             extras.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
@@ -112,7 +112,7 @@ def _result(name: str, stage: AnyStage, returned: Any) -> Result:
     return Result(recordings={"": _recording(name, returned)}) if stage.mapped else _files(name, returned)
 
 
-def _stored(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> StoredResult:
+def _store_returned(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> StoredResult:
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
@@ -173,10 +173,10 @@ class _Reader:
 
     def __reduce__(self) -> tuple[Any, ...]:
         sizes = self._sizes if isinstance(self._sizes, Manifest) else dict(self._sizes)
-        return _reader_at, (self._store.place, self._dataset_dirs, sizes)
+        return _open_reader, (self._store.place, self._dataset_dirs, sizes)
 
 
-def _reader_at(place: str, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
+def _open_reader(place: str, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
     return _Reader(opened(place), dataset_dirs, sizes)
 
 
@@ -334,7 +334,7 @@ def remove_empty_workspace(store: Store, key: str) -> None:
 
 
 @contextmanager
-def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
+def _follow_training(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
     """Report a stage's training to trackers and the display within the block, if it has a workspace."""
     workspace = arguments.get(stage.argument("Workspace") or "")
     if workspace is None:

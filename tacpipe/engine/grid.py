@@ -118,7 +118,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
     with terminal.showing_progress(False):
         try:
             missing = [request for request in requests if _is_missing(request)]
-            each_s = _timed(missing[0]) if missing else None
+            each_s = _measure_duration(missing[0]) if missing else None
         except TacpipeError:  # the grid reports it
             return None
     if each_s is None:
@@ -144,7 +144,7 @@ def _is_missing(request: Request) -> bool:
     return request.rerun or store.record(digest(RequestInputs(request, store).identity())) is None
 
 
-def _timed(request: Request) -> float | None:
+def _measure_duration(request: Request) -> float | None:
     stopwatch = _Stopwatch()
     try:
         with following.track_with([stopwatch]):

@@ -79,7 +79,7 @@ def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: Com
     published, nothing that it is computed from is collected. If an object turns out to be damaged when it is linked,
     the result is recomputed.
     """
-    place = _place(store, request)
+    place = _output_place(store, request)
     if (unread := place.unread(work)) is not None:
         return unread
     look = place.look()
@@ -116,7 +116,7 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
 
 def existing_answer(store: Store, request: Request, work: CommandSource) -> Manifest | Unread | None:
     """Return the result of `settle` if the output already shows the stored result, else None. Changes nothing."""
-    place = _place(store, request)
+    place = _output_place(store, request)
     if (unread := place.unread(work)) is not None:
         return unread
     look = place.look()
@@ -127,7 +127,7 @@ def existing_answer(store: Store, request: Request, work: CommandSource) -> Mani
     return place.settled(hit)
 
 
-def _place(store: Store, request: Request) -> _Place:
+def _output_place(store: Store, request: Request) -> _Place:
     return _File(store, request) if request.single_file else _Directory(store, request)
 
 
@@ -211,7 +211,7 @@ class _Directory(_Place):
         return bool(appearance)
 
     @cached_property
-    def _noted(self) -> Note | None:
+    def _valid_note(self) -> Note | None:
         """The note about this directory, if it describes the manifest shown here."""
         note, root = presence.read_note(self.store, self.path), self.root
         if note is None or root is None or root["manifest"] != note.head.manifest:
@@ -225,7 +225,7 @@ class _Directory(_Place):
         request = self.request
         if request.compare or request.rerun or request.track or request.check:
             return None
-        note = self._noted
+        note = self._valid_note
         if note is None or note.head.key != work.key:
             return None
         with suppress(OSError, TacpipeError):
@@ -246,10 +246,14 @@ class _Directory(_Place):
 
     @property
     def source_manifests(self) -> list[str]:
-        return [] if self._noted is None else [self._noted.head.manifest, *previous_of.inputs(self.store, self._noted)]
+        return (
+            []
+            if self._valid_note is None
+            else [self._valid_note.head.manifest, *previous_of.inputs(self.store, self._valid_note)]
+        )
 
     def previous(self) -> Previous | None:
-        return None if self._noted is None else previous_of.find(self.store, self.path, self._noted)
+        return None if self._valid_note is None else previous_of.find(self.store, self.path, self._valid_note)
 
     def published(self, work: CommandSource, result: Manifest, previous: Previous | None = None) -> Manifest:
         published = self.publish(result, previous, work.key)
@@ -285,10 +289,10 @@ class _Directory(_Place):
             before = None
         returning = replacing.returning_labels(self.store, self.request.output, before, result)
         if before is None:
-            return _labelled(result, returning)
+            return _with_labels(result, returning)
         if replacing.irreplaceable(result) and not self.request.replace:
             result = replacing.appended(before, result)
-        return _labelled(result, {**returning, **before.labels})
+        return _with_labels(result, {**returning, **before.labels})
 
     def check(self, result: Manifest) -> None:
         self._refuse_losses(result)
@@ -361,7 +365,7 @@ class _File(_Place):
         return str(matching)
 
 
-def _labelled(result: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
+def _with_labels(result: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
     return result.labelled(labels) if labels else result
 
 

@@ -64,11 +64,11 @@ def run(request: Request) -> Outcome:
     with ChosenExecutor(request.executor, request.jobs) as chosen:
         work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
         outcome = work.outcome
-        with _tracked(request, trackers, outcome, store) as end_tracking:
+        with _track_run(request, trackers, outcome, store) as end_tracking:
             result = output.settle(store, request, inputs.plan(), work)
             if isinstance(result, Manifest):  # otherwise there is nothing to track
                 end_tracking(result)
-    return _concluded(outcome, inputs, result, started)
+    return _conclude(outcome, inputs, result, started)
 
 
 def answered(request: Request) -> Outcome | None:
@@ -85,10 +85,10 @@ def answered(request: Request) -> Outcome | None:
     with ChosenExecutor(request.executor, request.jobs) as chosen:
         work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
         result = output.existing_answer(store, request, work)
-    return None if result is None else _concluded(work.outcome, inputs, result, started)
+    return None if result is None else _conclude(work.outcome, inputs, result, started)
 
 
-def _concluded(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread, started: float) -> Outcome:
+def _conclude(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *inputs.describe_unread(), *outcome.describe_results(), *outcome.notes]
     outcome.rows = result.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
@@ -96,7 +96,7 @@ def _concluded(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unrea
 
 
 @contextmanager
-def _tracked(
+def _track_run(
     request: Request, trackers: dict[str, Tracker], outcome: Outcome, store: Store
 ) -> Iterator[Callable[[Manifest], None]]:
     """Let trackers follow trainings in the block. Yields the function that ends their run with the resulting manifest."""
@@ -210,7 +210,7 @@ class _RequestRun:
             identity = keys.identity(request.name, stage.version, request.params, inputs)
             if stage.part is not None:
                 files = {**self._run_whole(request.name, identity, counted=False)["files"], **self._parts.files}
-                return replace(empty, files={**files, **self._originals()}, skipped=self._skipped)
+                return replace(empty, files={**files, **self._originals()}, skipped=self._skipped_recordings)
             result = self._run_whole(request.name, identity)
             return replace(empty, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
@@ -230,7 +230,7 @@ class _RequestRun:
             chain=chain,
             recordings=recordings,
             files=fitted or {},
-            skipped=self._skipped,
+            skipped=self._skipped_recordings,
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
 
@@ -243,7 +243,7 @@ class _RequestRun:
         return keys.trial_tasks(self.store, request.name, stage, request.params)
 
     @property
-    def _skipped(self) -> dict[str, str]:
+    def _skipped_recordings(self) -> dict[str, str]:
         carried = {
             name: reason for dataset in self.inputs.datasets for name, reason in dataset.manifest.skipped.items()
         }

@@ -187,7 +187,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     files, losses = {}, []
     for stream in recording.streams:
         table = recording.table(stream)
-        files[f"data/{stream_label(stream)}/{name}.parquet"] = to_parquet(_with_recording_column(table, name))
+        files[f"data/{stream_label(stream)}/{name}.parquet"] = to_parquet(_add_recording_column(table, name))
         losses += list(_losses(stream, table.schema))
     return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
 
@@ -236,7 +236,7 @@ def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
         yield Loss("the recording's name, as the stream has a column of this name", stream, RECORDING)
 
 
-def _with_recording_column(table: pa.Table, name: str) -> pa.Table:
+def _add_recording_column(table: pa.Table, name: str) -> pa.Table:
     """Return a table with a first column for the recording's name, unless it already has one."""
     import pyarrow as pa
 
@@ -267,7 +267,7 @@ def _readme(params: Params, recordings: Dataset, described: Contents, patterns: 
         front,
         f"# {plain(params.title, 200)}",
         params.description,
-        _opening(described),
+        _opening_example(described),
         *sections(recordings, described),
     ]
     return "\n\n".join(filter(None, parts)).encode() + b"\n"
@@ -288,7 +288,7 @@ def _front_matter(params: Params, patterns: dict[str, str]) -> Iterator[str]:
     yield f"  data_files: {LABELS}.parquet"
 
 
-def _opening(described: Contents) -> str:
+def _opening_example(described: Contents) -> str:
     stream = next((stream_label(name) for name in described.streams), "STREAM")
     return f"""```python
 import datasets, duckdb, polars

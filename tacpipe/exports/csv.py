@@ -103,22 +103,22 @@ def _stream_lines(stream: ExportStream, *, optional: bool) -> Iterator[str]:
         if column.name == TIME:
             continue
         if column.type not in READ:
-            yield f"    {{ match = {_quoted(column.name)}, skip = true }},"
+            yield f"    {{ match = {_quote(column.name)}, skip = true }},"
             continue
-        entries = {"match": _quoted(column.name), "type": _quoted(TYPES.get(column.type, column.type))}
-        entries |= {key: _quoted(column.about[key]) for key in ("quantity", "unit", "component") if key in column.about}
+        entries = {"match": _quote(column.name), "type": _quote(TYPES.get(column.type, column.type))}
+        entries |= {key: _quote(column.about[key]) for key in ("quantity", "unit", "component") if key in column.about}
         extra_metadata = {
             key: value for key, value in column.about.items() if key not in ("quantity", "unit", "component")
         }
         if extra_metadata:
             entries["about"] = (
-                f"{{ {', '.join(f'{_quoted(key)} = {_quoted(value)}' for key, value in extra_metadata.items())} }}"
+                f"{{ {', '.join(f'{_quote(key)} = {_quote(value)}' for key, value in extra_metadata.items())} }}"
             )
         yield f"    {{ {', '.join(f'{key} = {value}' for key, value in entries.items())} }},"
     yield "]"
 
 
-def _quoted(value: str) -> str:
+def _quote(value: str) -> str:
     return json.dumps(value, ensure_ascii=True)  # the same syntax as a basic string in TOML
 
 

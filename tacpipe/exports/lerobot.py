@@ -110,7 +110,7 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     names = [ACTION, "column", *STATISTICS]
     rows_of_statistics = pa.Table.from_arrays([pa.array(values) for values in zip(*rows, strict=True)], names=names)
     carried = [("", column) for feature in frame_features for column in feature.columns]
-    carried += [("", channel.name) for channel in _without_feature(frames.channels(columns))]  # named above
+    carried += [("", channel.name) for channel in _unsupported_channels(frames.channels(columns))]  # named above
     return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 
@@ -198,13 +198,13 @@ def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
     lossy = frames.rounded_channels(columns, [channel for channel in channels if channel.signal])
     for stream in dict.fromkeys(channel.stream for channel in lossy):
         yield Loss(f"digits beyond float32{place}", stream)
-    for channel in _without_feature(channels):
+    for channel in _unsupported_channels(channels):
         if channel.quantity == frames.IMAGE:
             continue  # packets are in the videos
         yield Loss(f"features have no type for {channel.type}{place}", channel.stream, channel.short)
 
 
-def _without_feature(channels: Sequence[Channel]) -> list[Channel]:
+def _unsupported_channels(channels: Sequence[Channel]) -> list[Channel]:
     """Return the channels whose type no feature supports."""
     return [channel for channel in channels if not channel.number and channel.type != "string"]
 

@@ -158,10 +158,10 @@ def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple
             values = columns.column(channel.name).to_numpy().astype(feature.kind).astype(np.float64)
         if feature.later:
             values = np.concatenate([values[1:], values[-1:]])
-        yield channel.name, _statistics_of(values)
+        yield channel.name, _compute_statistics(values)
 
 
-def _statistics_of(values: Floats) -> tuple[float, ...]:
+def _compute_statistics(values: Floats) -> tuple[float, ...]:
     import numpy as np
 
     finite = values[np.isfinite(values)]
@@ -195,7 +195,10 @@ def index_statistics(rows: int, episode: int, start: int, task: int, fps: float)
         "task_index": np.full(rows, float(task)),
     }
     return {
-        name: {**{key: [value] for key, value in zip(STATISTICS, _statistics_of(values), strict=True)}, "count": [rows]}
+        name: {
+            **{key: [value] for key, value in zip(STATISTICS, _compute_statistics(values), strict=True)},
+            "count": [rows],
+        }
         for name, values in columns.items()
     }
 

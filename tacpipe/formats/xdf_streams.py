@@ -181,7 +181,7 @@ class XdfFile:
             notes += [f"{self.path}: {plain(source)} {name}" for name in [*described, *_describe_losses(stream)]]
             attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
             streams.append(
-                SourceStream(source, names[source], Time(STAMP, "ns"), _content_of(stream, t_ns), stream.rows)
+                SourceStream(source, names[source], Time(STAMP, "ns"), _stream_content(stream, t_ns), stream.rows)
             )
             if stream.offsets:
                 source += OFFSETS
@@ -374,7 +374,7 @@ def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: i
     return max(low - 1, 0) + jump + 1
 
 
-def _content_of(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
+def _stream_content(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
     """Return the samples with their timestamps: a table if there are few, else batches from the spill file."""
     schema = pa.schema([_time_field(STAMP), _time_field(RAW), *stream.fields])
     raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))

@@ -57,7 +57,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
         + [f"ee_state_orientation_{part}" for part in schema.COMPONENTS],
     )  # (time, 22)
     xela.require_unit(files[ROBOT], robot[:, -4:], "ee_state_orientation")
-    robot[:, -4:] = _in_order(robot[:, :7], robot[:, -4:])
+    robot[:, -4:] = _reorder_quaternions(robot[:, :7], robot[:, -4:])
     markers = {name: xela.read_marker(files[MARKER], name) for name in ("marker1", "marker2")}
     rows = {name: len(tactile[stream][0]) for stream, name in xela.SENSORS.items()}
     xela.check_rows(trial, rows, "xela_sensor1.csv", missing_allowed=0)
@@ -91,7 +91,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
     )
 
 
-def _in_order(joint_rad: Floats, quaternions: Floats) -> Floats:
+def _reorder_quaternions(joint_rad: Floats, quaternions: Floats) -> Floats:
     """Return quaternions x, y, z, w (time, 4), reordered if the joints (time, 7) show that the columns are w, x, y, z."""
     import numpy as np
 

@@ -195,14 +195,14 @@ class ParquetTable:
         self._size = self._source.size()
         self._claims: Claims | None = None
         try:
-            self._file = self._opened()
+            self._file = self._open_file()
             stored = (self._file.metadata.metadata or {}).get(_KEY)
             self._fields = None if stored is None else json.loads(stored)["fields"]
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
             raise _read_error(self._size, error) from error
 
-    def _opened(self) -> pq.ParquetFile:
+    def _open_file(self) -> pq.ParquetFile:
         """Return a reader of the file that verifies page checksums if the file is not in memory."""
         if isinstance(self._content, pa.Buffer):
             return pq.ParquetFile(self._source)
@@ -228,7 +228,7 @@ class ParquetTable:
         total, largest, _ = self._count(columns)
         memory.require(total + largest, f"A Parquet file of {self._size} bytes", error=ShortageError)
         try:
-            return self._described(self._file.read(columns=list(columns) if columns is not None else None))
+            return self._attach_metadata(self._file.read(columns=list(columns) if columns is not None else None))
         except BROKEN as error:
             raise _read_error(self._size, error) from error
 
@@ -239,12 +239,12 @@ class ParquetTable:
         memory.require(at_once + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
         names = list(columns) if columns is not None else None
         try:
-            for batch in self._opened().iter_batches(rows, columns=names, use_threads=False):
-                yield self._described(pa.Table.from_batches([batch]))
+            for batch in self._open_file().iter_batches(rows, columns=names, use_threads=False):
+                yield self._attach_metadata(pa.Table.from_batches([batch]))
         except BROKEN as error:
             raise _read_error(self._size, error) from error
 
-    def _described(self, table: pa.Table) -> pa.Table:
+    def _attach_metadata(self, table: pa.Table) -> pa.Table:
         """Return a table of some columns with their field metadata."""
         if self._fields is None:
             return table

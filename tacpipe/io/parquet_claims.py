@@ -247,7 +247,7 @@ def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any],
         count = 2 * length if length >= 0 else -2 * length - 1
     values: list[Any] = []
     for _ in range(count):
-        usual = _usual(content, place, stop) if kind == 12 else None
+        usual = _read_common_form(content, place, stop) if kind == 12 else None
         if usual is not None:
             values.append(usual[0])
             place = usual[1]
@@ -259,7 +259,7 @@ def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any],
     return values, place
 
 
-def _usual(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:
+def _read_common_form(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:
     """Return the needed fields and the end of a footer structure in the common form, or None for other forms."""
     first = content[place] if place < stop else 0
     if first == _CHUNK and (chunk := _USUAL_CHUNK.match(content, place, stop)) and len(chunk[2]) == chunk[1][0]:

@@ -71,11 +71,11 @@ def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusA
             except CanOperationError as error:
                 if not isinstance(error.__cause__, UnicodeDecodeError):
                     raise
-                damaged.append((time.time_ns(), _with_invalid_size(error.__cause__.object)))
+                damaged.append((time.time_ns(), _make_size_invalid(error.__cause__.object)))
                 self._buffer.clear()
                 return None
             if line and not is_slcan_line(line[:-1]):
-                damaged.append((time.time_ns(), _with_invalid_size(line.encode())))
+                damaged.append((time.time_ns(), _make_size_invalid(line.encode())))
                 return None
             return line
 
@@ -95,7 +95,7 @@ def is_slcan_line(line: str) -> bool:
     return (length <= 8 or frame["kind"][0] in "dDbB") and len(frame["data"]) >= 2 * min(length, 8)
 
 
-def _with_invalid_size(line: bytes) -> bytes:
+def _make_size_invalid(line: bytes) -> bytes:
     """Return a damaged line, shortened if necessary so that its size is not a multiple of the frame size."""
     return line if len(line) % FRAME.size else line[:-1]
 

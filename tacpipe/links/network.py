@@ -222,11 +222,11 @@ class UdpLink(DescriptorLink):
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         if not self._prompt:
             time.sleep(self._linger_s)
-        queued = self._queued()
+        queued = self._read_queue()
         self._arrivals.read_clocks()
         return [(self._arrivals.to_monotonic(wall_ns), data) for wall_ns, data in queued]
 
-    def _queued(self) -> Arrived:
+    def _read_queue(self) -> Arrived:
         """Return the queued datagrams with their arrivals on the wall clock. An error is stored for `_receive`.
 
         Datagrams of other senders are only counted. At most `MAX_FETCHED` are fetched, so that a read always ends.

@@ -124,7 +124,7 @@ def hid_module() -> Any:
 
 def holders_of_file(path: str) -> list[str]:
     """Return the other processes that have ``path`` open, as ``screen (process 4711)``. Unreadable ones are skipped."""
-    return _processes_with({str(Path(path).resolve())})
+    return _find_processes({str(Path(path).resolve())})
 
 
 def holders_of_port(kind: str, port: int) -> list[str]:
@@ -139,7 +139,7 @@ def holders_of_port(kind: str, port: int) -> list[str]:
             columns = line.split()
             if int(columns[1].rpartition(":")[2], 16) == port:
                 targets.add(f"socket:[{columns[9]}]")
-    return _processes_with(targets)
+    return _find_processes(targets)
 
 
 def describe_holders(holders: list[str]) -> str:
@@ -151,7 +151,7 @@ def describe_holders(holders: list[str]) -> str:
     return " and ".join(holders) if holders else "a process of another user"
 
 
-def _processes_with(targets: set[str]) -> list[str]:
+def _find_processes(targets: set[str]) -> list[str]:
     return [
         f"{_name(process)} (process {process.name})"
         for process in sorted(PROCESSES.glob("[0-9]*"), key=lambda path: int(path.name))

@@ -99,7 +99,7 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | No
     if not data.data:
         return []
     data = _truncate(data)
-    shuffled, noise = _shuffled(data), _noise(data)
+    shuffled, noise = _shuffle(data), _noise(data)
     findings = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
         frames, part, rate_hz = _count_frames(candidate.sensor, data)
@@ -151,7 +151,7 @@ def _noise(data: Chunks) -> Chunks:
     return Chunks(data.t_ns, data.size, np.random.default_rng(0).bytes(len(data.data)))
 
 
-def _shuffled(data: Chunks) -> Chunks:
+def _shuffle(data: Chunks) -> Chunks:
     text = np.random.default_rng(0).permutation(np.frombuffer(data.data, np.uint8)).tobytes()
     return Chunks(data.t_ns, data.size, text)
 
@@ -227,13 +227,13 @@ def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Re
 def _probe_with_requests(address: Address, usb_id: str, progress: Progress) -> Report:
     """Return the best findings after each driver's opening requests. Drivers with this USB id are tried first."""
     best = Report(str(address))
-    for candidate in _by_usb(candidates(Chunks.from_pairs([]), address.scheme), usb_id):
+    for candidate in _sort_by_usb_id(candidates(Chunks.from_pairs([]), address.scheme), usb_id):
         sensor = candidate.sensor
         if not _has_requests(sensor):
             continue
         progress(f"{address}: sending the requests of {candidate.kind}")
         try:
-            with closing(open_link(address, _without_settling(sensor), "probe")) as link:
+            with closing(open_link(address, _placeholder_sensor(sensor), "probe")) as link:
                 chunks = _request_frames(link, sensor)
         except DeviceError as error:
             progress(f"{address}: {error}")
@@ -249,7 +249,7 @@ def _probe_with_requests(address: Address, usb_id: str, progress: Progress) -> R
 def _request_frames(link: Link, sensor: Sensor) -> Arrived:
     """Return the bytes of a device after a sensor's opening and requests. The closing request is sent at the end."""
     try:
-        entries = run_dialogue(link, _with_short_timeouts(sensor.opening(link.local)), "probe")
+        entries = run_dialogue(link, _shorten_timeouts(sensor.opening(link.local)), "probe")
         request = sensor.request()
         for _ in range(REQUESTS if request else 0):
             link.write(request)
@@ -277,13 +277,13 @@ def _report(address: Address, chunks: Arrived, baud: int, only: str = "") -> Rep
 
 def _bauds(usb_id: str) -> list[int]:
     """Return the baud rates of the serial drivers: first those of drivers with this USB id, then the most common."""
-    drivers = _by_usb(candidates(Chunks.from_pairs([]), "serial"), usb_id)
+    drivers = _sort_by_usb_id(candidates(Chunks.from_pairs([]), "serial"), usb_id)
     counts = Counter(candidate.sensor.baud for candidate in {driver.kind: driver for driver in drivers}.values())
     first = [candidate.sensor.baud for candidate in drivers if usb_id and usb_id in candidate.sensor.usb_ids]
     return list(dict.fromkeys([*first, *(baud for baud, _ in counts.most_common()), *TEXT_BAUDS]))
 
 
-def _by_usb(sensors: list[SensorCandidate], usb_id: str) -> list[SensorCandidate]:
+def _sort_by_usb_id(sensors: list[SensorCandidate], usb_id: str) -> list[SensorCandidate]:
     """Return one candidate per driver. Drivers with this USB id come first."""
     by_kind = {candidate.kind: candidate for candidate in reversed(sensors)}
     return sorted(by_kind.values(), key=lambda candidate: (usb_id not in candidate.sensor.usb_ids, candidate.kind))
@@ -295,12 +295,12 @@ def _has_requests(sensor: Sensor) -> bool:
     return driver.opening is not Sensor.opening or driver.request is not Sensor.request
 
 
-def _without_settling(sensor: Sensor) -> Sensor:
+def _placeholder_sensor(sensor: Sensor) -> Sensor:
     """Return a placeholder with this sensor's port settings, but without the wait: the device has already started."""
     return placeholder_sensor(getattr(sensor, "baud", 0), replace(sensor.line, settle_s=0.0))
 
 
-def _with_short_timeouts(dialogue: Dialogue) -> Dialogue:
+def _shorten_timeouts(dialogue: Dialogue) -> Dialogue:
     """Yield the requests of a dialogue with timeouts of at most `REPLY_S`."""
     try:
         ask = next(dialogue)

@@ -142,7 +142,7 @@ def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
 
     Raises `DeviceError` if it is missing or busy, or cannot send what the rig file requests.
     """
-    path = place if place.startswith("/") else _path_of(place, name)
+    path = place if place.startswith("/") else _find_device(place, name)
     try:
         device = V4l2Device(path)
     except FileNotFoundError:
@@ -163,7 +163,7 @@ def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
         raise
 
 
-def _path_of(place: str, name: str) -> str:
+def _find_device(place: str, name: str) -> str:
     paths = [port.address.removeprefix("v4l2:") for port in cameras() if port.persistent_path == f"v4l2:{place}"]
     if len(paths) != 1:
         described = "no camera has" if not paths else f"{', '.join(paths)} have"
@@ -283,7 +283,7 @@ class V4l2Link(DescriptorLink):
         if capture.encoding == "yuyv":
             self._encoder = JpegEncoder(capture.width_px, capture.height_px, "yuvj422p")
         count, *_ = struct.unpack("<5I", device.call(REQBUFS, struct.pack("<5I", BUFFERS, CAPTURE, MMAP, 0, 0)))
-        self._memory = [self._mapped(index) for index in range(count)]
+        self._memory = [self._map_buffer(index) for index in range(count)]
         for index in range(count):
             self._queue(index)
         device.call(STREAMON, struct.pack("<i", CAPTURE))
@@ -340,7 +340,7 @@ class V4l2Link(DescriptorLink):
         pixels = np.frombuffer(content, np.uint8, 2 * size_px[0] * size_px[1]).reshape(*size_px, 2)
         return self._encoder.encode(av.VideoFrame.from_ndarray(pixels, format="yuyv422"))
 
-    def _mapped(self, index: int) -> mmap.mmap:
+    def _map_buffer(self, index: int) -> mmap.mmap:
         described = BUFFER.unpack(self.device.call(QUERYBUF, self._buffer(index)))
         offset, length = described[10] & 0xFFFFFFFF, described[11]
         return mmap.mmap(self.device.fileno, length, offset=offset)

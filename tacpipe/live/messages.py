@@ -56,7 +56,7 @@ class Message:
     def to_dict(self) -> Json:
         """Return the message for JSON and msgpack; numbers that are not finite become null."""
         fields = {
-            value.name: _plain(value.read(self), value.digits)
+            value.name: _to_json(value.read(self), value.digits)
             for value in self.declaration.values
             if value.json and value.name not in self.absent
         }
@@ -183,7 +183,7 @@ def reference_page(declarations: Mapping[str, Declaration]) -> str:
     return "\n".join(lines)
 
 
-def _plain(value: Any, digits: int | None) -> Any:
+def _to_json(value: Any, digits: int | None) -> Any:
     """Return a value that JSON can represent."""
     if isinstance(value, np.ndarray):
         return value.tolist()

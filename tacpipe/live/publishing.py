@@ -82,13 +82,13 @@ class Publishers:
         self.states: Mapping[str, str] = {}  # the latest message as text
 
     @property
-    def _all(self) -> list[Publisher]:
+    def _publishers(self) -> list[Publisher]:
         return [*self._subscribed, *([] if self._streams is None else [self._streams])]
 
     @property
     def dropped(self) -> int:
         """Number of messages not sent."""
-        return sum(publisher.dropped for publisher in self._all)
+        return sum(publisher.dropped for publisher in self._publishers)
 
     def publish(self, message: Message, stamp: Callable[[Message], None]) -> None:
         """Send a message to all; ``stamp`` writes its current latency into it."""
@@ -106,7 +106,7 @@ class Publishers:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for opened in self._all:
+        for opened in self._publishers:
             with contextlib.suppress(OSError):
                 opened.close()
 

@@ -59,9 +59,9 @@ def status(store: CachedStore) -> BucketStatus:
     return {
         "store": store.place,
         "there": bucket.check(),
-        "objects": _measured(bucket.files.list("objects")),
-        "records": _measured(bucket.files.list("records")),
-        "tmp": _measured(bucket.files.list("tmp")),
+        "objects": _measure_folder(bucket.files.list("objects")),
+        "records": _measure_folder(bucket.files.list("records")),
+        "tmp": _measure_folder(bucket.files.list("tmp")),
         "roots": [{**root, "path": pushed.label(root, all_roots), "reachable": True} for root in all_roots],
         "running": [run.note for _, run in bucket.runs().values()],
         "cache": {
@@ -73,7 +73,7 @@ def status(store: CachedStore) -> BucketStatus:
     }
 
 
-def _measured(entries: Iterable[Entry]) -> FolderSize:
+def _measure_folder(entries: Iterable[Entry]) -> FolderSize:
     sizes = [entry.bytes for entry in entries]
     return {"files": len(sizes), "bytes": sum(sizes)}
 

@@ -99,12 +99,12 @@ def to_text(listed: list[Known]) -> str:
         state = "" if entry.state == SHOWN else f"  ({entry.state})"
         lines.append(
             f"{entry.manifest[:12]}  {date}  {plain(entry.stage):<20}  {entry.recordings:>10}  {entry.labelled:>8}  "
-            f"{plain(_place(entry), 200)}{state}"
+            f"{plain(_qualified_path(entry), 200)}{state}"
         )
     return printable.lines(lines)
 
 
-def _place(entry: Known) -> str:
+def _qualified_path(entry: Known) -> str:
     """Return the path of a manifest, preceded by its project if it was pushed."""
     return f"{entry.project}:{entry.path}" if entry.state in (IN_STORE, EARLIER) else entry.path
 

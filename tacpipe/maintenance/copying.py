@@ -46,7 +46,7 @@ class _Plan:
         }
 
 
-def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, ancestors: bool) -> _Plan:
+def _plan_copy(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, ancestors: bool) -> _Plan:
     """Return what a dataset needs: its manifest and objects, its ancestors' manifests, and optionally their objects."""
     plan = _Plan()
     todo, visited = [dataset.digest], set()
@@ -62,14 +62,14 @@ def _planned(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, 
         plan.manifests[name] = manifest.content
         todo += garbage.ancestors(manifest)
         if ancestors or name == dataset.digest:
-            _expect_formed(manifest, name)
+            _expect_valid_pages(manifest, name)
             plan.objects.update({digest: (path, size) for path, digest, size in manifest.contents()})
         elif manifest.pages is not None:
             plan.objects.update({page.digest: (page.path, page.bytes) for page in manifest.pages.pages})
     return plan
 
 
-def _expect_formed(manifest: Manifest, name: str) -> None:
+def _expect_valid_pages(manifest: Manifest, name: str) -> None:
     """Raise `DamagedError` if a page of a manifest, which may be untrusted, is invalid."""
     try:
         manifest_of.check_pages(manifest)
@@ -92,19 +92,19 @@ def copy(
 
     ``before`` is a manifest in the target with much in common, such as the last one of that name.
     """
-    plan = _planned(source, target, dataset, ancestors=ancestors)
+    plan = _plan_copy(source, target, dataset, ancestors=ancestors)
     sizes = plan.sizes()
     target.announce(sizes)  # announced before the sizes are read, so that no collection removes an object in between
     present_sizes = target.sizes(sizes)
     absent = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
     _expect_room(target, sum(sizes[name] for name in absent))
-    absent += _damaged(
+    absent += _find_damaged(
         target, [name for name in plan.objects if present_sizes.get(name) == sizes[name]], sizes, verify=verify
     )
     _send(source, target, plan, absent, dataset_dirs)
     target.settle(layout.object_name(name) for name in absent)
     fresh = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
-    fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
+    fresh += _find_damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
     for name in fresh:
         target.take(name, [plan.manifests[name]])
     target.settle(layout.object_name(name) for name in fresh)
@@ -116,7 +116,7 @@ def copy(
     _copy_records(source, target, dataset, sizes, before)
 
 
-def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
+def _find_damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
     """Return the objects whose content does not match their digest; an empty list unless ``verify`` is set."""
 
     def is_sound(name: str) -> bool:
@@ -159,7 +159,7 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
         path, size = plan.objects[name]
         if isinstance(source, RemoteStore):
             raise DamagedError(f"{path}: {error}") from error
-        target.take(name, _counted([execution.reader(source, directories, sizes)(name, path)], size, path))
+        target.take(name, _check_size([execution.reader(source, directories, sizes)(name, path)], size, path))
 
 
 def _copy_records(
@@ -193,16 +193,16 @@ def _manifest(source: AnyStore, target: AnyStore, name: str) -> Manifest:
 
 
 class _Counted:
-    """The blocks of an object, which can be iterated repeatedly. Raises the errors of `_counted`."""
+    """The blocks of an object, which can be iterated repeatedly. Raises the errors of `_check_size`."""
 
     def __init__(self, source: AnyStore, name: str, size: int, path: str) -> None:
         self._source, self._name, self._size, self._path = source, name, size, path
 
     def __iter__(self) -> Iterator[bytes]:
-        return _counted(self._source.blocks(self._name, self._size), self._size, self._path)
+        return _check_size(self._source.blocks(self._name, self._size), self._size, self._path)
 
 
-def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
+def _check_size(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
     """Yield blocks. Raises `DamagedError` after the last if their size is not the one declared by the manifest."""
     count = 0
     for block in blocks:

@@ -129,7 +129,7 @@ def collect(
         for entry in list(store.asides()):
             _restore(store, entry, dead=now_s - entry.changed_s > max(grace_days, 1.0) * _DAY_S)
     entries = {Path(entry.name).name: entry for entry in store.files.list("objects") if _is_object(entry.name)}
-    needed = _needed(store)
+    needed = _collect_needed(store)
     retained = set(needed.objects)
     unneeded: dict[str, set[str]] = {}  # digests by record key
     for key, record in store.records():
@@ -141,7 +141,7 @@ def collect(
             continue
         unneeded[key] = names
     if not recordings:
-        retained |= _unnamed(store, [name for name in entries if name not in retained], needed.recorded)
+        retained |= _find_unnamed(store, [name for name in entries if name not in retained], needed.recorded)
     collected.kept_recordings = len((retained - needed.objects) & set(entries))
     collected.records = len(unneeded)
     surplus = [entry for name, entry in entries.items() if name not in retained]
@@ -160,7 +160,7 @@ def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str
         lambda entry: store.files.move(entry.name, asides[entry.name]), surplus, MAX_CONCURRENT
     )
     moved = [entry for entry, was_moved in zip(surplus, moves, strict=True) if was_moved]
-    needed = _needed(store).objects
+    needed = _collect_needed(store).objects
     restored = [entry for entry in moved if Path(entry.name).name in needed]
     _run_all(lambda entry: _put_back(store, entry._replace(name=asides[entry.name])), restored)
     _run_all(store.files.delete, [layout.record_name(key) for key, names in records.items() if not names <= needed])
@@ -221,7 +221,7 @@ def _forget_dead(store: RemoteStore, grace_days: float) -> float:
     return entry.changed_s
 
 
-def _needed(store: RemoteStore) -> _Needed:
+def _collect_needed(store: RemoteStore) -> _Needed:
     """Return what announcements and roots need.
 
     Announcements are read first: a run that ends in between has already written its root.
@@ -269,7 +269,7 @@ def _manifest(store: RemoteStore, name: str) -> Manifest | None:
         ) from error
 
 
-def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Manifest]) -> set[str]:
+def _find_unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Manifest]) -> set[str]:
     """Return the digests of manifests that have no root but contain the only copy of recordings or labels.
 
     The digests of everything in these manifests are included.

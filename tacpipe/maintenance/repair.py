@@ -261,17 +261,17 @@ def status(store: Store) -> FolderStatus:
     return {
         "store": str(store.root),
         "there": store.check(),
-        "objects": _measured(store, "objects"),
-        "records": _measured(store, "records"),
-        "quarantine": _measured(store, "quarantine"),
-        "tmp": _measured(store, "tmp"),
-        "checkpoints": _measured(store, "checkpoints"),
+        "objects": _measure_folder(store, "objects"),
+        "records": _measure_folder(store, "records"),
+        "quarantine": _measure_folder(store, "quarantine"),
+        "tmp": _measure_folder(store, "tmp"),
+        "checkpoints": _measure_folder(store, "checkpoints"),
         "roots": [{**root, "reachable": _reachable(root)} for root in store.roots.all()],
         "running": [run.note for run in store.leases.runs()],
     }
 
 
-def _measured(store: Store, name: _Measured) -> FolderSize:
+def _measure_folder(store: Store, name: _Measured) -> FolderSize:
     """Return number and size of the files in a folder of the store; files that disappear meanwhile are not counted."""
     sizes = []
 

@@ -85,7 +85,7 @@ def push(
         folder, name = projects.place(dataset.directory)
         if project:
             projects.join(local_store, folder, pushed.project_in(target, project))
-        with _announced(local_store, dataset.digest) as writable, target.at_work([dataset.digest]):
+        with _announce_read(local_store, dataset.digest) as writable, target.at_work([dataset.digest]):
             owner = projects.identify(local_store, folder, writable=writable)
             if writable:
                 replacing.outgoing(local_store, dataset.directory.absolute())
@@ -147,7 +147,7 @@ def bring(
 
 
 @contextlib.contextmanager
-def _announced(store: Store, manifest: str) -> Iterator[bool]:
+def _announce_read(store: Store, manifest: str) -> Iterator[bool]:
     """Block `gc` in a store that is being read. Yields False if the store is read-only; a push does not need it.
 
     A concurrent collection is then not blocked: if it removes something before it is copied, the push fails.

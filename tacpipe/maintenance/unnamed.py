@@ -44,7 +44,7 @@ def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterabl
     covered = {possession for manifest in named_manifests for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
     candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether the candidate is a page
-    for name, content in _beginning(store, objects, (_BEGINS, pages.BEGINS)):
+    for name, content in _objects_with_marks(store, objects, (_BEGINS, pages.BEGINS)):
         if bytes_digest(content) != name:
             names[name] = digests(content)
             continue
@@ -98,10 +98,10 @@ def digests(content: bytes) -> set[str]:
 
 def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
     """Return the digests in the objects with these names that are pages of a manifest."""
-    return {digest for _, content in _beginning(store, names, (pages.BEGINS,)) for digest in digests(content)}
+    return {digest for _, content in _objects_with_marks(store, names, (pages.BEGINS,)) for digest in digests(content)}
 
 
-def _beginning(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
+def _objects_with_marks(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
     """Yield name and content of the objects with these names that start with a mark."""
     for name in names:
         path = store.object_path(name)

@@ -207,13 +207,13 @@ def measures_by_step(
         gains = intervals.skill(
             np.append(pinball_sums, pinball_sums.sum()), np.append(baseline_pinball, baseline_pinball.sum())
         )
-        measures["pinball_skill"] = _by_step(gains)
+        measures["pinball_skill"] = _named_steps(gains)
     return measures
 
 
 def _means_by_step(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
     """Return sums (step,) divided by their number of values, by step and over all steps."""
-    return _by_step(np.append(sums / values, sums.sum() / values.sum()))
+    return _named_steps(np.append(sums / values, sums.sum() / values.sum()))
 
 
 def _coverage_interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
@@ -223,10 +223,10 @@ def _coverage_interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[s
         for name in ("covered", "values")
     )
     shares = intervals.share_interval(covered, values)
-    return _by_step(shares.low), _by_step(shares.high)
+    return _named_steps(shares.low), _named_steps(shares.high)
 
 
-def _by_step(values: AnyFloats) -> dict[str, float]:
+def _named_steps(values: AnyFloats) -> dict[str, float]:
     """Return values (step + 1,) by name, rounded to 9 digits, without undefined ones."""
     names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
     return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}

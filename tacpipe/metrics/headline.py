@@ -291,13 +291,15 @@ def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})
         len({headline.target for headline in headlines}) > 1
     )  # all targets have the same measure, so its name is omitted
     for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
-        summary["_".join(place if targets else [*place, _short(headline.columns[-1])])] = headline.model.values[-1]
+        summary["_".join(place if targets else [*place, _to_identifier(headline.columns[-1])])] = headline.model.values[
+            -1
+        ]
     for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
         reference = next((row for row in headline.baselines if row.name == headline.reference), None)
         for at, column in enumerate(headline.columns if reference else ()):
             if reference and column.startswith("MAE"):
-                summary["_".join([*place, _short(column)])] = headline.model.values[at]
-                summary["_".join([*place, reference.name, _short(column)])] = reference.values[at]
+                summary["_".join([*place, _to_identifier(column)])] = headline.model.values[at]
+                summary["_".join([*place, reference.name, _to_identifier(column)])] = reference.values[at]
     finite = {name: value for name, value in summary.items() if math.isfinite(value)}
     return {name: _round_float(value) for name, value in list(finite.items())[: MAX_NUMBERS - 1]}
 
@@ -313,14 +315,14 @@ def _distinct_names(headlines: Sequence[Headline], names: Names) -> list[list[st
     for texts in ([headline.target for headline in headlines], [headline.part for headline in headlines]):
         if len(set(texts)) > 1:
             for place, text in zip(names_by_headline, texts, strict=True):
-                place.append(names.get(text) or _short(text))
+                place.append(names.get(text) or _to_identifier(text))
     return names_by_headline
 
 
-def _short(text: str) -> str:
+def _to_identifier(text: str) -> str:
     """Convert text to an identifier.
 
-    >>> [_short(text) for text in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
+    >>> [_to_identifier(text) for text in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
     ['vs_persistence', 'accuracy', 'rmse', 'unseen_objects']
     """
     return "_".join(re.findall(r"[a-z0-9]+", re.sub(r"\(.*?\)", "", text.lower())))

@@ -190,7 +190,7 @@ def geometric_skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: An
     """
     logs, counted = weighted_log_ratios(model, baseline)
     values = logs.shape[1]
-    sums = _by_cluster(np.hstack([logs, counted]), clusters)
+    sums = _sum_by_cluster(np.hstack([logs, counted]), clusters)
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         count = draws[:, values:]
@@ -213,7 +213,7 @@ def skill_interval(
     squared errors, from sums of squares. Bounds are NaN with fewer than `MIN_INTERVAL_CLUSTERS` clusters.
     """
     values = model.shape[1]
-    sums = _by_cluster(np.hstack([model, baseline]), clusters)
+    sums = _sum_by_cluster(np.hstack([model, baseline]), clusters)
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         return power * log_ratio(draws[:, :values], draws[:, values:])
@@ -227,13 +227,13 @@ def share_interval(part: AnyFloats, total: AnyFloats, clusters: AnyArray | None 
     ``clusters`` (item,) assigns items to clusters, by default one per item. Bounds are limited to 0 and 1.
     """
     values = part.shape[1]
-    sums = _by_cluster(np.hstack([part, total]), clusters)
+    sums = _sum_by_cluster(np.hstack([part, total]), clusters)
     shares = jackknife(sums[None], lambda draws: 1 - skill(draws[:, :values], draws[:, values:]), sums[:, values:])
     interval = shares.interval()
     return Interval(interval.mean, np.maximum(interval.low, 0), np.minimum(interval.high, 1))
 
 
-def _by_cluster(rows: AnyFloats, clusters: AnyArray | None) -> AnyFloats:
+def _sum_by_cluster(rows: AnyFloats, clusters: AnyArray | None) -> AnyFloats:
     """Return the sums of rows (item, part) by cluster, (cluster, part)."""
     if clusters is None:
         return rows

@@ -58,12 +58,12 @@ def r2(true: AnyFloats, predicted: AnyFloats) -> float:
     it.
     """
     error, spread = _sums_by_value(true, predicted)
-    return _explained(error.sum(), spread.sum())
+    return _explained_fraction(error.sum(), spread.sum())
 
 
 def r2_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return `r2` of each value separately, (grasp, value) to (value,)."""
-    return np.array([_explained(*pair) for pair in zip(*_sums_by_value(true, predicted), strict=True)])
+    return np.array([_explained_fraction(*pair) for pair in zip(*_sums_by_value(true, predicted), strict=True)])
 
 
 def rmse_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
@@ -109,7 +109,7 @@ def _sums_by_value(true: AnyFloats, predicted: AnyFloats) -> tuple[AnyFloats, An
     return np.square(error).sum(axis=0), np.square(values - values.mean(axis=0)).sum(axis=0)
 
 
-def _explained(error: float, spread: float) -> float:
+def _explained_fraction(error: float, spread: float) -> float:
     return float(1 - error / spread) if spread > 0 else float("nan")
 
 

@@ -255,9 +255,9 @@ class TaxelwiseForecast(ChangeForecast):
     def calibrate(self, windows: ForecastWindows, ahead: Tensor) -> None:
         """Fit the scales on training windows; ``ahead`` is (horizon, window, feature)."""
         super().calibrate(windows, ahead)
-        axis_spread = self._by_taxel(windows.touch).std(dim=(0, 1, 2))
+        axis_spread = self._split_taxels(windows.touch).std(dim=(0, 1, 2))
         self.axis_scale.copy_(torch.where(axis_spread > 0, axis_spread, 1.0))
-        for name, values in zip(("own", "told"), self._read(windows), strict=True):
+        for name, values in zip(("own", "told"), self._network_inputs(windows), strict=True):
             flat = values.flatten(0, -2)
             getattr(self, f"{name}_mean").copy_(flat.mean(0))
             getattr(self, f"{name}_scale").copy_(spread(flat) + 1e-3)
@@ -268,7 +268,7 @@ class TaxelwiseForecast(ChangeForecast):
             ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(
                 -CLIP_DEVIATIONS, CLIP_DEVIATIONS
             )
-            for name, values in zip(("own", "told"), self._read(windows), strict=True)
+            for name, values in zip(("own", "told"), self._network_inputs(windows), strict=True)
         )
         whole = self.drop(self.whole(whole_inputs))  # (window, hidden)
         hidden = self.own(own) + self.from_whole(whole)[:, None] + self.from_traits(self.traits)
@@ -287,7 +287,7 @@ class TaxelwiseForecast(ChangeForecast):
         """Return 3 for new rows and -1 for repeated ones, (window, context): new frames are rare, so they weigh more."""
         return 3 - 4 * repeats(windows.touch).T
 
-    def _by_taxel(self, touch: Tensor) -> Tensor:
+    def _split_taxels(self, touch: Tensor) -> Tensor:
         """Return ``touch`` (…, channel) as (…, taxel, axis)."""
         return touch.reshape(*touch.shape[:-1], self.sensors * self.taxels, self.axes)
 
@@ -296,12 +296,12 @@ class TaxelwiseForecast(ChangeForecast):
         mask: Tensor = self.drop(hidden.new_ones(len(hidden), 1, hidden.shape[-1]))
         return mask
 
-    def _read(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
+    def _network_inputs(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
         """Return the inputs of each taxel (window, taxel, …) and of the shared network (window, …)."""
         touch = windows.touch
         lags = torch.tensor([windows.context - 1 - lag for lag in self.lags], dtype=torch.long)
-        change = self._by_taxel(touch[-1] - touch[lags])  # (lag, window, taxel, axis)
-        level = self._by_taxel(touch[-1:])
+        change = self._split_taxels(touch[-1] - touch[lags])  # (lag, window, taxel, axis)
+        level = self._split_taxels(touch[-1:])
         plain = torch.cat([change, level]) / self.axis_scale
         # changes of a few counts and of thousands both matter, so their logarithms are used
         fine = torch.cat([torch.asinh(8 * change / self.change_scale), torch.asinh(2 * level / self.change_scale)])

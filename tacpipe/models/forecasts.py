@@ -160,14 +160,14 @@ class RecurrentForecast(nn.Module):
 
     def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the predicted features (horizon, window, feature), in their own unit."""
-        restored: Tensor = self._scaled(windows) * self.touch_half + self.touch_centre
+        restored: Tensor = self._predict_scaled(windows) * self.touch_half + self.touch_centre
         return restored
 
     def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
         """Return the mean squared error of scaled features, the paper's loss; ``ahead`` is (horizon, window, feature)."""
-        return nn.functional.mse_loss(self._scaled(windows), (ahead - self.touch_centre) / self.touch_half)
+        return nn.functional.mse_loss(self._predict_scaled(windows), (ahead - self.touch_centre) / self.touch_half)
 
-    def _scaled(self, windows: ForecastWindows) -> Tensor:
+    def _predict_scaled(self, windows: ForecastWindows) -> Tensor:
         touch = (windows.touch - self.touch_centre) / self.touch_half
         pose = (windows.arm[..., :POSE] - self.pose_centre) / self.pose_half
         past = torch.cat([touch, pose[: windows.context]], -1)

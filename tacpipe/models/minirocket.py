@@ -67,7 +67,7 @@ class Rocket:
         chosen = drawn < channel_counts[..., None]
         examples = rng.integers(slides, size=(len(dilations), KERNELS))
         quantiles = np.arange(1, KERNELS * counts_per_kernel.sum() + 1) * GOLDEN % 1
-        padded, outputs = _padded(x, dilations[-1]), []
+        padded, outputs = _pad(x, dilations[-1]), []
         for at, dilation in enumerate(dilations):
             for kernel in range(KERNELS):
                 example = padded[:, :, examples[at, kernel], None]
@@ -96,7 +96,7 @@ class Rocket:
     def _block(self, x: AnyFloats) -> AnyFloats:
         """Return the features of a block of slides, (feature, slide)."""
         features, at = np.empty((len(self.biases), len(x)), np.float32), 0
-        padded = _padded(x, self.dilations[-1])
+        padded = _pad(x, self.dilations[-1])
         for index, (dilation, features_per_kernel) in enumerate(zip(self.dilations, self.counts, strict=True)):
             for kernel in range(KERNELS):
                 output = _kernel_output(padded, self.frames, index, kernel, dilation, self.channels)
@@ -151,7 +151,7 @@ def _dilations(frames: int, features_per_kernel: int) -> tuple[Int32s, Int32s]:
     return dilations, counts
 
 
-def _padded(x: AnyFloats, dilation: int) -> AnyFloats:
+def _pad(x: AnyFloats, dilation: int) -> AnyFloats:
     """Pad slides with zeros at both ends for kernels up to ``dilation``: (channel, time, slide), float32."""
     pad = (LENGTH // 2) * int(dilation)
     padded = np.zeros((x.shape[2], x.shape[1] + 2 * pad, x.shape[0]), np.float32)

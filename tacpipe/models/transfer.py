@@ -280,12 +280,12 @@ class Bands:
             raise TacpipeError("Some slides contain values that are not finite. Segment them again, or exclude these.")
         step_m = speed_m_s / rate_hz
         waves = self._waves(window, step_m)
-        parts = [self._read(slides[first : first + CHUNK], waves) for first in range(0, len(slides), CHUNK)]
+        parts = [self._chunk_features(slides[first : first + CHUNK], waves) for first in range(0, len(slides), CHUNK)]
         features = np.concatenate(parts) if parts else np.empty((0, len(self.edges_per_m)))
         features[:, -1] += np.log(step_m)
         return features
 
-    def _read(self, slides: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
+    def _chunk_features(self, slides: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
         """Return the features of a chunk of slides."""
         level = np.maximum(slides.mean(axis=1, dtype=np.float64), 0)  # (slide, channel)
         leading = np.argsort(-level, axis=1, kind="stable")[:, : max(1, round(LEADING_FRACTION * level.shape[1]))]

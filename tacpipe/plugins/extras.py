@@ -55,7 +55,7 @@ def explain_missing(needed_by: str, plugin: Callable[[], str | None] = lambda: N
 def require(needed_by: str, *modules: str) -> None:
     """Raise `MissingModuleError` for the first of these modules that is not installed."""
     for module in modules:
-        if not _installed(module):
+        if not _is_installed(module):
             absent = ModuleNotFoundError(f"No module named {module!r}", name=module)
             raise missing(absent, needed_by) or absent
 
@@ -68,7 +68,7 @@ def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> Mi
     module = (error.name or "").partition(".")[0]
     if not module or module in OWN or module in sys.modules:  # a mistake in the importing module
         return None
-    extra, absent = extra_for(module), isinstance(error, ModuleNotFoundError) and not _installed(module)
+    extra, absent = extra_for(module), isinstance(error, ModuleNotFoundError) and not _is_installed(module)
     if extra is None:
         if not absent:
             return None
@@ -223,7 +223,7 @@ def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def _installed(module: str) -> bool:
+def _is_installed(module: str) -> bool:
     from importlib.util import find_spec
 
     try:

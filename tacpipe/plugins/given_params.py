@@ -53,7 +53,7 @@ def build(
     early = [] if file is None else _from_file(file, block or name, required=block is not None)
     late = [_from_set(name, text) for text in sets]
     late += [_Setting(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
-    kind = _chosen(stage, early, late, preset)
+    kind = _choose_kind(stage, early, late, preset)
     between = [] if preset is None else _from_preset(name, stage, kind, preset)
     values: dict[str, Any] = {}
     chooses = params_of.tag(stage)
@@ -61,7 +61,7 @@ def build(
         if setting.key != chooses or setting.value in params_of.choices(
             kind, setting.key
         ):  # other values were overridden
-            values[setting.key] = _checked(stage, kind, setting, values)
+            values[setting.key] = _convert_setting(stage, kind, setting, values)
     try:
         params = kind(**values)
     except TypeError as error:
@@ -71,7 +71,7 @@ def build(
     return params
 
 
-def _chosen(stage: AnyStage, early: Sequence[_Setting], late: Sequence[_Setting], preset: str | None) -> Kind:
+def _choose_kind(stage: AnyStage, early: Sequence[_Setting], late: Sequence[_Setting], preset: str | None) -> Kind:
     """Return the kind of params chosen by an option, or else by the preset if the file's kind does not have it."""
     kind = _kind_by_tag(stage, early)
     if any(setting.key == params_of.tag(stage) for setting in late):
@@ -99,7 +99,7 @@ def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
     return kind
 
 
-def _checked(stage: AnyStage, kind: Kind, setting: _Setting, before: Values) -> Any:
+def _convert_setting(stage: AnyStage, kind: Kind, setting: _Setting, before: Values) -> Any:
     """Return the value of ``setting`` converted to the type of its field in ``kind``."""
     annotations, name = fields_of.hints(kind), params_of.tag(stage)
     if setting.key not in params_of.fields(stage):

@@ -156,10 +156,10 @@ def from_json(stage: AnyStage, values: StoredParams) -> Any:
             f"What is stored was computed by another version of {stage.function.__name__}, with the param {removed[0]}, "
             f"which this version does not have. Run the stage again, or use that version."
         )
-    return kind(**{name: _as_field(v, annotations[name]) for name, v in current.items() if name in annotations})
+    return kind(**{name: _field_value(v, annotations[name]) for name, v in current.items() if name in annotations})
 
 
-def _as_field(value: Any, annotation: fields_of.Annotation) -> Any:
+def _field_value(value: Any, annotation: fields_of.Annotation) -> Any:
     origin: Any = get_origin(annotation)
     return tuple(value) if origin is tuple else value
 
@@ -207,12 +207,14 @@ def read(union: Any, values: StoredParams, place: str) -> Any:
     architectures.warn_of_version(values, kind)
     annotations = fields_of.hints(kind)
     fitted = {
-        name: _of_type(value, annotations[name], name, place) for name, value in current.items() if name in annotations
+        name: _convert_type(value, annotations[name], name, place)
+        for name, value in current.items()
+        if name in annotations
     }
     return kind(**fitted)
 
 
-def _of_type(value: Any, annotation: Any, name: str, place: str) -> Any:
+def _convert_type(value: Any, annotation: Any, name: str, place: str) -> Any:
     """Return ``value`` in the type of an annotation, without its constraints; raises `TacpipeError` for another type."""
     kind = fields_of.bare(annotation)
     if get_origin(kind) is Literal:
@@ -247,7 +249,7 @@ def _current(alternatives: Sequence[Kind], values: StoredParams) -> tuple[Kind |
     Names that the kind does not have are unchanged.
     """
     name = _tag_name(alternatives) if len(alternatives) > 1 else None
-    chosen = next((kind for kind in alternatives if name is None or _tagged(kind, name, values)), None)
+    chosen = next((kind for kind in alternatives if name is None or _has_tag(kind, name, values)), None)
     upgrade = getattr(chosen, "upgrade", None)
     values = values if upgrade is None else upgrade(values)
     today = _today(tuple(kind for kind in (chosen, *alternatives) if kind is not None))
@@ -269,7 +271,7 @@ def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]
     return current
 
 
-def _tagged(kind: Kind, name: str, values: StoredParams) -> bool:
+def _has_tag(kind: Kind, name: str, values: StoredParams) -> bool:
     """Return whether stored params have a choice of the tag ``name`` that belongs to ``kind``."""
     mark = _stored_as(kind, name)
     stored = values.get(mark.name)
@@ -318,10 +320,10 @@ def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, fields_of.Annotation
         for name, annotation in fields_of.hints(kind).items():
             if annotation not in annotations.setdefault(name, []):
                 annotations[name].append(annotation)
-    return {name: _joined(options) for name, options in annotations.items()}
+    return {name: _join_annotations(options) for name, options in annotations.items()}
 
 
-def _joined(annotations: Sequence[Any]) -> Any:
+def _join_annotations(annotations: Sequence[Any]) -> Any:
     """Return an annotation that accepts every value that one of ``annotations`` accepts."""
     if all(get_origin(fields_of.bare(annotation)) is Literal for annotation in annotations):
         return Literal[

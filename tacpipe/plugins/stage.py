@@ -322,18 +322,18 @@ class Requirements:
         chain = ", then ".join(f"tacpipe {stage}" for stage in self.stages)
         lines = [f"tacpipe train {self.task} reads the output of", f"  {chain}"]
         lines += [f"  (optional: {stage})" for stage in self.optional_stages]
-        lines += ["", "roles in the split", *_wrapped(self.roles, "  "), ""]
+        lines += ["", "roles in the split", *_wrap(self.roles, "  "), ""]
         lines += ["channels, selected by the quantity and unit of a column, in any stream unless a stream is named"]
         for channel in self.channels:
             place = f", stream {channel.stream}" if channel.stream else ""
             head = f"  {channel.quantity} [{' or '.join(channel.units) or 'any unit'}]{place}: "
-            lines += _wrapped(f"{channel.description}. {_need(channel.without)}", head)
+            lines += _wrap(f"{channel.description}. {_format_need(channel.without)}", head)
         if self.labels:
             lines += ["", "labels of recordings"]
             lines += [
                 line
                 for label in self.labels
-                for line in _wrapped(f"{label.description}. {_need(label.without)}", f"  {label.name}: ")
+                for line in _wrap(f"{label.description}. {_format_need(label.without)}", f"  {label.name}: ")
             ]
         lines += [
             "",
@@ -343,9 +343,9 @@ class Requirements:
         return "\n".join(lines)
 
 
-def _need(without: str) -> str:
+def _format_need(without: str) -> str:
     return f"Optional. {without}" if without else "Required."
 
 
-def _wrapped(text: str, head: str) -> list[str]:
+def _wrap(text: str, head: str) -> list[str]:
     return wrap(text, REQUIREMENT_WIDTH, initial_indent=head, subsequent_indent="      " if head.strip() else head)

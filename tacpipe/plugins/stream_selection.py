@@ -62,7 +62,9 @@ class StreamSelection:
         left_out = self._matching(recording, names, "--without", self.without)
         selected = [name for name in names if name in requested and name not in left_out]
         if not selected:
-            raise TacpipeError(f"{_described(recording)} has no stream left; it has {', '.join(names)}. Select others.")
+            raise TacpipeError(
+                f"{_recording_phrase(recording)} has no stream left; it has {', '.join(names)}. Select others."
+            )
         return selected
 
     @staticmethod
@@ -72,14 +74,14 @@ class StreamSelection:
             matches = [name for name in names if fnmatchcase(name, pattern)]
             if not matches and not any(sign in pattern for sign in WILDCARDS):
                 raise TacpipeError(
-                    f"{_described(recording)} has no stream {pattern!r}, which {option} names; it has "
+                    f"{_recording_phrase(recording)} has no stream {pattern!r}, which {option} names; it has "
                     f"{', '.join(names)}.{suggestion(pattern, names)}"
                 )
             matching.update(matches)
         return matching
 
 
-def _described(recording: str) -> str:
+def _recording_phrase(recording: str) -> str:
     return f"Recording {recording}" if recording else "The recording"
 
 

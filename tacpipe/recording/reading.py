@@ -74,7 +74,7 @@ class CounterUnroller:
             )
         first = self._last is None
         last_raw, last_seq, last_ns = self._last or (int(raw[0]), int(raw[0]) // self.step, int(t_ns[0]))
-        delta = self._signed(np.diff(raw, prepend=last_raw))
+        delta = self._signed_difference(np.diff(raw, prepend=last_raw))
         elapsed_ns = np.diff(t_ns, prepend=last_ns)
         slow = elapsed_ns * 1e-9 * self.rate_hz * self.step > self.modulus / 2  # never true without a declared rate
         if (delta[first:] == self.step).all() and not slow.any():  # the usual case: no event
@@ -84,7 +84,7 @@ class CounterUnroller:
             return UnrolledCounters(seq, np.zeros(len(raw), dtype=np.int64), empty, empty, empty)
         return self._unroll_rows(raw, t_ns, last_raw, last_seq, last_ns, first=first)
 
-    def _signed(self, delta: Int64s) -> Int64s:
+    def _signed_difference(self, delta: Int64s) -> Int64s:
         half = self.modulus // 2
         signed: Int64s = (delta + half) % self.modulus - half
         return signed
@@ -260,7 +260,7 @@ class LinkReader:
             _concatenate(decoded_samples, name) for name in ("seq", "device_seq", "t_device_ns")
         )
         if t_device_ns is not None and self.sensor.device_wrap_ns is not None:
-            t_device_ns = self._unrolled(t_device_ns, self.sensor.device_wrap_ns)
+            t_device_ns = self._unroll_device_time(t_device_ns, self.sensor.device_wrap_ns)
         events: list[StreamFault] = []
         retained = np.ones(len(t_ns), dtype=bool)
         self._pending_losses += losses
@@ -286,7 +286,7 @@ class LinkReader:
         batch = Batch(t_ns, blocks, seq, device_seq, t_device_ns, tuple(sorted(events)))
         return batch if retained.all() else _select_rows(batch, retained)
 
-    def _unrolled(self, sent_ns: Times, wrap_ns: int) -> Times:
+    def _unroll_device_time(self, sent_ns: Times, wrap_ns: int) -> Times:
         """Return device times (sample,) in ns without wrap-arounds. Smaller steps back are retained."""
         last_sent_ns, last_ns = self._device_ns or (int(sent_ns[0]), int(sent_ns[0]))
         steps_ns = np.diff(sent_ns, prepend=last_sent_ns)

@@ -149,7 +149,7 @@ class Recorder:
             self._companion.begin(spool.clock)
         for name, station in self.stations.items():
             self._watch(name, station.take())
-            preroll_blocks = _blocks_since(self._preroll[name], preroll_start_ns) if preroll else None
+            preroll_blocks = _retained_blocks(self._preroll[name], preroll_start_ns) if preroll else None
             pending = station.start_recording(functools.partial(spool.tally, spool.streams[name]), preroll_blocks)
             if station.error is not None:  # the link was lost before the recording, so no note reports it
                 spool.note(StreamNote(clock.now_ns(), name, LOST, str(station.error)))
@@ -242,7 +242,9 @@ def _sync(spool: Spool, stopped: threading.Event) -> None:
         spool.sync()
 
 
-def _blocks_since(retained: deque[tuple[int, list[Chunks | StreamNote]]], start_ns: int) -> list[Chunks | StreamNote]:
+def _retained_blocks(
+    retained: deque[tuple[int, list[Chunks | StreamNote]]], start_ns: int
+) -> list[Chunks | StreamNote]:
     """Return the blocks that arrived at or after ``start_ns``. Blocks that arrived partly before are cut."""
     blocks = [block for _, batch in retained for block in batch]
     recent: list[Chunks | StreamNote] = []

@@ -163,7 +163,7 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
     read = _read(_joined_blocks(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
     events = read.events + _silent_end(sensor, last_ns, end_ns)
-    crashed = _unspooled(spooled, name, read.chunks, read.bytes)
+    crashed = _count_unspooled(spooled, name, read.chunks, read.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         events.append(StreamFault(last_ns, CRASH, bytes=crashed[1], detail=detail))
@@ -211,7 +211,7 @@ def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decode
                 stall = stalls.add(block)
                 account.events += [] if stall is None else [stall]
             elif block.what != OPENED or was_lost:  # opening before the recording is not an event
-                account.events.append(_event_of(block, sensor))
+                account.events.append(_note_event(block, sensor))
             continue
         account.chunks += len(block.size)
         account.bytes += len(block.data)
@@ -227,13 +227,13 @@ def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decode
     return account
 
 
-def _unspooled(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
+def _count_unspooled(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
     """Return the numbers of chunks and bytes of a stream that were read but not spooled."""
     tallied = spooled.tallied().get(name)
     return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
 
 
-def _event_of(note: StreamNote, sensor: Sensor) -> StreamFault:
+def _note_event(note: StreamNote, sensor: Sensor) -> StreamFault:
     """Return the event of a note. Packets that this computer dropped count as lost if the device has no counter."""
     dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
     return StreamFault(note.t_ns, note.what, dropped, detail=note.detail)

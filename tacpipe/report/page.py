@@ -129,10 +129,10 @@ def render(datasets: Sequence[Dataset], *, title: str = "", traces: int = 2) -> 
     there is no result.
     """
     with model_files.validated("the results"):
-        return _rendered(datasets, title, traces)
+        return _render(datasets, title, traces)
 
 
-def _rendered(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
+def _render(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
     results = [dataset for dataset in datasets if "metrics.json" in dataset.files]
     extra_datasets = [dataset for dataset in datasets if "metrics.json" not in dataset.files]
     tasks = {name: report_on(name) for name in by_task(results)}

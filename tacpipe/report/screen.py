@@ -87,7 +87,7 @@ def first_table(context: Context) -> Table | None:
         return None
     targets = list(dict.fromkeys(comparison.question.target for compared in parts.values() for comparison in compared))
     if len(targets) > 1:
-        return _by_target(context, parts, targets)
+        return _table_by_target(context, parts, targets)
     firsts = [compared[0] for compared in parts.values()]
     names = list(dict.fromkeys(row.name for comparison in firsts for row in _leaders(comparison)))[: MAX_ROWS - 2]
     baselines = [row.name for first in firsts for row in [first.best_baseline] if row]
@@ -116,7 +116,7 @@ def first_table(context: Context) -> Table | None:
     return table_of(title, heads, rows, kinds)
 
 
-def _by_target(context: Context, parts: dict[str, list[Comparison]], targets: Sequence[str]) -> Table:
+def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targets: Sequence[str]) -> Table:
     heads = [""]
     for part, compared in parts.items():
         method = context.winner(part)
@@ -216,7 +216,7 @@ def _verb(comparison: Comparison, row: ComparisonRow) -> str:
     verdict = row.gain.verdict
     if verdict == headline.NO_VERDICT:
         warning = headline.explain_no_verdict(row.n, comparison.measure.cluster, row.gain.effective)
-        return f"has {_gained(comparison, row)} over the best baseline, {row.baseline}; {warning}"
+        return f"has {_format_gain(comparison, row)} over the best baseline, {row.baseline}; {warning}"
     return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(comparison, row, '95 % interval ')}"
 
 
@@ -224,10 +224,10 @@ def _amount(comparison: Comparison, row: ComparisonRow, called: str = "") -> str
     """Return a phrase with a gain, its interval and its basis."""
     ends = [headline.signed(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
     interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
-    return f"{_gained(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
+    return f"{_format_gain(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
 
 
-def _gained(comparison: Comparison, row: ComparisonRow) -> str:
+def _format_gain(comparison: Comparison, row: ComparisonRow) -> str:
     gained = headline.signed(row.gain.mean, comparison.measure.name)
     return f"{gained} points" if comparison.measure.name == "points" else f"{comparison.measure.name} {gained}"
 

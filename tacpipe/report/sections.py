@@ -172,7 +172,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
         rows = comparison.of(kind)  # type: ignore[arg-type]
         if rows:
             groups.append(Group([_line(comparison, row, extra, "quiet") for row in rows], title))
-    score = [] if _same(comparison) else [comparison.measure.scored]
+    score = [] if _is_score_column(comparison) else [comparison.measure.scored]
     heads = [
         "",
         *comparison.measure.columns,
@@ -186,7 +186,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
     return Table(comparison.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
 
-def _same(comparison: Comparison) -> bool:
+def _is_score_column(comparison: Comparison) -> bool:
     """Return whether the score is already among the columns."""
     return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in comparison.rows) or all(
         row.score.mean == row.values[0] for row in comparison.rows
@@ -199,7 +199,7 @@ def _line(
     score = row.score
     ends = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
     cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
-    cells += [] if _same(comparison) else [number(score.mean)]
+    cells += [] if _is_score_column(comparison) else [number(score.mean)]
     cells += [ends, number(row.spread, 3), screen.gain(comparison, row), row.baseline or NONE, p_value(row.p)]
     cells += [make(row) for _, make in extra]
     counts = {comparison.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
@@ -212,7 +212,7 @@ def recordings(context: Context) -> list[Fold]:
     parts: list[blocks.Block] = []
     for comparison in context.comparisons:
         row = context.row(comparison, context.winner(comparison.question.part))
-        parts += _by_recording(comparison, row) if row else []
+        parts += _recording_table(comparison, row) if row else []
     if not parts:
         return []
     command = SmallPrint(
@@ -222,7 +222,7 @@ def recordings(context: Context) -> list[Fold]:
     return [Fold("Recordings", [command, *parts], "where the best method fails, and the command to look at it")]
 
 
-def _by_recording(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
+def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
     measure, question = comparison.measure, comparison.question
     best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
     mine = pairing.add_by_key((name, comparison) for (_, name), comparison in row.method.sums(question).items())

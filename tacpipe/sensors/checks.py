@@ -58,7 +58,7 @@ def crc16_ccitt(data: Bytes) -> Counts:
 
 def crc16_wts(data: Bytes) -> Counts:
     """Return the checksum of Weiss WTS frames (frame,): the table of 0x1021, shifted to the right, initial value 0xFFFF."""
-    return _crc(data, _mixed, 0x1021, 16, b"\xff\xff").astype(np.uint16)
+    return _crc(data, _mixed_table, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 
 
 def crc32(data: Bytes) -> NDArray[np.uint32]:
@@ -129,7 +129,7 @@ def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Ste
     return table, step
 
 
-def _mixed(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
+def _mixed_table(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
     """Return the table of `_high_bit_first` with the step of `_low_bit_first`."""
     return _high_bit_first(polynomial, bits)[0], _step_low_bit_first
 

@@ -272,7 +272,7 @@ class Parser:
     def _strip_affixes(self, lines: Sequence[bytes]) -> list[bytes] | None:
         """Return the lines without checksum, prefix and suffix, or None if a line lacks one or its checksum is wrong."""
         if self.sum is not None:
-            bodies = _without_sum(lines, self.sum)
+            bodies = _strip_checksums(lines, self.sum)
             if bodies is None:
                 return None
             lines = bodies
@@ -294,7 +294,7 @@ class Parser:
             texts = number_texts.select(texts, _cell_indices(len(lines), len(self.cells), self._channels))
         absent = None
         if self.missing:
-            texts, absent = _without_missing(texts, self.missing)
+            texts, absent = _fill_missing(texts, self.missing)
         joined = number_texts.concatenate(texts)
         if joined.translate(None, NUMBER_CHARACTERS.replace(b".", self.decimal)):
             return None
@@ -367,7 +367,7 @@ class Parser:
         return numbers
 
 
-def _without_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Array, Bools | None]:
+def _fill_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Array, Bools | None]:
     """Replace the texts of missing values by 0, and return a mask (text,) of them, or None if there are none."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -403,7 +403,7 @@ def _cast_checked(numbers: AnyArray, kind: str) -> AnyArray | None:
     return None if out_of_range else numbers.astype(target)
 
 
-def _without_sum(lines: Sequence[bytes], total: LineSum) -> list[bytes] | None:
+def _strip_checksums(lines: Sequence[bytes], total: LineSum) -> list[bytes] | None:
     """Return the lines up to the mark of their checksum, or None if a checksum is missing or wrong."""
     mark, begin = total.mark.encode(), total.begin.encode()
     digits = re.compile(

@@ -187,11 +187,11 @@ class Frustum:
         with np.errstate(invalid="ignore", divide="ignore"):
             outward = at_m[:, :2] / from_axis[:, None]
         side = np.column_stack([outward, np.full(len(at_m), -self.slope)]) / np.hypot(1, self.slope)
-        return np.where(self._on_side(at_m)[:, None], side, -DOWN_Z * np.sign(at_m[:, 2:]))
+        return np.where(self._is_on_side(at_m)[:, None], side, -DOWN_Z * np.sign(at_m[:, 2:]))
 
     def bending(self, at_m: Floats) -> Floats:
         """Return cos(half angle) / radius around the axis on the side (point, xyz, xyz), and zeros on the ends."""
-        on = np.flatnonzero(self._on_side(at_m))
+        on = np.flatnonzero(self._is_on_side(at_m))
         bending = np.zeros((len(at_m), 3, 3))
         from_axis = np.hypot(at_m[on, 0], at_m[on, 1])
         about = np.column_stack([-at_m[on, 1], at_m[on, 0], np.zeros(len(on))]) / from_axis[:, None]
@@ -204,7 +204,7 @@ class Frustum:
         end = np.where(at_m[:, 2] > 0, self.top_m, self.bottom_m)
         from_axis = np.hypot(at_m[:, 0], at_m[:, 1])
         along = (self.half_m - np.abs(at_m[:, 2])) * np.hypot(1, self.slope)
-        return np.where(self._on_side(at_m), along, end - from_axis)
+        return np.where(self._is_on_side(at_m), along, end - from_axis)
 
     def rests(self) -> list[Rest]:
         """Return standing on the wider end, unless the body is too tall, and lying on the side."""
@@ -214,7 +214,7 @@ class Frustum:
         outward = np.array([1.0, 0.0, -self.slope]) / np.hypot(1, self.slope)
         return [*standing, Rest(-outward, float(self.middle_m / np.hypot(1, self.slope)))]
 
-    def _on_side(self, at_m: Floats) -> Bools:
+    def _is_on_side(self, at_m: Floats) -> Bools:
         from_axis = np.hypot(at_m[:, 0], at_m[:, 1])
         from_side = np.abs(from_axis - self.middle_m - self.slope * at_m[:, 2])
         return np.asarray(from_side <= np.abs(self.half_m - np.abs(at_m[:, 2])))

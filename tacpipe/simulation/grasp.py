@@ -174,7 +174,7 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
     else:
         streams["cloud"] = scene.cloud.table()
         no_drift = np.zeros((1, len(biotac_sp.FINGERS)))
-        streams["reading"] = _logged(np.array([t_ns + READ_NS]), hand, readings.signal[None], no_drift, rig, rng)
+        streams["reading"] = _noisy_stream(np.array([t_ns + READ_NS]), hand, readings.signal[None], no_drift, rig, rng)
     bound = error_bound(hand, scene, rig, np.random.default_rng([seed, BOUND, index]))
     streams["truth"] = truth_table(t_ns, scene, readings, bound, moments_ns)
     return RecordingOutput(streams, _attributes(scene, session(index, rig)))
@@ -214,10 +214,10 @@ def _readings_over_time(
     centre = np.broadcast_to(readings.touch.centre_m, (len(force), *readings.touch.centre_m.shape[1:]))
     counts = fingertip_sp.signal(hand, force, contact, skin, centre) + readings.drift
     speed = np.gradient(force, course.t_ns / 1e9, axis=0)
-    return _logged(course.t_ns, hand, counts, speed, rig, rng)
+    return _noisy_stream(course.t_ns, hand, counts, speed, rig, rng)
 
 
-def _logged(
+def _noisy_stream(
     t_ns: Times,
     hand: fingertip_sp.Sensors,
     signal: Floats,

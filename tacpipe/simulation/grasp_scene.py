@@ -100,7 +100,7 @@ def antipodal_grasps(
     ``shift`` is the largest shift of the point as a fraction of half the cloud's length. With ``central``, the body's origin
     is used instead. Finger 1, at ``g1``, is on the camera's left, as on the published rig.
     """
-    through = placed.origin_m if central else _inside(placed, _shifted(seen_m, shift, rng))
+    through = placed.origin_m if central else _inside(placed, _shift_along_axis(seen_m, shift, rng))
     if through is None:
         return None
     directions = _level_directions(up, rng)
@@ -118,7 +118,7 @@ def antipodal_grasps(
     return Grasp(first[chosen], second[chosen], np.column_stack([approach, closing, np.cross(approach, closing)]))
 
 
-def _shifted(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
+def _shift_along_axis(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
     """Return the visible point (xyz) in metres that is closest to a random point on the first principal axis."""
     centre = seen_m.mean(axis=0)
     axis = np.linalg.eigh(np.cov(seen_m.T))[1][:, -1]
@@ -267,7 +267,7 @@ def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
         situation = pinch.situation(placed, grasp, thing.compliance_1_pa)
         hidden = pinch.draw_unseen(rng, 1, rig.effort_spread)
         scene = GraspScene(thing, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
-        return scene if scale == 1 else _scaled(scene, scale)
+        return scene if scale == 1 else _scale_scene(scene, scale)
     raise TacpipeError(f"The object {thing.name} could not be grasped in {MAX_POSES} poses; use another seed.")
 
 
@@ -279,7 +279,7 @@ def read_sensors(hand: fingertip_sp.Sensors, scene: GraspScene, t_ns: int, rig: 
     return Readings(touch, drift, signal + drift)
 
 
-def _scaled(scene: GraspScene, scale: float) -> GraspScene:
+def _scale_scene(scene: GraspScene, scale: float) -> GraspScene:
     """Return a scene with all lengths multiplied by ``scale``. The camera's image does not change."""
     thing = replace(scene.thing, shape=Ellipsoid(np.full(3, REFERENCE_M * scale)))
     placed = Placed(thing.shape, scene.placed.rotation, scene.placed.origin_m * scale)

@@ -132,13 +132,15 @@ def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> Recording
             columns = [*clocks, *measure(block).T]  # noqa: B023
             return schema.stream(start_ns + arrived_ns[block], columns, [*_clock_fields(), *fields])  # noqa: B023
 
-        streams[name] = _in_blocks(len(samples.seq), build_rows, spill)
+        streams[name] = _build_in_blocks(len(samples.seq), build_rows, spill)
         labels |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
-    streams["truth"] = _in_blocks(len(scene.path.t_ns), _truth(scene, start_ns), spill)
+    streams["truth"] = _build_in_blocks(len(scene.path.t_ns), _truth(scene, start_ns), spill)
     return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | labels)
 
 
-def _in_blocks(rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill) -> pa.Table | pa.RecordBatchReader:
+def _build_in_blocks(
+    rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill
+) -> pa.Table | pa.RecordBatchReader:
     """Return a stream of ``rows`` rows, built in blocks that are spilled to disk."""
     gathered = Gathered(spill, build_rows(slice(0, 0)))
     for first in range(0, rows, BLOCK_ROWS):

@@ -40,7 +40,7 @@ class Bucket:
 
     def __init__(self, address: BucketAddress | str, client: Any = None) -> None:
         self.place = str(address)
-        self._client = client if isinstance(address, str) else _connected(address)
+        self._client = client if isinstance(address, str) else _connect(address)
         self._large = Semaphore(_LARGE)
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
@@ -70,7 +70,7 @@ class Bucket:
             )
 
         with self._large:
-            self._tried(send, tries=1 if blocks is content else TRIES)
+            self._retry(send, tries=1 if blocks is content else TRIES)
         return True
 
     def _create(self, name: str, content: bytes) -> bool:
@@ -94,7 +94,7 @@ class Bucket:
 
         try:
             for _ in range(TRIES):
-                created = self._tried(put_object)
+                created = self._retry(put_object)
                 if created is not None:
                     return created
                 time.sleep(PAUSE_S)
@@ -123,7 +123,7 @@ class Bucket:
             size = int(response.meta["size"])
             return bytes(response.bytes()) if size <= PART_BYTES else b"", size
 
-        first, size = self._tried(begin)
+        first, size = self._retry(begin)
         if max_bytes is not None and size > max_bytes:
             raise regular.IrregularError(
                 f"{self.place}/{name} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged "
@@ -146,14 +146,14 @@ class Bucket:
     def _range(self, name: str, start: int, end: int) -> bytes:
         import obstore
 
-        return self._tried(lambda: bytes(obstore.get_range(self._client, name, start=start, end=end)))
+        return self._retry(lambda: bytes(obstore.get_range(self._client, name, start=start, end=end)))
 
     def stat(self, name: str) -> Entry | None:
         """Implement `Backend.stat`."""
         import obstore
 
         try:
-            head = self._tried(lambda: obstore.head(self._client, name))
+            head = self._retry(lambda: obstore.head(self._client, name))
         except FileNotFoundError:
             return None
         return Entry(name, head["size"], head["last_modified"].timestamp())
@@ -176,7 +176,7 @@ class Bucket:
                 raise
             return [Entry(item["path"], item["size"], item["last_modified"].timestamp()) for item in page]
 
-        while page := self._tried(next_page):  # one request per page, so that reading only some names costs no more
+        while page := self._retry(next_page):  # one request per page, so that reading only some names costs no more
             new = [entry for entry in page if entry.name not in listed]
             listed.update(entry.name for entry in new)
             yield from new
@@ -192,7 +192,7 @@ class Bucket:
             if entry.bytes > _COPY_BYTES:
                 self.create(to, self._blocks(name, None))
             else:
-                self._tried(lambda: obstore.copy(self._client, name, to))
+                self._retry(lambda: obstore.copy(self._client, name, to))
         except FileNotFoundError:
             return False
         self.delete(name)
@@ -203,9 +203,9 @@ class Bucket:
         import obstore
 
         with contextlib.suppress(FileNotFoundError):
-            self._tried(lambda: obstore.delete(self._client, name))
+            self._retry(lambda: obstore.delete(self._client, name))
 
-    def _tried(self, request: Callable[[], Result], tries: int = 0) -> Result:
+    def _retry(self, request: Callable[[], Result], tries: int = 0) -> Result:
         """Return the result of a request, repeating it if the connection or the server fails. Raises `StorageError`."""
         import obstore
         from obstore.exceptions import BaseError
@@ -284,7 +284,7 @@ def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
         yield part
 
 
-def _connected(address: BucketAddress) -> Any:
+def _connect(address: BucketAddress) -> Any:
     """Return obstore's client for an address, with credentials from the environment or a profile."""
     with extras.explain_missing(f"A store at {address.scheme}://"):
         from obstore.exceptions import BaseError

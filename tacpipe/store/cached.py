@@ -38,13 +38,13 @@ def folder(address: BucketAddress) -> Path:
     Its name contains a digest of address and server, because the same address on another server is another store.
     """
     cache = os.environ.get(VARIABLE)
-    above = Path(cache).expanduser() if cache else _of_user() / "tacpipe"
+    above = Path(cache).expanduser() if cache else _user_cache() / "tacpipe"
     endpoint = addresses.settings(address).config.get("endpoint", "")
     label = "-".join([address.scheme, *address.path.split("/")])[:80].replace(" ", "_")
     return above.absolute() / f"{label}-{digest([str(address), endpoint])[:12]}"
 
 
-def _of_user() -> Path:
+def _user_cache() -> Path:
     cache = os.environ.get("XDG_CACHE_HOME", "")
     return Path(cache) if Path(cache).is_absolute() else Path("~/.cache").expanduser()
 

@@ -118,10 +118,10 @@ class Leases:
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
-                    running.append(_parsed(path))
+                    running.append(_read_lease(path))
                     continue
                 if not _has_locks(handle) and _seems_alive(path):
-                    running.append(_parsed(path))
+                    running.append(_read_lease(path))
                 else:
                     path.unlink(missing_ok=True)
                 os.close(handle)
@@ -167,11 +167,11 @@ class Announcing:
     def __init__(self, path: Path | str) -> None:
         self.path = str(path)
         self._handle = -1
-        self._parsed: set[str] = set()
+        self._read_lease: set[str] = set()
 
     def announce(self, names: Iterable[str]) -> None:
         """Announce that objects are used. Raises `TacpipeError` if the process that started the run has ended."""
-        new = [name for name in names if name not in self._parsed]
+        new = [name for name in names if name not in self._read_lease]
         if not new:
             return
         with readable_errors(Path(self.path).parent):
@@ -183,7 +183,7 @@ class Announcing:
                         "The process that started this run has ended, so nothing more is written."
                     ) from None
             write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
-        self._parsed.update(new)
+        self._read_lease.update(new)
 
     def close(self) -> None:
         """Stop announcing."""
@@ -200,7 +200,7 @@ def _release(path: Path, handle: int) -> None:
         os.close(handle)
 
 
-def _parsed(path: Path) -> Run:
+def _read_lease(path: Path) -> Run:
     return parsed(path, regular.content(path, LEASE_BYTES, follow=False))
 
 
@@ -260,15 +260,15 @@ def _holder(path: Path, unknown: str = "Another process") -> str:
     """Return a phrase with the holder of a lease and whether it is stopped."""
     note: Holder = {}
     with contextlib.suppress(OSError, TacpipeError):  # the holder's name only informs the user
-        note = _parsed(path).note
+        note = _read_lease(path).note
     if "pid" not in note:
         return unknown
-    stopped = ", which is stopped: `kill -CONT` lets it continue," if _stopped(note) else ""
+    stopped = ", which is stopped: `kill -CONT` lets it continue," if _is_stopped(note) else ""
     prefix = "process" if unknown[0].islower() else "Process"
     return f"{prefix} {note['pid']} on {note.get('host')} ({note.get('command')}){stopped}"
 
 
-def _stopped(note: Holder) -> bool:
+def _is_stopped(note: Holder) -> bool:
     if note.get("host") != platform.node():
         return False
     try:
@@ -279,7 +279,7 @@ def _stopped(note: Holder) -> bool:
 
 def _seems_alive(path: Path) -> bool:
     """Return whether a run may be active, on a file system without locks."""
-    note = _parsed(path).note
+    note = _read_lease(path).note
     if note.get("host") == platform.node() and "pid" in note:
         try:
             os.kill(note["pid"], 0)

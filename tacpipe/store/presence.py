@@ -170,7 +170,7 @@ class Look:
     def unchanged(self) -> bool:
         """Return whether the directory has the same names and files as at the start of the check."""
         with contextlib.suppress(OSError, TacpipeError):
-            if self._settled()(self._directory_state) is not None:
+            if self._settled_states()(self._directory_state) is not None:
                 return _state(self._directory) == self._directory_state
         return _inodes(self._directory) == self.inodes
 
@@ -189,9 +189,9 @@ class Look:
         if listed:
             self.begin()
             same = same and _state(self._directory) == self._directory_state
-        if not same and _listing(self._directory_state, self.inodes) != head.listing:
+        if not same and _listing_digest(self._directory_state, self.inodes) != head.listing:
             return False
-        changed = self._changed(note)
+        changed = self._changed_shelves(note)
         if not all(self._lie(note.rows(shelf)) for shelf in changed):
             return False
         if not listed and (head.directory != self._directory_state or len(changed) > _MAX_CHANGED):
@@ -209,15 +209,15 @@ class Look:
             return False
         with contextlib.suppress(OSError, TacpipeError, KeyError):
             rows = [(name, size, inodes[path]) for path, name, size in contents]
-            rows.append(self._stored(head.manifest))
-            settled = self._settled()
-            if _inodes(self._directory) != inodes or not self._alike(rows):
+            rows.append(self._object_row(head.manifest))
+            settled = self._settled_states()
+            if _inodes(self._directory) != inodes or not self._lists_inodes(rows):
                 return False
             shelves = {
                 shelf: (settled(self._shelves[shelf]), encode_note(shelf_rows))
                 for shelf, shelf_rows in shelved_notes(rows)
             }
-            listing = _listing(directory_state, inodes)
+            listing = _listing_digest(directory_state, inodes)
             write_note(
                 self._store,
                 self._directory,
@@ -241,13 +241,13 @@ class Look:
             for path in before:
                 expected.pop(path, None)
             placed = [*now]
-            new = [self._stored(name) for _, name, _ in placed]
+            new = [self._object_row(name) for _, name, _ in placed]
             expected |= {path: row[2] for (path, _, _), row in zip(placed, new, strict=True)}
             inodes = _inodes(self._directory)
             if any(inodes.get(path) != inode for path, inode in expected.items()):
                 return False
-            added = dict(shelved_notes({*new, self._stored(head.manifest)}))
-            settled = self._settled()
+            added = dict(shelved_notes({*new, self._object_row(head.manifest)}))
+            settled = self._settled_states()
             shelves = {}
             for shelf in {*note.shelves, *added}:
                 state, content = self._shelves[shelf], note.content(shelf)
@@ -258,7 +258,7 @@ class Look:
                     state if is_unchanged else settled(state),
                     content + encode_note(added.get(shelf, ())),
                 )
-            listing = _listing(directory_state, inodes)
+            listing = _listing_digest(directory_state, inodes)
             write_note(
                 self._store, self._directory, replace(head, boot=_boot(), directory=None, listing=listing), shelves
             )
@@ -268,7 +268,7 @@ class Look:
     def _renew(self, note: Note, changed: Collection[str]) -> None:
         """Note the current states of folders where that is safe; everything in the note was found."""
         with contextlib.suppress(OSError, TacpipeError):
-            settled = self._settled()
+            settled = self._settled_states()
             directory_state = settled(self._directory_state) or note.head.directory
             states = {shelf: settled(self._shelves[shelf]) for shelf in changed}
             gained = sum(state is not None for state in states.values()) > _MAX_CHANGED
@@ -282,10 +282,10 @@ class Look:
                 shelves[shelf] = states.get(shelf, state), content
             write_note(self._store, self._directory, replace(note.head, directory=directory_state), shelves)
 
-    def _changed(self, note: Note) -> set[str]:
+    def _changed_shelves(self, note: Note) -> set[str]:
         return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
 
-    def _stored(self, name: str) -> Row:
+    def _object_row(self, name: str) -> Row:
         """Return digest, size and inode of an object. Raises `KeyError` if it is not a file of the directory."""
         status = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
         if (
@@ -299,15 +299,15 @@ class Look:
     def _lie(self, rows: Iterable[Row] | None) -> bool:
         """Return whether every noted object is still in place and is the same file."""
         try:
-            return rows is not None and all(self._stored(row[0]) == row for row in rows)
+            return rows is not None and all(self._object_row(row[0]) == row for row in rows)
         except (OSError, KeyError):
             return False
 
-    def _alike(self, rows: Sequence[Row]) -> bool:
+    def _lists_inodes(self, rows: Sequence[Row]) -> bool:
         """Return whether listing the directory gives the inodes of its files, which is not the case on every file system."""
         return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
 
-    def _settled(self) -> Callable[[State | None], State | None]:
+    def _settled_states(self) -> Callable[[State | None], State | None]:
         """Return a function that maps a folder's state at the start of the check to None if the folder had just changed.
 
         The next change might then have the same time. Raises `TacpipeError` if changes do not update the time of a
@@ -337,7 +337,7 @@ def _inodes(directory: Path) -> dict[str, int]:
     return {}
 
 
-def _listing(state: State, inodes: Mapping[str, int]) -> str:
+def _listing_digest(state: State, inodes: Mapping[str, int]) -> str:
     """Return the digest of a directory's device, names and inodes."""
     names = sorted(inodes)
     hasher = hashlib.sha256("\0".join([str(state[0]), *names]).encode(errors="surrogateescape"))

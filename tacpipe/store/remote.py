@@ -154,14 +154,14 @@ class RemoteStore:
 
     def sizes(self, names: Collection[str]) -> dict[str, int]:
         """Return the sizes in bytes of the objects that exist."""
-        entries = self._entries_at("objects", {layout.object_name(name): name for name in names})
+        entries = self._existing_entries("objects", {layout.object_name(name): name for name in names})
         return {name: entry.bytes for name, entry in entries.items()}
 
     def present(self, keys: Iterable[str]) -> set[str]:
         """Return the keys that have a record, valid or damaged."""
-        return set(self._entries_at("records", {layout.record_name(key): key for key in keys}))
+        return set(self._existing_entries("records", {layout.record_name(key): key for key in keys}))
 
-    def _entries_at(self, folder: str, names_by_path: Mapping[str, str]) -> dict[str, Entry]:
+    def _existing_entries(self, folder: str, names_by_path: Mapping[str, str]) -> dict[str, Entry]:
         """Return the entries of the names (values) whose paths (keys) exist in a folder.
 
         The folder is listed while that costs no more than single requests; the remaining paths are requested one by

@@ -113,9 +113,9 @@ class RemoteRoots:
     def _read(self, only: str = "") -> Iterator[tuple[str, Root | None]]:
         """Yield the name and newest version of each root, or only of one; None for a damaged root."""
         newest = {name: versions[-1] for name, versions in self._versions(only).items()}
-        return zip(newest, threads.map_in_threads(self._at, newest.values(), MAX_CONCURRENT), strict=True)
+        return zip(newest, threads.map_in_threads(self._read_version, newest.values(), MAX_CONCURRENT), strict=True)
 
-    def _at(self, version: tuple[int, str]) -> Root | None:
+    def _read_version(self, version: tuple[int, str]) -> Root | None:
         number, file = version
         with contextlib.suppress(FileNotFoundError):
             root = read_twice(self.files, file, ROOT_BYTES, _parse)

@@ -190,7 +190,7 @@ def decoded(value: object) -> Root | None:
     """Return the root in a JSON value, or None if it is damaged."""
     root = dict(value) if isinstance(value, dict) else {}
     check = root.pop("check", None)
-    return root if check is not None and check == digest(root) and _formed(root) else None
+    return root if check is not None and check == digest(root) and _is_valid_root(root) else None
 
 
 def project_id(root: Root) -> str:
@@ -210,7 +210,7 @@ def succeeding(current: Root | None, path: str, kind: str, manifest: str, *, las
     }
 
 
-def _formed(root: dict[object, Any]) -> TypeGuard[Root]:
+def _is_valid_root(root: dict[object, Any]) -> TypeGuard[Root]:
     """Return whether the values of a root have the right types; another program may have written it."""
     project, history = root.get("project", {"id": "", "name": ""}), root.get("history", [])
     if not (

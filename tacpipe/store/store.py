@@ -254,11 +254,11 @@ class Store:
         except FileNotFoundError:
             if self._put_back(name):
                 return self._read(name, size)
-            raise self._missing(name) from None
+            raise self._absent_error(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
         if bytes_digest(content) != name:
-            raise self._damaged(name)
+            raise self._damaged_error(name)
         return content
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
@@ -270,13 +270,13 @@ class Store:
                 hashed.update(block)
                 yield block
         except FileNotFoundError:
-            raise self._missing(name) from None
+            raise self._absent_error(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
         if hashed.hexdigest() != name:
-            raise self._damaged(name)
+            raise self._damaged_error(name)
 
-    def _missing(self, name: str) -> AbsentError:
+    def _absent_error(self, name: str) -> AbsentError:
         return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
 
     def _irregular(self, name: str, error: regular.IrregularError) -> MissingError:
@@ -285,7 +285,7 @@ class Store:
             self._exists(name)
         return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {str(error).rstrip('.')}.")
 
-    def _damaged(self, name: str) -> MissingError:
+    def _damaged_error(self, name: str) -> MissingError:
         moved = self.quarantine(self.object_path(name))
         outcome = f"is now in {self._root}/quarantine" if moved else "cannot be moved out of the way"
         return MissingError(f"Object {name[:12]} was damaged and {outcome}.")

@@ -27,7 +27,7 @@ def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Ke
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
-        return [_at_rows(stream, name, pa.array(exact), "none", keep) for name in stream.channels]
+        return [_channel_at_rows(stream, name, pa.array(exact), "none", keep) for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
         groups.setdefault(streams.method(stream.columns.schema, name), []).append(name)
@@ -35,17 +35,17 @@ def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Ke
     if "nearest" in groups:
         rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
         for name in groups.pop("nearest"):
-            grid_columns[name] = _at_rows(stream, name, rows, "nearest", keep)
+            grid_columns[name] = _channel_at_rows(stream, name, rows, "nearest", keep)
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         interpolation = method.partition(" ")[0]
         rows = slice(None) if interpolation == "median" else used
         for block in _blocks(stream, members, interpolation, len(grid_ns)):
             for name, column in zip(
-                block, _between_samples(stream, block, interpolation, grid_ns, rows).T, strict=True
+                block, _interpolate_samples(stream, block, interpolation, grid_ns, rows).T, strict=True
             ):
                 kind = streams.interpolated_type(stream.columns.schema.field(name).type)
-                grid_columns[name] = _as_stored(
+                grid_columns[name] = _to_column(
                     streams.grid_field(stream.name, stream.field(name), interpolation, kind), column, keep
                 )
     return [grid_columns[name] for name in stream.channels]
@@ -68,13 +68,13 @@ def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[Gri
             kind = streams.interpolated_type(stream.columns.schema.field(name).type)
             field = streams.grid_field(stream.name, stream.field(name), "median", kind)
             values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, ONLINE_MEDIAN_NS)
-            grid_columns.append(_as_stored(field, values[:, 0], keep))
+            grid_columns.append(_to_column(field, values[:, 0], keep))
         else:
-            grid_columns.append(_at_rows(stream, name, rows, "hold", keep))
+            grid_columns.append(_channel_at_rows(stream, name, rows, "hold", keep))
     return grid_columns
 
 
-def _at_rows(stream: TimedStream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
+def _channel_at_rows(stream: TimedStream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
     """Return field and values of a channel at ``rows`` with the same type; ``interpolation`` names the method."""
     return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
 
@@ -89,7 +89,9 @@ def _blocks(stream: TimedStream, members: list[str], interpolation: str, points:
     return [members[first : first + size] for first in range(0, len(members), size)]
 
 
-def _between_samples(stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any) -> Floats:
+def _interpolate_samples(
+    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any
+) -> Floats:
     """Interpolate channels (grid, channel) from the rows ``used``."""
     import numpy as np
 
@@ -104,7 +106,7 @@ def _between_samples(stream: TimedStream, names: list[str], interpolation: str, 
     return linear(t_ns, values, grid_ns)
 
 
-def _as_stored(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
+def _to_column(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
     import numpy as np
 
     return kind, keep(np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype()))

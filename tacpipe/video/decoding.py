@@ -130,9 +130,9 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
             packet.pts = packet.dts = row
             packet.is_keyframe = bool(columns[KEY_FRAME])  # FFmpeg would add other PNG images to the previous one
             for frame in context.decode(packet):
-                yield _numbered(video_format, frame)
+                yield _row_and_frame(video_format, frame)
         for frame in context.decode(None) if started else ():
-            yield _numbered(video_format, frame)
+            yield _row_and_frame(video_format, frame)
     except (av.error.FFmpegError, ValueError) as error:
         reason = plain(str(getattr(error, "strerror", None) or error), 100)
         raise TacpipeError(
@@ -161,7 +161,7 @@ def open_decoder(video_format: VideoFormat) -> Any:
     return context
 
 
-def _numbered(video_format: VideoFormat, frame: Any) -> tuple[int, Any]:
+def _row_and_frame(video_format: VideoFormat, frame: Any) -> tuple[int, Any]:
     if (frame.width, frame.height) != (video_format.width_px, video_format.height_px):
         raise TacpipeError(
             f"Frame {frame.pts} has {frame.width} x {frame.height} pixels, and the stream {video_format.width_px} x "

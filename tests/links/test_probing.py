@@ -114,7 +114,7 @@ def test_the_bauds_of_drivers_that_know_the_device_come_first() -> None:
     bauds = probing._bauds("16d0:14cc")  # a Robotiq, at 115,200 as most
     assert bauds[0] == 115_200
     assert len(bauds) == len(set(bauds)) >= 5
-    assert probing._by_usb(candidates(Chunks.from_pairs([]), "serial"), "16d0:14cc")[0].kind == "robotiq"
+    assert probing._sort_by_usb_id(candidates(Chunks.from_pairs([]), "serial"), "16d0:14cc")[0].kind == "robotiq"
 
 
 def test_a_port_that_cannot_be_opened_is_reported_with_its_reason() -> None:

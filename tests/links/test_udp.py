@@ -259,7 +259,7 @@ def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hos
     with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.queued = [(names[host], host.encode()) for host in "abab"]
         link = network.UdpLink("crowd", port, prompt=True, sender=sender)
-        datagrams = link._queued()
+        datagrams = link._read_queue()
 
         assert b"".join(data for _, data in datagrams).decode() == hosts
         assert link.foreign == foreign
@@ -271,7 +271,7 @@ def test_a_flood_is_left_to_the_next_read() -> None:
         port.queued = [("192.0.2.1", b"x")] * (network.MAX_FETCHED + 10)
         link = network.UdpLink("flood", port, prompt=True)
 
-        assert [len(link._queued()), len(link._queued())] == [network.MAX_FETCHED, 10]
+        assert [len(link._read_queue()), len(link._read_queue())] == [network.MAX_FETCHED, 10]
         link.close()
 
 

@@ -22,11 +22,11 @@ class Stepping(Bucket):
         for name, value in content.items():
             assert self.create(name, value)
 
-    def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
+    def _retry(self, request: Callable[[], Any], tries: int = 0) -> Any:
         self.steps += 1
         if self.steps == self._step:
             self._action()
-        return super()._tried(request, tries)
+        return super()._retry(request, tries)
 
     def begin(self, step: int, action: Callable[[], object]) -> None:
         """Count steps from here, and call ``action`` before the step of this number."""

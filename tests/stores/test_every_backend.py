@@ -161,9 +161,9 @@ def test_only_as_many_pages_are_asked_for_as_are_used(without_profiles: None, mo
     requests = []
 
     class Asked(bucket.Bucket):
-        def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
+        def _retry(self, request: Callable[[], Any], tries: int = 0) -> Any:
             requests.append(request)
-            return super()._tried(request, tries)
+            return super()._retry(request, tries)
 
     monkeypatch.setattr(bucket, "PAGE", 2)
     counting_bucket = Asked("s3://lab/store", MemoryStore())

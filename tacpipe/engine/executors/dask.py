@@ -87,7 +87,7 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
     `MissingModuleError` if Dask is not installed.
     """
     if not address:
-        with _started(jobs or provenance.jobs()) as workers:
+        with _start_workers(jobs or provenance.jobs()) as workers:
             yield workers
         return
     if not _is_here(address):
@@ -146,7 +146,7 @@ class Dask:
         task_chunks = [[_absolute(task) for task in chunk] for chunk in divide_into_chunks(tasks, workers, _MAX_BATCH)]
         summary = f"{len(tasks)} tasks were given to {workers} workers"
         with (
-            self._followed(tasks) as topic,
+            self._follow_task(tasks) as topic,
             termination.reporting(
                 f"tacpipe: interrupted; {summary}: those that wait are cancelled, those at work end."
             ),
@@ -164,7 +164,7 @@ class Dask:
                     self.client.cancel(futures)  # type: ignore[no-untyped-call]
 
     @contextlib.contextmanager
-    def _followed(self, tasks: Sequence[WorkerTask]) -> Iterator[str]:
+    def _follow_task(self, tasks: Sequence[WorkerTask]) -> Iterator[str]:
         """Follow the training of a task in a worker. Yields the topic of its messages, "" without followers.
 
         Followers are called in a separate thread, because the client's thread must not wait for a tracker's server.
@@ -176,7 +176,7 @@ class Dask:
                 return
             topic = f"tacpipe-{uuid.uuid4().hex}"
             messages: Queue[following.TrainingMessage | None] = Queue()
-            thread = threading.Thread(target=_passed_on, args=(messages, followers), daemon=True)
+            thread = threading.Thread(target=_pass_messages, args=(messages, followers), daemon=True)
             thread.start()
             self.client.subscribe_topic(topic, lambda event: messages.put(event[1]))  # type: ignore[no-untyped-call]
             try:
@@ -228,7 +228,7 @@ class Dask:
 
 
 @contextlib.contextmanager
-def _started(workers: int) -> Iterator[Dask]:
+def _start_workers(workers: int) -> Iterator[Dask]:
     """Yield single-threaded worker processes on this computer that end with the block or with this process."""
     with extras.explain_missing("The executor dask"):
         import cryptography  # noqa: F401  (TLS of one command's own: other users of this computer reach its port)
@@ -318,7 +318,7 @@ def _absolute(task: WorkerTask) -> WorkerTask:
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
-def _passed_on(messages: Queue[following.TrainingMessage | None], followers: Sequence[following.Follower]) -> None:
+def _pass_messages(messages: Queue[following.TrainingMessage | None], followers: Sequence[following.Follower]) -> None:
     """Call followers with each message until None arrives."""
     receiver = following.Receiver(followers)
     while (message := messages.get()) is not None:
@@ -363,14 +363,14 @@ def _check(name: str, versions: Mapping[str, str], task: WorkerTask) -> None:
             store.record(digest(task.identity))
         except TacpipeError as error:
             raise TacpipeError(f"Worker {name} does not reach the store: {error}") from error
-    elif task.run and not _at_work(task.run):
+    elif task.run and not _is_run_alive(task.run):
         raise TacpipeError(
             f"Worker {name} does not find the store {task.store} as this command sees it, or the command has ended: workers "
             f"need the store at the same path, as on a shared file system."
         )
 
 
-def _at_work(run: str) -> bool:
+def _is_run_alive(run: str) -> bool:
     """Return whether the command that started a run is still running, according to its lease."""
     return os.path.exists(run)  # noqa: PTH110
 
@@ -396,7 +396,7 @@ def _keep(store: Store, run: str, lease_paths: Queue[str]) -> None:
     run_ended = threading.Event()
     with store.leases.running() as announcing:
         lease_paths.put(announcing.path)
-        while _at_work(run):
+        while _is_run_alive(run):
             run_ended.wait(_POLL_S)
         with _one_at_a_time:
             del _leases[run]

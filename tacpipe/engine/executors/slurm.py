@@ -56,8 +56,8 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     with (
         dask_workers.quiet(),
         dask.config.set(dask_workers.NO_PAGES),
-        tempfile.TemporaryDirectory(prefix="slurm-", dir=_shared(dask.config)) as folder,
-        _submitted(address, jobs, _certified(Path(folder)), Path(folder), dask.config) as cluster,
+        tempfile.TemporaryDirectory(prefix="slurm-", dir=_shared_folder(dask.config)) as folder,
+        _submit_jobs(address, jobs, _create_certificate(Path(folder)), Path(folder), dask.config) as cluster,
         Client(cluster, security=cluster.security, set_as_default=False) as client,  # type: ignore[no-untyped-call]
     ):
         _wait(client, _numbers(cluster), Path(folder))
@@ -74,7 +74,7 @@ def _interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _shared(config: Any) -> Path:
+def _shared_folder(config: Any) -> Path:
     """Return the shared folder for certificates and job output: the configured one, or one in the home directory."""
     configured = config.get(f"{SECTION}.shared-temp-directory")
     folder = Path(configured).expanduser() if configured else Path.home() / ".cache/tacpipe"
@@ -82,7 +82,7 @@ def _shared(config: Any) -> Path:
     return folder
 
 
-def _certified(folder: Path) -> Security:
+def _create_certificate(folder: Path) -> Security:
     """Return a new certificate and key, in files that only their owner can read."""
     from distributed import Security
 
@@ -103,7 +103,7 @@ def _certified(folder: Path) -> Security:
 
 
 @contextlib.contextmanager
-def _submitted(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
+def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
     """Submit the jobs, and cancel them at the end of the block."""
     from dask_jobqueue import SLURMCluster
 
@@ -173,10 +173,10 @@ def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
     """Wait until a job has started to work. Raises `TacpipeError` if all jobs end first."""
     began_s, is_noted = time.monotonic(), False
     while not client.scheduler_info(n_workers=-1)["workers"]:
-        if not _waiting(numbers):
+        if not _are_jobs_active(numbers):
             raise TacpipeError(
-                f"No job began to work: {', '.join(numbers)} ended at once. {_printed(folder)} Jobs need Python and tacpipe "
-                f"where this computer has them, and a way to reach it."
+                f"No job started to work: {', '.join(numbers)} ended at once. {_last_error_line(folder)} Jobs need Python "
+                f"and tacpipe at the same paths as on this computer, and a way to reach it."
             )
         if not is_noted and time.monotonic() - began_s > _SHOWN_S:
             is_noted = True
@@ -184,14 +184,14 @@ def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
         time.sleep(_POLL_S)
 
 
-def _waiting(numbers: Sequence[str]) -> bool:
+def _are_jobs_active(numbers: Sequence[str]) -> bool:
     """Return whether any of the jobs is pending or running; True if Slurm does not respond."""
     command = ["squeue", "--noheader", "--format=%T", "--jobs", ",".join(numbers)]
     queue = subprocess.run(command, check=False, capture_output=True, text=True)
     return queue.returncode != 0 or bool(queue.stdout.strip())
 
 
-def _printed(folder: Path) -> str:
+def _last_error_line(folder: Path) -> str:
     """Return the last line of a job's standard error as a sentence."""
     for file in sorted(folder.glob("*.err")):
         lines = file.read_text(errors="replace").strip().splitlines()

@@ -58,7 +58,7 @@ class Hdf5Tree:
         if group in self._members:
             return self._members[group]
         arrays, below = [], []
-        with self._reading(group or "its root"):
+        with self._convert_read_errors(group or "its root"):
             parent = self._file[group or "/"]
             for name in self._names(parent):
                 path = f"{group}/{name}" if group else name
@@ -77,13 +77,13 @@ class Hdf5Tree:
 
     def is_group(self, path: str) -> bool:
         """Return whether a group has this path."""
-        with self._reading(path or "its root"):
+        with self._convert_read_errors(path or "its root"):
             kind = self._file.get(path, getclass=True) if path else h5py.Group
             return kind is not None and issubclass(kind, h5py.Group)
 
     def attributes(self, group: str) -> StoredAttributes:
         """Return the readable attributes of a group."""
-        with self._reading(group or "its root"):
+        with self._convert_read_errors(group or "its root"):
             if group not in self._attributes_by_group:
                 self._attributes_by_group[group] = _read_attributes(self._file[group or "/"], self.path)
             return self._attributes_by_group[group]
@@ -95,7 +95,7 @@ class Hdf5Tree:
         place = f"{self.path}, {plain(array.path, 200)},"
         with (
             memory.bounded(limit_bytes, place) if array.dtype.hasobject else contextlib.nullcontext(),
-            self._reading(array.path),
+            self._convert_read_errors(array.path),
         ):
             dataset = self._file[array.path]
             if self._available is not None:
@@ -112,7 +112,7 @@ class Hdf5Tree:
         """Return None, because the file itself contains the encoding."""
 
     @contextlib.contextmanager
-    def _reading(self, place: str) -> Iterator[None]:
+    def _convert_read_errors(self, place: str) -> Iterator[None]:
         """Convert errors of h5py in the block to a `TacpipeError` with the file and the path in it."""
         try:
             yield

@@ -23,11 +23,11 @@ def declare_images(content: Batched, message_type: str) -> Batched:
     if PICTURE not in schema.names or not pa.types.is_binary(schema.field(PICTURE).type):
         return content
     if name == COMPRESSED:
-        return _with_metadata(content, {"quantity": "image"})
+        return _add_metadata(content, {"quantity": "image"})
     return _raw_images(content) if name in RAW else content
 
 
-def _with_metadata(content: Batched, metadata: dict[str, str], left_out: tuple[str, ...] = ()) -> Batched:
+def _add_metadata(content: Batched, metadata: dict[str, str], left_out: tuple[str, ...] = ()) -> Batched:
     """Return rows with metadata at the images and without some columns."""
     fields = [
         field.with_metadata({**(field.metadata or {}), **metadata}) if field.name == PICTURE else field
@@ -59,7 +59,7 @@ def _raw_images(content: Batched) -> Batched:
     sizes = {len(image) for table in content.read() for image in table.column(PICTURE).to_pylist()}
     if step < row_bytes or sizes != {step * height}:
         return content
-    declared = _with_metadata(content, video_format.to_metadata(), tuple(present))
+    declared = _add_metadata(content, video_format.to_metadata(), tuple(present))
     if step == row_bytes:
         return declared
 

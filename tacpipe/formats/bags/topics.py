@@ -104,7 +104,7 @@ class TopicRows:
 
         def read(piece: Piece) -> pa.Table:
             table = self._spill.read(piece)
-            return pa.table([_without_nulls(table, field) for field in schema], schema)
+            return pa.table([_fill_nulls(table, field) for field in schema], schema)
 
         count = sum(piece.rows for piece in self._pieces)
         content = Batched(schema, count, lambda: spill.in_order(self._pieces, read, clock))
@@ -133,7 +133,7 @@ def _column_type(kind: pa.DataType, absent: bool) -> pa.DataType:
     return pa.float64()
 
 
-def _without_nulls(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
+def _fill_nulls(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
     """Return a column cast to the type of ``field``, with NaN or empty text in place of nulls."""
     if field.name not in table.column_names:
         column = pa.chunked_array([pa.nulls(table.num_rows, field.type)])
@@ -282,7 +282,7 @@ class Json:
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages. Raises `TopicError` if one is not a JSON object."""
-        encoded = self._encoded()
+        encoded = self._base64_properties()
         rows: list[dict[str, Leaf]] = []
         for message in messages:
             try:
@@ -301,7 +301,7 @@ class Json:
             rows.append(row)
         yield block_from_rows(rows, dict.fromkeys(encoded, pa.binary()))
 
-    def _encoded(self) -> set[str]:
+    def _base64_properties(self) -> set[str]:
         try:
             schema = json.loads(self.schema or "{}")
             return {

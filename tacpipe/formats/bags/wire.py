@@ -116,15 +116,15 @@ class MessageShape:
         order = self.encoding.order
         if leaf.kind == "stamp":
             # ROS 1 seconds are unsigned, an unset ROS 2 stamp may be negative; both fit 32 bits until 2038
-            seconds = _numbers_at(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
-            return seconds * 10**9 + _numbers_at(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
+            seconds = _read_numbers(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
+            return seconds * 10**9 + _read_numbers(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
         kind = np.dtype(f"{order}{NUMBERS[leaf.kind]}")
-        values = _numbers_at(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
+        values = _read_numbers(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
         values = values.astype(kind.newbyteorder("="), copy=False)
         return values[:, 0] if leaf.count is None else values
 
 
-def _numbers_at(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
+def _read_numbers(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
     width = np.dtype(kind).itemsize * count
     if not width:
         return np.empty((len(matrix), 0), kind)
@@ -201,7 +201,7 @@ class _Walk:
     def message(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
         """Walk the fields of a message that starts at ``at`` and return its end."""
         if name in STAMPS:
-            at = self._aligned(at, 4)
+            at = self._align(at, 4)
             self._add(Leaf(path, "stamp", at, None, enclosing))
             return at + 8
         self.messages += 1
@@ -210,12 +210,12 @@ class _Walk:
         enclosing = (*enclosing, (len(path), name))
         fields = [field for field in self.types[name] if field[0] != "structure_needs_at_least_one_member"]
         if not fields:
-            return self._padding(at)
+            return self._skip_empty_byte(at)
         for field_name, description in fields:
             at = self._field(description, (*path, field_name), enclosing, at)
         return at
 
-    def _padding(self, at: int) -> int:
+    def _skip_empty_byte(self, at: int) -> int:
         """Skip the byte that CDR writes for a message without fields, also if its definition has only constants."""
         end = at + self.shape.encoding.aligned  # ROS 1 writes nothing
         if end > len(self.content):
@@ -236,7 +236,7 @@ class _Walk:
         kind = element[1][0] if int(element[0]) == _BASE else ""
         if kind in NUMBERS:
             width = np.dtype(NUMBERS[kind]).itemsize
-            at = self._aligned(at, width) if count else at
+            at = self._align(at, width) if count else at
             if at + width * count > len(self.content):
                 raise struct.error
             self._add(Leaf(path, kind, at, count, enclosing))
@@ -257,20 +257,20 @@ class _Walk:
         if kind not in NUMBERS:
             raise WireError(f"its field {'.'.join(map(str, path))} is a {plain(kind)}, which is not read")
         width = np.dtype(NUMBERS[kind]).itemsize
-        at = self._aligned(at, width)
+        at = self._align(at, width)
         if at + width > len(self.content):
             raise struct.error
         self._add(Leaf(path, kind, at, None, enclosing))
         return at + width
 
     def _length(self, at: int) -> tuple[int, int]:
-        at = self._aligned(at, 4)
+        at = self._align(at, 4)
         length: int
         (length,) = struct.unpack_from(f"{self.shape.encoding.order}I", self.content, at)
         self.shape.lengths.append(at)
         return length, at + 4
 
-    def _aligned(self, at: int, width: int) -> int:
+    def _align(self, at: int, width: int) -> int:
         start = self.shape.encoding.start
         gap = -(at - start) % width if self.shape.encoding.aligned else 0
         return at + gap

@@ -126,10 +126,10 @@ class LeRobotDescription:
             yield EpisodeDescription(
                 _episode_name(index, extra_values),
                 index,
-                self._place("data_path", DATA_PATHS["v2"], values),
+                self._format_path("data_path", DATA_PATHS["v2"], values),
                 length,
                 tuple(map(str, entry.get("tasks") or ())),
-                {key: self._place("video_path", "", {**values, "video_key": key}) for key in self._videos},
+                {key: self._format_path("video_path", "", {**values, "video_key": key}) for key in self._videos},
                 _plain_attributes(extra_values),
             )
 
@@ -165,10 +165,10 @@ class LeRobotDescription:
         for key in self._videos:
             at = {name: row.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
             if None not in at.values():
-                videos[key] = self._place("video_path", "", {**at, "video_key": key})
+                videos[key] = self._format_path("video_path", "", {**at, "video_key": key})
                 start_s = row.get(f"videos/{key}/from_timestamp")
                 starts_s[key] = float(start_s) if isinstance(start_s, int | float) else 0.0
-        file = self._place("data_path", DATA_PATHS["v3"], values)
+        file = self._format_path("data_path", DATA_PATHS["v3"], values)
         tasks = tuple(map(str, row.get("tasks") or ()))
         original = _original_attributes(path, row.get(ATTRIBUTES))
         return EpisodeDescription(
@@ -187,7 +187,7 @@ class LeRobotDescription:
     def _videos(self) -> list[str]:
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
-    def _place(self, key: str, usual: str, values: Mapping[str, str | int | None]) -> str:
+    def _format_path(self, key: str, usual: str, values: Mapping[str, str | int | None]) -> str:
         """Return a path in the dataset from a pattern in info.json."""
         pattern = str(self.info.get(key) or usual)
         try:

@@ -83,28 +83,28 @@ class NumpyArchive:
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
-        return list(self._places)
+        return list(self._column_sources)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns in ``types`` in blocks of rows."""
-        array_names = {self._places[name][0] for name in types}
+        array_names = {self._column_sources[name][0] for name in types}
         arrays = {name: array for name, array in self._arrays.items() if name in array_names}
         rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
         self._expect_same_length(arrays)
-        with contextlib.ExitStack() as stack, self._reading():
+        with contextlib.ExitStack() as stack, self._convert_errors():
             archive = stack.enter_context(self._archive())
             readers = {name: stack.enter_context(array.reading(archive)) for name, array in arrays.items()}
             count = next((array.rows for array in arrays.values()), 0)
             for start in range(0, count, rows) if count else (0,):
                 blocks = {name: read(min(rows, count - start)) for name, read in readers.items()}
-                yield pa.table({name: _column(blocks, *self._places[name]) for name in types})
+                yield pa.table({name: _column(blocks, *self._column_sources[name]) for name in types})
 
     def place(self, index: int) -> str:
         """Return the name of the data row ``index`` (from 0) in errors."""
         return f"row {index + 1}"
 
     @functools.cached_property
-    def _places(self) -> dict[str, tuple[str, int | None]]:
+    def _column_sources(self) -> dict[str, tuple[str, int | None]]:
         """The array of each column, and the column's position in a row of it."""
         places: list[tuple[str, tuple[str, int | None]]] = []
         for name, array in self._arrays.items():
@@ -144,7 +144,7 @@ class NumpyArchive:
         rows = max(1, BLOCK_BYTES // max(1, images.row_bytes))
 
         def read() -> Iterator[pa.Table]:
-            with contextlib.ExitStack() as stack, self._reading():
+            with contextlib.ExitStack() as stack, self._convert_errors():
                 archive = stack.enter_context(self._archive())
                 readers = {name: stack.enter_context(member.reading(archive)) for name, member in arrays.items()}
                 for start in range(0, images.rows, rows):
@@ -157,7 +157,7 @@ class NumpyArchive:
 
     @functools.cached_property
     def _arrays(self) -> dict[str, ArrayMember]:
-        with self._reading(), self._archive() as archive:
+        with self._convert_errors(), self._archive() as archive:
             members = [
                 ArrayMember.from_archive(archive, info, self.time_axis)
                 for info in archive.infolist()
@@ -179,7 +179,7 @@ class NumpyArchive:
             )
 
     @contextlib.contextmanager
-    def _reading(self) -> Iterator[None]:
+    def _convert_errors(self) -> Iterator[None]:
         try:
             yield
         except _ZIP_ERRORS as error:
@@ -330,7 +330,7 @@ class JsonLines:
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns in ``types`` in blocks of lines, with the same types in each block."""
-        for block in map(self._unfolded, self._blocks()):
+        for block in map(self._split_lists, self._blocks()):
             columns = {
                 name: block.column(name).cast(self._kinds[name], safe=False)  # includes integers in a column of floats
                 if name in block.column_names
@@ -341,7 +341,7 @@ class JsonLines:
 
     def head(self) -> pa.Table:
         """Return the first lines."""
-        return self._unfolded(next(self._blocks(), pa.table({})))
+        return self._split_lists(next(self._blocks(), pa.table({})))
 
     def place(self, index: int) -> str:
         """Return the name of the data row ``index`` (from 0) in errors."""
@@ -354,7 +354,7 @@ class JsonLines:
         widths: dict[str, int] = {}
         for block in self._blocks():
             self._widths(block, widths)
-            schemas.append(self._unfolded(block.slice(0, 1)).schema)
+            schemas.append(self._split_lists(block.slice(0, 1)).schema)
         try:
             full_schema = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
         except pa.ArrowException as error:
@@ -367,13 +367,13 @@ class JsonLines:
             while new := file.read(BLOCK_BYTES):
                 end = new.rfind(b"\n") + 1
                 if end:
-                    yield from self._parsed(remainder, memoryview(new)[:end])
+                    yield from self._parse_blocks(remainder, memoryview(new)[:end])
                 remainder = new[end:] if end else remainder + new
                 if len(remainder) > MAX_LINE_BYTES:
                     raise TacpipeError(f"{self.path} is not JSON lines: a line has over {MAX_LINE_BYTES} bytes.")
-            yield from self._parsed(remainder)
+            yield from self._parse_blocks(remainder)
 
-    def _parsed(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
+    def _parse_blocks(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
         if not any(_NOT_BLANK.search(piece) for piece in pieces):
             return
         try:
@@ -396,7 +396,7 @@ class JsonLines:
                     )
                 (widths[field.name],) = lengths
 
-    def _unfolded(self, block: pa.Table) -> pa.Table:
+    def _split_lists(self, block: pa.Table) -> pa.Table:
         """Return a table whose list columns of constant length are split into columns."""
         columns: list[tuple[str, pa.ChunkedArray]] = []
         widths: dict[str, int] = {}

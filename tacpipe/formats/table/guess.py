@@ -65,7 +65,7 @@ def guess_layout(folder: Path) -> str:
         raise UsageError(f"{folder} holds no file of {kinds}; there is nothing to guess from.")
     groups, labels, damaged = _group_files(folder, data)
     groups += _camera_groups(folder, videos, images, {group.stream for group in groups}, damaged)
-    groups, stamps = _with_stamps(groups)
+    groups, stamps = _match_stamp_files(groups)
     if not groups:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
     trees = _label_files(folder, [path for path in all_paths if path.suffix.lower() in TREES], groups)
@@ -99,7 +99,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
     labels: list[_FileGroup] = []
     damaged: dict[str, str] = {}
     used: set[str] = set()
-    for paths in itertools.chain.from_iterable(map(_by_file_name, by_template.values())):
+    for paths in itertools.chain.from_iterable(map(_group_by_file_name, by_template.values())):
         try:
             sample = file_sample.read_sample(folder / paths[0])
         except MissingModuleError:
@@ -116,7 +116,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         if shared or single:
             labels.append(group)
         else:
-            streams += _by_length(group)
+            streams += _group_by_length(group)
     return streams, labels, damaged
 
 
@@ -130,7 +130,7 @@ def _camera_groups(
         by_template.setdefault((_template(path), path in folders), []).append(path)
     groups = []
     for (_, are_folders), paths in by_template.items():
-        for alike in _by_file_name(paths):
+        for alike in _group_by_file_name(paths):
             try:
                 entries, count = (_image_entries if are_folders else _video_entries)(folder / alike[0])
             except MissingModuleError:
@@ -165,7 +165,7 @@ def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
     return lines, len(paths)
 
 
-def _by_length(group: _FileGroup) -> list[_FileGroup]:
+def _group_by_length(group: _FileGroup) -> list[_FileGroup]:
     """Return one stream per length of the arrays in a file; files without arrays are one stream."""
     pictures = [name for name, array in group.first.arrays.items() if array.is_pictures]
     if pictures:
@@ -174,7 +174,7 @@ def _by_length(group: _FileGroup) -> list[_FileGroup]:
         streams = [_picture_group(group, name, clock) for name in pictures]
         if set(others) - {clock}:
             rest = replace(group, first=group.first.only(others), skipped=tuple(pictures))
-            streams += _by_length(rest)
+            streams += _group_by_length(rest)
         return streams
     by_length: dict[int, list[str]] = {}
     for name, array in group.first.arrays.items():
@@ -201,7 +201,7 @@ def _picture_group(group: _FileGroup, array: str, clock: str | None) -> _FileGro
     return replace(group, stream=stream, first=sample, camera=entries)
 
 
-def _with_stamps(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:
+def _match_stamp_files(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:
     """Return the streams and the groups of timestamp files. A stream without timestamps gets the file of equal length."""
     clocks = [group for group in groups if len(group.first.names) == 1 and _is_clock(group)]
     used: list[_FileGroup] = []
@@ -272,7 +272,7 @@ def _is_table_of_labels(path: Path) -> bool:
         return False
 
 
-def _by_file_name(paths: Sequence[Path]) -> list[list[Path]]:
+def _group_by_file_name(paths: Sequence[Path]) -> list[list[Path]]:
     """Return the files of each stream: split by name if several folders contain the same names, otherwise all files."""
     by_folder: dict[Path, set[str]] = {}
     for path in paths:

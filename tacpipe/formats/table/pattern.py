@@ -176,13 +176,13 @@ def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, .
     before = _count_common_start(kinds)
     after = 0
     if any(tokens != kinds[0] for tokens in kinds):
-        before = _without_slots(kinds[0], before)
-        after = _without_slots(kinds[0][::-1], _count_common_start([tokens[before:][::-1] for tokens in kinds]))
+        before = _count_before_slots(kinds[0], before)
+        after = _count_before_slots(kinds[0][::-1], _count_common_start([tokens[before:][::-1] for tokens in kinds]))
         while any(len(tokens) == before + after for tokens in kinds):  # a placeholder has at least one character
             if before:
-                before = _without_slots(kinds[0], before - 1)
+                before = _count_before_slots(kinds[0], before - 1)
             else:
-                after = _without_slots(kinds[0][::-1], after - 1)
+                after = _count_before_slots(kinds[0][::-1], after - 1)
     parts = [(kinds[0][place], tuple(tokens[place][1] for tokens in names)) for place in range(before)]
     if any(len(tokens) > before + after for tokens in names):
         middles = tuple("".join(text for _, text in tokens[before : len(tokens) - after]) for tokens in names)
@@ -196,7 +196,7 @@ def _count_common_start(sequences: Sequence[Sequence[str]]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))
 
 
-def _without_slots(kinds: Sequence[str], count: int) -> int:
+def _count_before_slots(kinds: Sequence[str], count: int) -> int:
     """Return how many of the first ``count`` elements remain without dates and numbers at their end.
 
     Next to differing text, the end of a date or number would be ambiguous.

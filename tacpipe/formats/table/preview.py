@@ -285,7 +285,7 @@ def _layout_text(contents: EpisodeContents, command: str, path: Path, remarks: S
 
 def _stream_text(stream: SourceStream) -> str:
     rows = "" if stream.rows is None else f"  # {stream.rows} rows"
-    lines = [f"[streams.{stream.name}]", f"source = {_quoted(stream.source)}{rows}"]
+    lines = [f"[streams.{stream.name}]", f"source = {_quote(stream.source)}{rows}"]
     declared = f"# time = {_time_text(stream.time)}, if nothing else is written here"
     lines.append(declared if stream.time.is_declared else 'time = { rate_hz = "?" }  # not in the file')
     fields = [field for field in stream.schema if field.name != stream.time.column and not _is_time(field)]
@@ -301,7 +301,7 @@ def _time_text(time: Time) -> str:
     entries = [("column", time.column), ("unit", time.unit if time.column else "s"), ("origin", time.origin)]
     entries += [("zone", time.zone), ("start", time.start)]
     default = Time(unit="s" if not time.column else "iso8601" if time.unit == "s" else "s")  # a unit is always written
-    entries_text = [f"{key} = {_quoted(value)}" for key, value in entries if value != getattr(default, key)]
+    entries_text = [f"{key} = {_quote(value)}" for key, value in entries if value != getattr(default, key)]
     entries_text += [] if time.rate_hz is None else [f"rate_hz = {time.rate_hz:g}"]
     return "{ " + ", ".join(entries_text) + " }"
 
@@ -340,10 +340,10 @@ def _rule_text(match: str, quantity: str, unit: str, kind: str) -> str:
     comment = f"  # not in the file: {', '.join(unknown)}" if unknown else ""
     return (
         "{ "
-        + ", ".join(f"{key} = {_quoted(value)}" for key, value in entries if value or key in (unknown or ()))
+        + ", ".join(f"{key} = {_quote(value)}" for key, value in entries if value or key in (unknown or ()))
         + f" }},{comment}"
     )
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return json.dumps(text, ensure_ascii=not text.isprintable())

@@ -183,13 +183,13 @@ class TextTable:
             while new := file.read(BLOCK_BYTES):
                 end = new.rfind(b"\n") + 1
                 if end:
-                    yield from self._without_comments(drop, remainder, memoryview(new)[:end])
+                    yield from self._drop_matches(drop, remainder, memoryview(new)[:end])
                 remainder = new[end:] if end else remainder + new
                 if len(remainder) > MAX_LINE_BYTES:
                     raise self._endless_line()
-            yield from self._without_comments(drop, remainder)
+            yield from self._drop_matches(drop, remainder)
 
-    def _without_comments(
+    def _drop_matches(
         self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
     ) -> Iterator[tuple[bytes | memoryview, ...]]:
         """Yield pieces that end with a line, without the matches of ``drop``; nothing if no line has content."""

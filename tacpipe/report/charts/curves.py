@@ -237,7 +237,7 @@ def _rule(name: str, at: float) -> Spec:
 
 def _bands(base: ChartEncoding) -> Spec:
     """Return the layer of bands between bounds."""
-    encoding = _of_points(base)
+    encoding = _point_channels(base)
     encoding["y"] = {**base["y"], "field": "low"}
     encoding["y2"] = {"field": "high"}
     encoding["opacity"] = _opacity(0.16, 0.02)
@@ -267,11 +267,11 @@ def _dots(base: ChartEncoding) -> Spec:
     return {
         "transform": [{"filter": "datum.thin === false"}],
         "mark": {"type": "circle", "size": 28, "clip": True},
-        "encoding": _of_points(base),
+        "encoding": _point_channels(base),
     }
 
 
-def _of_points(base: ChartEncoding) -> ChartEncoding:
+def _point_channels(base: ChartEncoding) -> ChartEncoding:
     """Return the channels of lines without the one that separates runs."""
     encoding = base.copy()
     del encoding["detail"]

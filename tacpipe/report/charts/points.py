@@ -55,7 +55,7 @@ def scatter(
 
     With ``diagonal``, a line x = y is drawn.
     """
-    values = _shortened(rows)
+    values = _shorten_numbers(rows)
     names = list(order) or sorted({str(row["name"]) for row in values})
     encoding: ChartEncoding = {
         "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "padding": MARGIN}},
@@ -129,7 +129,7 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
 
     The colour shows a strength from -1 to 1; rows without ``text`` have no label.
     """
-    values = _shortened(rows)
+    values = _shorten_numbers(rows)
     xs, ys = ([float(row[key] or 0.0) for row in rows] for key in ("x", "y"))
     room = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
     ends = {
@@ -168,7 +168,7 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
     }  # fmt: skip
 
 
-def _shortened(rows: Iterable[DataRow]) -> list[DataRow]:
+def _shorten_numbers(rows: Iterable[DataRow]) -> list[DataRow]:
     """Return rows whose numbers have only their visible digits."""
     return [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
 

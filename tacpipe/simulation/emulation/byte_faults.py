@@ -27,11 +27,11 @@ def is_undetectable(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: b
     """Return whether the framer returns a wrong frame if ``harmed`` is sent instead of ``frames[row]``."""
     before = _sample(frames, range(row - NEIGHBOURS, row), row)
     after = _sample(frames, range(row + 1, row + 1 + NEIGHBOURS), row)
-    expected = set(_framed(sensor, [*before, frames[row], *after]))
-    return any(frame not in expected for frame in _framed(sensor, [*before, harmed, *after]))
+    expected = set(_frame_bytes(sensor, [*before, frames[row], *after]))
+    return any(frame not in expected for frame in _frame_bytes(sensor, [*before, harmed, *after]))
 
 
-def _framed(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
+def _frame_bytes(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
     framer = sensor.framer()
     chunks = [chunk for piece in pieces for chunk in _chunks(sensor, piece)]
     runs, _ = framer.feed(Chunks.from_pairs(list(enumerate(chunks))))

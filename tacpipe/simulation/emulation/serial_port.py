@@ -147,7 +147,7 @@ class Pty:
 
     def wrong_baud(self) -> bool:
         """Return whether the host has set another baud rate than the device's."""
-        self._baud = _speed(self._master) if self._master >= 0 else 0
+        self._baud = _host_baud(self._master) if self._master >= 0 else 0
         return bool(self._baud) and self._baud != getattr(self.sensor, "baud", self._baud)
 
     def write(self, pieces: Sequence[bytes]) -> list[int]:
@@ -174,7 +174,7 @@ class Pty:
         return [data]
 
 
-def _speed(master: int) -> int:
+def _host_baud(master: int) -> int:
     """Return the baud rate that the host has set."""
     settings = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
     return int(struct.unpack_from("=I", settings, SPEED_AT)[0])

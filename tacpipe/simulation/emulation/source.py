@@ -110,7 +110,7 @@ class SampleSource(Sampled):
         view = SensorView(self.world, sample_ns, self.finger)
         columns: Columns = {}
         for group in self._groups:
-            columns |= self._columns_of(group, view, block, rng)
+            columns |= self._quantity_columns(group, view, block, rng)
         step = self.sensor.step
         counts = [
             (first + step * numbers) % (modulus or UNUSED_MODULUS)
@@ -119,7 +119,9 @@ class SampleSource(Sampled):
         device_ns = faults.device_stamps(sample_ns, self.timing.clock) + self.timing.steps(sample_ns)
         return Samples(_blocks(self._widths, columns), counts[0], device_ns, counts[1])
 
-    def _columns_of(self, group: Sequence[int], view: SensorView, block: int, rng: np.random.Generator) -> Columns:
+    def _quantity_columns(
+        self, group: Sequence[int], view: SensorView, block: int, rng: np.random.Generator
+    ) -> Columns:
         """Return the columns of a group of fields with one quantity."""
         fields = [self.fields[number] for number in group]
         quantity = quantities.metadata_of(fields[0], "quantity") or ""

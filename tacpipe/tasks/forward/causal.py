@@ -52,9 +52,9 @@ class Arm:
         Otherwise they are differences from the previous row.
         """
         placed = np.concatenate([position_m, self._continuous(quaternion)])
-        moved = None if angles is None or speeds is None else self._by_joints(angles, speeds, position_m)
+        moved = None if angles is None or speeds is None else self._joint_velocity(angles, speeds, position_m)
         if moved is None:
-            moved = self._by_differences(t_ns, placed)
+            moved = self._finite_difference_velocity(t_ns, placed)
         self._before = (t_ns, placed)
         row = np.concatenate([placed, moved]).astype(np.float32)[None]
         if not self._decided and np.isfinite(row).all():
@@ -72,7 +72,7 @@ class Arm:
         continuous: Floats = unit[0] * self._sign + 0.0
         return continuous
 
-    def _by_differences(self, t_ns: int, placed: Floats) -> Floats:
+    def _finite_difference_velocity(self, t_ns: int, placed: Floats) -> Floats:
         if self._before is None:
             return np.zeros(6)
         before_ns, before = self._before
@@ -80,7 +80,7 @@ class Arm:
         velocity: Floats = kinematics.difference_velocity(np.array([before_ns, t_ns]), rows[:, :3], rows[:, 3:])[1]
         return velocity
 
-    def _by_joints(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
+    def _joint_velocity(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
         if not self._carried:
             return None
         frames = kinematics.joint_frames(kinematics.PANDA, angles[None])

@@ -68,7 +68,7 @@ class QuantileSums:
         for forecast in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             for part in _parts(len(forecast.count)):
                 truth = track.tactile[forecast.future[part]]
-                for name, quantiles_ahead in _predicted(forecaster, uncertainty, track, forecast, part):
+                for name, quantiles_ahead in _predict_quantiles(forecaster, uncertainty, track, forecast, part):
                     flat = quantiles_ahead.transpose(0, 2, 1, 3).reshape(-1, truth.shape[1], len(uncertainty.percents))
                     true = truth.transpose(0, 2, 1).reshape(-1, truth.shape[1])
                     part_sums = Sums.from_predictions(true, flat, uncertainty.errors.levels)
@@ -142,7 +142,7 @@ def band(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: s
     return forecaster.band(windows, track.tactile[forecast.past[part]], forecast.count[part])
 
 
-def _predicted(
+def _predict_quantiles(
     forecaster: Forecaster, uncertainty: ForecastQuantiles, track: Track, forecast: WindowForecast, part: slice
 ) -> Iterator[tuple[str, AnyFloats]]:
     """Yield the quantiles (window, step, channel, level) of each predictor."""

@@ -220,7 +220,9 @@ class Forecaster:
         arm = np.zeros((1, self.context + self.horizon, len(self.pose.columns)))
         arm[..., 6:] = 1
         touch = np.zeros((1, self.context, len(self.codec.channels)))
-        self._of_arrays(*self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :]))
+        self._predict_arrays(
+            *self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :])
+        )
         if self.baselines is not None:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
             moved = motion(ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
@@ -234,7 +236,7 @@ class Forecaster:
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
-        predicted = self._of_arrays(touch, arm, finger)
+        predicted = self._predict_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
@@ -248,7 +250,7 @@ class Forecaster:
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
-        ahead = self._of_arrays(touch, arm, finger)
+        ahead = self._predict_arrays(touch, arm, finger)
         read = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
         quantiles = self.band(read, touch[:, -self.context :], ahead)[..., at]
         return quantiles[0] if single else quantiles
@@ -268,7 +270,7 @@ class Forecaster:
         assert self.quantiles is not None
         return self.quantiles.quantiles(self.error_features(windows, past, ahead), ahead)
 
-    def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
+    def _predict_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
         """Return the future tactile signals (window, horizon, channel) for the result of `_parts`."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
@@ -344,7 +346,7 @@ class Forecaster:
             raise TacpipeError("Window and plan must both hold velocities, or neither.")
         finger = window[..., -1] if has_velocities else np.zeros(window.shape[:2])
         arm = np.concatenate([window[..., channels : channels + plan.shape[2]], plan], axis=1)
-        arm = np.stack([self._arm(_posed(rows, posed), has_velocities and derived > 0) for rows in arm])
+        arm = np.stack([self._arm(_pad_pose(rows, posed), has_velocities and derived > 0) for rows in arm])
         touch = np.ascontiguousarray(window[..., :channels], dtype=np.float32)
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
@@ -357,7 +359,7 @@ class Forecaster:
         return tracks.aligned(rows, self.orientation)
 
 
-def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
+def _pad_pose(rows: AnyFloats, columns: int) -> AnyFloats:
     """Return arm rows padded to the 7 columns of a pose; ``columns`` is the number of existing ones."""
     if columns == POSE:
         return rows

@@ -203,7 +203,7 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFlo
     columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS.names}
     for trial in trials:
         for predictor, errors in trial.errors.items():
-            for group, squared, absolute, channels in _pooled(errors, groups, channel_scale):
+            for group, squared, absolute, channels in _pool_groups(errors, groups, channel_scale):
                 steps = len(squared)
                 row = (trial.name, trial.object, trial.known, trial.seen, predictor, group)
                 for name, value in zip(columns, row, strict=False):
@@ -211,12 +211,14 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFlo
                 columns["step"] += range(1, steps + 1)
                 columns["windows"] += [trial.windows] * steps
                 columns["channels"] += [channels] * steps
-                columns["squared"] += [_rounded(value) for value in squared]
-                columns["absolute"] += [None if value is None else _rounded(value) for value in absolute]
+                columns["squared"] += [_round(value) for value in squared]
+                columns["absolute"] += [None if value is None else _round(value) for value in absolute]
     return to_parquet(pa.table(columns, schema=_COLUMNS))
 
 
-def _pooled(errors: ForecastErrorSums, groups: Masks, channel_scale: AnyFloats) -> Iterator[tuple[str, Any, Any, int]]:
+def _pool_groups(
+    errors: ForecastErrorSums, groups: Masks, channel_scale: AnyFloats
+) -> Iterator[tuple[str, Any, Any, int]]:
     """Yield each group's name, sums of squared and absolute errors (step,) and number of channels."""
     for group, mask in groups.items():
         yield (
@@ -241,7 +243,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
             model, baseline = (float(trial.errors[name].count_absolute.mean()) for name in (MODEL, BASELINE))
             gain = float(intervals.skill(np.array([model]), np.array([baseline]))[0])
             values = (model / trial.windows, baseline / trial.windows, gain)
-            errors = [_rounded(value) if math.isfinite(value) else "" for value in values]
+            errors = [_round(value) if math.isfinite(value) else "" for value in values]
         rows.append(
             (
                 trial.name,
@@ -273,8 +275,8 @@ def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
         errors = [item.errors[name] for item in evaluated]
         squared = np.stack([item.count_squared for item in errors])  # (recording, step, channel)
         predictors[name] = {
-            "mse_counts": _grouped(squared, windows, groups),
-            "mae_counts": _grouped(np.stack([item.count_absolute for item in errors]), windows, groups),
+            "mse_counts": _group_errors(squared, windows, groups),
+            "mae_counts": _group_errors(np.stack([item.count_absolute for item in errors]), windows, groups),
             "mse_standard": _steps(squared / channel_scale**2, windows),
         }
         latent, feature = (
@@ -288,10 +290,12 @@ def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
     kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
     skill = {
-        name_of: _intervals(_by_step(evaluated, MODEL, attribute), _by_step(evaluated, BASELINE, attribute), units)
+        name_of: _intervals(
+            _error_sums_by_step(evaluated, MODEL, attribute), _error_sums_by_step(evaluated, BASELINE, attribute), units
+        )
         for name_of, attribute in kinds.items()
     }
-    model, persistence = (_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
+    model, persistence = (_error_sums_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
     skill[headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
     return ForwardScores(counts, predictors, skill)
 
@@ -299,15 +303,15 @@ def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
 def _steps(sums: AnyFloats, windows: Int64s) -> dict[str, float]:
     """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
     error = regression.mean_error(sums, windows)
-    return {f"t{step}": _rounded(value) for step, value in enumerate(error, 1)} | {"mean": _rounded(error.mean())}
+    return {f"t{step}": _round(value) for step, value in enumerate(error, 1)} | {"mean": _round(error.mean())}
 
 
-def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> dict[str, dict[str, float]]:
+def _group_errors(sums: AnyFloats, windows: Int64s, groups: Masks) -> dict[str, dict[str, float]]:
     """Return the mean error by channel group and step."""
     return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
 
 
-def _by_step(trials: Sequence[Trial], predictor: str, attribute: str) -> AnyFloats:
+def _error_sums_by_step(trials: Sequence[Trial], predictor: str, attribute: str) -> AnyFloats:
     """Return the error sums in an attribute of a predictor's errors over all channels, shape (recording, step)."""
     return np.stack([getattr(trial.errors[predictor], attribute).sum(axis=1) for trial in trials])
 
@@ -333,11 +337,11 @@ def _intervals_by_step(interval: Interval) -> IntervalsByStep:
     tree: IntervalsByStep = {}
     for index, name in enumerate(names):
         ends = {part: float(getattr(interval, part)[index]) for part in ("mean", "low", "high")}
-        tree[name] = {part: _rounded(value) for part, value in ends.items() if math.isfinite(value)}
+        tree[name] = {part: _round(value) for part, value in ends.items() if math.isfinite(value)}
     return {name: ends for name, ends in tree.items() if ends}
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     """Round ``value`` to 9 digits, because further digits differ between machines."""
     return float(f"{value:.9g}")
 

@@ -217,19 +217,19 @@ class Network:
     def __init__(self, forecaster: Forecaster) -> None:
         """Trace the network, or keep the original if the trace returns different values."""
         self._forecaster = forecaster
-        self._recorded = None if forecaster.actions == "shuffled" else _recorded(forecaster)
+        self._trace_network = None if forecaster.actions == "shuffled" else _trace_network(forecaster)
 
     @property
     def is_recorded(self) -> bool:
         """Whether the traced network is used."""
-        return self._recorded is not None
+        return self._trace_network is not None
 
     @torch.no_grad()
     def features(self, windows: ForecastWindows) -> AnyFloats:
         """Return the future features (window, horizon, feature), as `Forecaster.features` does, for a single window."""
-        if self._recorded is None:
+        if self._trace_network is None:
             return self._forecaster.features(windows)
-        predicted: Tensor = self._recorded(*windows)
+        predicted: Tensor = self._trace_network(*windows)
         features: AnyFloats = predicted.transpose(0, 1).numpy()
         return features
 
@@ -247,10 +247,10 @@ class _Parts(nn.Module):
 
 
 @torch.no_grad()
-def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
+def _trace_network(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
     """Return the traced network, or None if tracing fails or the trace does not return identical bits."""
     parts = _Parts(forecaster).eval()
-    examples = _tried(forecaster)
+    examples = _test_windows(forecaster)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns of shapes that become constants, which is intended here
@@ -264,7 +264,7 @@ def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
     return frozen
 
 
-def _tried(forecaster: Forecaster) -> list[ForecastWindows]:
+def _test_windows(forecaster: Forecaster) -> list[ForecastWindows]:
     """Return test windows, one per item, with random walks, rest, jumps and constant values."""
     rng = np.random.default_rng(0)
     context, rows = forecaster.context, forecaster.context + forecaster.horizon

@@ -37,7 +37,7 @@ def predict(
     Raises `TacpipeError` for a step beyond the model's horizon, for quantiles that the model does not have, and for
     recordings that the model cannot read.
     """
-    tables = _gathered(Forecaster.load(model), recordings, steps, quantiles)
+    tables = _collect_predictions(Forecaster.load(model), recordings, steps, quantiles)
     return Result({name: RecordingOutput(gathered.rows()) for name, gathered in tables.items()})
 
 
@@ -45,11 +45,13 @@ def tables(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
 ) -> dict[str, pa.Table]:
     """Return each recording's table of predictions; steps and errors are those of `predict`."""
-    rows = {name: table.rows() for name, table in _gathered(forecaster, recordings, steps, quantiles).items()}
+    rows = {
+        name: table.rows() for name, table in _collect_predictions(forecaster, recordings, steps, quantiles).items()
+    }
     return {name: table if isinstance(table, pa.Table) else table.read_all() for name, table in rows.items()}
 
 
-def _gathered(
+def _collect_predictions(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
 ) -> dict[str, Gathered]:
     """Return each recording's predictions, collected in batches of windows."""

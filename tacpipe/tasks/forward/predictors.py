@@ -112,8 +112,8 @@ class _Predictions(Mapping[str, Prediction]):
     def each_prediction(self) -> Iterator[tuple[str, Prediction]]:
         """Yield each predictor's name and prediction."""
         forecaster, track, forecast = self._forecaster, self._track, self._forecast
-        yield from _of_model(forecaster, track, forecast)
-        yield from _of_codec(forecaster, track, forecast)
+        yield from _model_predictions(forecaster, track, forecast)
+        yield from _codec_predictions(forecaster, track, forecast)
         past = track.tactile[forecast.past]
         yield "context_mean", Prediction(None, _repeat_over_steps(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
@@ -134,7 +134,9 @@ class _Items(ItemsView[str, Prediction]):
         return self._each_prediction()
 
 
-def _of_model(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
+def _model_predictions(
+    forecaster: Forecaster, track: Track, forecast: WindowForecast
+) -> Iterator[tuple[str, Prediction]]:
     """Yield the predictions of the model and of persistence."""
     codec, horizon = forecaster.codec, forecaster.horizon
     last, last_feature = track.tactile[forecast.now], track.latent[forecast.now]
@@ -145,7 +147,9 @@ def _of_model(forecaster: Forecaster, track: Track, forecast: WindowForecast) ->
         yield "model_anchored", Prediction(None, forecaster.anchored(forecast.count, last, last_feature))
 
 
-def _of_codec(forecaster: Forecaster, track: Track, forecast: WindowForecast) -> Iterator[tuple[str, Prediction]]:
+def _codec_predictions(
+    forecaster: Forecaster, track: Track, forecast: WindowForecast
+) -> Iterator[tuple[str, Prediction]]:
     """Yield the codec's reconstruction of the true future features, whose error is that of the codec."""
     codec = forecaster.codec
     if codec.kind == "raw":

@@ -69,8 +69,8 @@ class ResidualQuantiles:
         centre = rows.mean(axis=0, dtype=np.float64)
         spread = rows.std(axis=0, dtype=np.float64)
         spread = np.where(spread > 0, spread, 1.0)
-        read = _scaled(rows, centre, spread)
-        network = _trained(read, (errors / unit).reshape(len(rows), -1), levels, seed, passes)
+        read = _standardise(rows, centre, spread)
+        network = _train_network(read, (errors / unit).reshape(len(rows), -1), levels, seed, passes)
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
         weights = tuple(layer.weight.detach().numpy().T.copy() for layer in layers)
         biases = tuple(layer.bias.detach().numpy().copy() for layer in layers)
@@ -81,12 +81,12 @@ class ResidualQuantiles:
 
         ``features`` are (window, channel, feature).
         """
-        hidden: AnyFloats = _scaled(features.reshape(-1, features.shape[-1]), self.centre, self.spread)
+        hidden: AnyFloats = _standardise(features.reshape(-1, features.shape[-1]), self.centre, self.spread)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = _silu(hidden @ weight + bias)
         raw = hidden @ self.weights[-1] + self.biases[-1]
         steps = self.unit.shape[1]
-        ordered = _ordered(raw.reshape(*features.shape[:2], steps, len(self.levels)), len(self.levels) // 2)
+        ordered = _sort_quantiles(raw.reshape(*features.shape[:2], steps, len(self.levels)), len(self.levels) // 2)
         return (ordered * self.unit[None, :, :, None]).astype(np.float32, copy=False)
 
     def to_tensors(self) -> dict[str, AnyArray]:
@@ -119,7 +119,7 @@ class ResidualQuantiles:
         return quantiles
 
 
-def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, passes: int) -> nn.Sequential:
+def _train_network(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, passes: int) -> nn.Sequential:
     """Return the network trained to minimise the pinball loss on ``errors`` (value, step), in units of the channel."""
     steps, middle = errors.shape[1], len(levels) // 2
     with torch.random.fork_rng(devices=[]):
@@ -151,7 +151,7 @@ def _ordered_tensor(raw: torch.Tensor, middle: int) -> torch.Tensor:
     return torch.cat([down, median, up], -1)
 
 
-def _ordered(raw: AnyFloats, middle: int) -> AnyFloats:
+def _sort_quantiles(raw: AnyFloats, middle: int) -> AnyFloats:
     """Do the same as `_ordered_tensor` on an array."""
     median = raw[..., middle : middle + 1]
     up = median + np.logaddexp(raw[..., middle + 1 :], 0).cumsum(-1)
@@ -164,7 +164,7 @@ def _silu(x: AnyFloats) -> AnyFloats:
     return activated
 
 
-def _scaled(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:
+def _standardise(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:
     return np.clip((rows - centre) / spread, -FARTHEST, FARTHEST).astype(np.float32)
 
 
@@ -272,7 +272,7 @@ class ForecastQuantiles:
         """
         errors = ResidualQuantiles.fit(training.features, training.errors, levels, seed=seed)
         predicted = errors.predict(calibration.features)
-        moved = _moved(errors, predicted, calibration, promised)
+        moved = _outward_shifts(errors, predicted, calibration, promised)
         return cls(errors, moved, _empirical(calibration.errors, levels), _empirical(training.changes, levels))
 
     def to_bytes(self) -> bytes:
@@ -328,7 +328,9 @@ def window_features(
     return error_features(past, ahead, arm, finger, scale)
 
 
-def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool) -> AnyFloats:
+def _outward_shifts(
+    errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool
+) -> AnyFloats:
     """Return each quantile's outward shift (level, step) in units of the error."""
     levels, steps = errors.levels, errors.unit.shape[1]
     middle, channels = len(levels) // 2, errors.unit.shape[0]

@@ -140,7 +140,7 @@ class BySituation:
         interval = intervals.geometric_skill_interval(model, persistence)
         skill = {
             step: {
-                part: _rounded(value)
+                part: _round(value)
                 for part in ("mean", "low", "high")
                 if math.isfinite(value := getattr(interval, part)[place])
             }
@@ -158,8 +158,8 @@ class BySituation:
 
 
 def _steps(errors: AnyFloats) -> dict[str, float]:
-    return {f"t{step}": _rounded(value) for step, value in enumerate(errors, 1)} | {"mean": _rounded(errors.mean())}
+    return {f"t{step}": _round(value) for step, value in enumerate(errors, 1)} | {"mean": _round(errors.mean())}
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return float(f"{value:.9g}")

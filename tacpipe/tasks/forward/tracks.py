@@ -284,7 +284,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.DEFAULT_POSE
             latent = read.astype(np.float32)
         placed = np.hstack([_position(table, pose), _orientation(table, pose)])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
-        finger = _opening(table)
+        finger = _finger_width(table)
         gaps, slips = tactile.gap_mask(table), slips_of(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
@@ -334,7 +334,7 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
         return make_continuous(inputs(table, pose.orientation).astype(np.float64))
 
 
-def _opening(table: pa.Table | Columns) -> AnyFloats:
+def _finger_width(table: pa.Table | Columns) -> AnyFloats:
     """Return the width between the fingers (time,) in m, or 0 if no width or more than one is recorded."""
     column = opening(table.schema)
     if not column:

@@ -104,7 +104,7 @@ def train(
     if rate_hz:
         terminal.report_progress(f"a step is {1e3 / rate_hz:.4g} ms")
     reference = start.orientation if start else _reference(track.arm[track.usable, 3:7] for track in parts[0])
-    parts = [[_aligned(track, reference, mapped) for track in part] for part in parts]
+    parts = [[_align_quaternions(track, reference, mapped) for track in part] for part in parts]
     device = devices.kind()
     training_rows, validation_rows = (
         _windows(part, params, stride, device, mapped) for part, stride in zip(parts, (params.stride, 1), strict=True)
@@ -124,7 +124,7 @@ def train(
         "task": TASK,
         "architecture": params.architecture,
         "params": params_of.to_json(params),
-        "codec": _described(codec),
+        "codec": _describe_codec(codec),
         "context": params.context,
         "horizon": params.horizon,
         "inputs": _inputs(codec, pose, unit, reference),
@@ -143,7 +143,7 @@ def train(
             for name, part, rows_of_part in zip(("train", "val"), parts, (training_rows, validation_rows), strict=True)
         },
     }
-    if look_ahead := _look_ahead(training):
+    if look_ahead := _training_look_ahead(training):
         config["look_ahead"] = look_ahead
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
@@ -204,7 +204,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
     return inputs
 
 
-def _look_ahead(training: Dataset) -> LookAhead | None:
+def _training_look_ahead(training: Dataset) -> LookAhead | None:
     """Return how far rows of the training recordings look ahead, or None if no recording contains this information."""
     look_ahead = [
         (
@@ -251,7 +251,7 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
         )
 
 
-def _aligned(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
+def _align_quaternions(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
     """Return a track whose quaternions have the sign of ``reference``; negated ones are stored in ``mapped``."""
     arm = tracks.aligned(track.arm, reference)
     return track if arm is track.arm else dataclasses.replace(track, arm=mapped.kept(arm))
@@ -292,11 +292,11 @@ def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
     total: AnyFloats = np.zeros(0)
     count = 0
     for track, usable in _usable(part, mapped):
-        total, count = _summed(total, track.tactile[usable]), count + len(usable)
+        total, count = _add_rows(total, track.tactile[usable]), count + len(usable)
     mean = total / count
     squares: AnyFloats = np.zeros(0)
     for track, usable in _usable(part, mapped):
-        squares = _summed(squares, (track.tactile[usable] - mean) ** 2)
+        squares = _add_rows(squares, (track.tactile[usable] - mean) ** 2)
     spread = np.sqrt(squares / count)
     low, high = np.min([track.low for track in ranges], axis=0), np.max([track.high for track in ranges], axis=0)
     return {
@@ -314,13 +314,13 @@ def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track
         mapped.release()
 
 
-def _summed(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
+def _add_rows(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
     """Return ``total`` (channel,) plus rows (row, channel), bit-identical to a single numpy sum."""
     sums: AnyFloats = np.add.reduce(np.concatenate([total[None], rows]) if total.size else rows, axis=0)
     return sums
 
 
-def _described(codec: codecs.Codec) -> CodecDescription:
+def _describe_codec(codec: codecs.Codec) -> CodecDescription:
     """Return a codec's description for a model's configuration, including a short name."""
     frames, latents = int(getattr(codec, "frames", 1)), len(codec.latents)
     name = {"raw": "raw", "pca": f"PCA-{latents}", "autoencoder": f"AE-C{frames}-{latents}"}.get(codec.kind, codec.kind)
@@ -349,7 +349,7 @@ def _check_start(
                 f"The model of --init has {name} {started_with} and the one to train {requested}; they must be equal. "
                 f"Give --{name} {started_with}, or begin without --init."
             )
-    read, recorded = start.config["codec"]["name"], _described(codec)["name"]
+    read, recorded = start.config["codec"]["name"], _describe_codec(codec)["name"]
     if read != recorded:
         raise TacpipeError(
             f"The model of --init reads {read} and the recordings hold {recorded}, so its weights mean something else. "

@@ -56,8 +56,7 @@ def calibrate(
     for sensor in classifier.layouts:
         held_out = set(classifier.config.get("held_out", {}).get(sensor, []))
         training_slides, validation_slides = (
-            _with_learned_labels(classifier, part[sensor], held_out)
-            for part in (training_by_sensor, validation_by_sensor)
+            _select_learned(classifier, part[sensor], held_out) for part in (training_by_sensor, validation_by_sensor)
         )
         scores = classifier.readers[sensor].read(validation_slides.frames).scores
         labels = np.searchsorted(classifier.classes, validation_slides.materials)
@@ -89,7 +88,7 @@ def _calibration_errors(scores: Any, labels: Any, temperature: float) -> dict[st
     return errors
 
 
-def _with_learned_labels(classifier: Classifier, slides: Slides, held_out: set[int]) -> Slides:
+def _select_learned(classifier: Classifier, slides: Slides, held_out: set[int]) -> Slides:
     """Return the slides of classes whose labels the sensor learned."""
     return slides.select(np.isin(slides.materials, [number for number in classifier.classes if number not in held_out]))
 

@@ -321,9 +321,9 @@ def predictions_table(
         (pa.field("recording", pa.string()), [name for result in evaluated.values() for name in result.slides.names]),
         (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
         headlines.label_field(
-            "material", names_for(_joined(result.slides.materials for result in evaluated.values())), "label"
+            "material", names_for(_concatenate(result.slides.materials for result in evaluated.values())), "label"
         ),
-        (pa.field("seen", pa.bool_()), _joined(result.in_training for result in evaluated.values())),
+        (pa.field("seen", pa.bool_()), _concatenate(result.in_training for result in evaluated.values())),
     ]
     session_values = [(sessions or {}).get(name) for result in evaluated.values() for name in result.slides.names]
     columns.append(
@@ -333,11 +333,11 @@ def predictions_table(
         values = [
             result.predicted.get(name, np.full(len(result.slides), headlines.UNKNOWN)) for result in evaluated.values()
         ]
-        columns.append(headlines.label_field(name, names_for(_joined(values)), "prediction"))
-    columns += score_columns(classifier, _joined(result.output.scores for result in evaluated.values()))
+        columns.append(headlines.label_field(name, names_for(_concatenate(values)), "prediction"))
+    columns += score_columns(classifier, _concatenate(result.output.scores for result in evaluated.values()))
     latents = [result.output.latents for result in evaluated.values() if result.output.latents is not None]
     if latents:
-        columns += latent_columns(_joined(latents))
+        columns += latent_columns(_concatenate(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]
     return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
 
@@ -360,5 +360,5 @@ def latent_columns(latents: Float32s) -> list[tuple[pa.Field, Any]]:
     ]
 
 
-def _joined(parts: Any) -> Any:
+def _concatenate(parts: Any) -> Any:
     return np.concatenate(list(parts))

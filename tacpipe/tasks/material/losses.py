@@ -324,7 +324,8 @@ class JointWork:
     def watch(self, model: nn.Module) -> Validated:
         """Return the epoch's training losses, and losses and accuracy of each sensor on its validation slides."""
         evaluated = {
-            sensor: self._evaluated(model.get_submodule(sensor), slides) for sensor, slides in self.validation.items()
+            sensor: self._evaluate_network(model.get_submodule(sensor), slides)
+            for sensor, slides in self.validation.items()
         }
         weights = self.weights
         return {
@@ -342,7 +343,7 @@ class JointWork:
         }
 
     @torch.no_grad()
-    def _evaluated(self, network: nn.Module, slides: ScaledSlides) -> dict[str, float]:
+    def _evaluate_network(self, network: nn.Module, slides: ScaledSlides) -> dict[str, float]:
         labelled = (slides.classes != NONE).nonzero()[:, 0]
         if self.drop_last:
             labelled = labelled[

@@ -136,7 +136,7 @@ def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
     return None
 
 
-def _stored(shape: AutoencoderShape) -> StoredShape:
+def _shape_json(shape: AutoencoderShape) -> StoredShape:
     return {
         "channels": shape.channels,
         "classes": shape.classes,
@@ -157,7 +157,7 @@ def _describe(
     partners: Mapping[int, int] | None,
 ) -> None:
     """Add the networks to a model's configuration."""
-    config["shapes"] = {name: _stored(shape) for name, shape in shapes.items()}
+    config["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     config["scaling"] = {
         name: {key: value.tolist() for key, value in scaling.to_tensors().items()} for name, scaling in scalings.items()
     }
@@ -345,7 +345,7 @@ def train(
     _check(params, init)
     only = CommaList().items(params.sensors)
     kinds = slides_of.quantities(params.quantities) or params.QUANTITIES
-    naming = _naming(params.label, training, validation)
+    naming = _label_naming(params.label, training, validation)
     training_slides = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
     validation_slides: BySensor = {}
     if validation is not None and validation.recordings:
@@ -384,7 +384,7 @@ def train(
     return params.fit(TrainingSlides(config, training_slides, validation_slides, naming, workspace, init))
 
 
-def _naming(key: str, *parts: Dataset | None) -> Naming:
+def _label_naming(key: str, *parts: Dataset | None) -> Naming:
     """Return the naming of the labels ``key`` of all training and validation recordings."""
     shards = [shard for part in parts if part is not None for shard in part.recordings.values()]
     return Naming.from_labels(key, (shard.attributes.get(key) for shard in shards))

@@ -186,7 +186,7 @@ def _evaluation_result(
     files = {
         headline.FILE: headline.write(_headlines(predictor, grasps, predicted, in_training, is_known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
-        "by_object.csv": _by_object_csv(fresh),
+        "by_object.csv": _object_csv(fresh),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     if predictor.quantiles is not None:
@@ -271,7 +271,7 @@ def _measures(
     return reading_measures(readings, model, mean, clusters[mask].tolist())
 
 
-def _by_object_csv(scores: TouchScores) -> bytes:
+def _object_csv(scores: TouchScores) -> bytes:
     """Return CSV with one row per object, predictor and target: grasps, relative RMSE, RMSE in counts, R2 and skill."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

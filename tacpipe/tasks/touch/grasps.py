@@ -74,7 +74,7 @@ def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[.
         grasps.append(grasp)
         t_ns.append(stamp)
         if with_readings:
-            for target, values in _reading(shard).items():
+            for target, values in _read_targets(shard).items():
                 readings[target].append(values)
         if advance is not None:
             advance(note=shard.name)
@@ -122,7 +122,7 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     return cloud, grasp, int(table.column("t_ns")[0].as_py())
 
 
-def _reading(shard: Recording) -> dict[str, Floats]:
+def _read_targets(shard: Recording) -> dict[str, Floats]:
     if READING not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has no tactile reading to learn from or to evaluate with. `tacpipe predict` needs none."

@@ -201,7 +201,9 @@ class PatchSources:
             require_colours(names, clouds)
         for cloud, grasp in zip(clouds, grasps, strict=True):
             points = local_points(cloud.points_m, grasp)
-            self.near.append([_indices_near(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)])
+            self.near.append(
+                [_contact_indices(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)]
+            )
             parts = [points / UNIT_M]
             if patches.coloured and cloud.colours is not None:
                 parts.append(cloud.colours / 127.5 - 1.0)
@@ -236,7 +238,7 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
             )
 
 
-def _indices_near(points: Floats, place_m: float, radius_m: float) -> Indices:
+def _contact_indices(points: Floats, place_m: float, radius_m: float) -> Indices:
     """Return the indices of the points within a radius of a contact, or the nearest point if there are none."""
     away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
     inside = np.flatnonzero(away <= radius_m)

@@ -182,10 +182,10 @@ class Limits:
                 for low, high, by_target in self.near
             ],
             "learning_curve": [
-                {"grasps": point.grasps, "trained": point.trained, "skill": _by_target(point.skill)}
+                {"grasps": point.grasps, "trained": point.trained, "skill": _skills_json(point.skill)}
                 for point in self.curve
             ],
-            "other_finger": _by_target(self.other_finger),
+            "other_finger": _skills_json(self.other_finger),
         }
 
 
@@ -296,7 +296,7 @@ def sample_grasps(candidates: Indices, objects: Sequence[str], size: int, rng: n
     return np.concatenate([rng.permutation(candidates[names == name])[:size] for name in sorted(set(names))])
 
 
-def _by_target(skills: Skills) -> dict[str, dict[str, float | None]]:
+def _skills_json(skills: Skills) -> dict[str, dict[str, float | None]]:
     return {name: _estimate_json(estimate) for name, estimate in skills.items()}
 
 

@@ -345,7 +345,7 @@ class LiveChain:
         now = self._rolling.now.astype(np.float32)
         if cause:
             return GridForecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
-        ahead, lacking = self._ahead(row.t_ns)
+        ahead, lacking = self._planned_rows(row.t_ns)
         count = self._rolling.predict(ahead)
         band = self._rolling.band(ahead, count)[..., self._quantiles] if self._quantiles else None
         return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
@@ -364,7 +364,7 @@ class LiveChain:
             usable=not row.gaps,
         )
 
-    def _ahead(self, t_ns: int) -> tuple[AnyFloats, Cause]:
+    def _planned_rows(self, t_ns: int) -> tuple[AnyFloats, Cause]:
         """Return the arm's rows to come (horizon, 13), and what they were made without."""
         now, ahead_ns = self._rolling.arm, t_ns + self._steps_ns()
         if not self.reads_plan:  # a model without plans puts the newest row there itself

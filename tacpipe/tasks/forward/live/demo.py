@@ -69,7 +69,7 @@ def draw(
     for place, begins_ns in enumerate(slips_ns[:MAX_DRAWN_SLIPS, 0].tolist()):
         near = figure.add_subplot(grid[2, place], sharey=nears[0] if nears else None)
         nears.append(near)
-        _near(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)
+        _draw_slip_alarm(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)
         near.set_title(f"slip at {(begins_ns - start_ns) / 1e9:.1f} s\n{lead_in_words(alarm, begins_ns, horizon_ns)}")
         if place == 0:
             near.set_ylabel("slip alarm's score,\nmultiples of its level")
@@ -132,7 +132,7 @@ def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> No
     axes.set_xlabel("time, s")
 
 
-def _near(axes: Any, alarm: Any, since_ms: AnyFloats, horizon_ms: float) -> None:
+def _draw_slip_alarm(axes: Any, alarm: Any, since_ms: AnyFloats, horizon_ms: float) -> None:
     """Draw the score of the slip alarm around a slip."""
     near = (since_ms >= -BEFORE_MS) & (since_ms <= AFTER_MS)
     score, state = alarm["slip_score"].to_numpy()[near], alarm["slip_state"].to_numpy()[near]
@@ -182,7 +182,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
             is_over.set()
             planner.join()
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
-    return _shown(output, world, epoch_ns)
+    return _show_session(output, world, epoch_ns)
 
 
 def _train(output: Path) -> None:
@@ -224,7 +224,7 @@ def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
             planner.sendto(plans.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses), ("127.0.0.1", port))
 
 
-def _shown(output: Path, world: World, epoch_ns: int) -> Path:
+def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
     """Print and draw the last session against the slips of the simulation."""
     import tacpipe
 

@@ -140,7 +140,7 @@ class InputLayout:
         joints = (placed(angles), placed(speeds)) if has_joints else (None, None)
         finger = placed([opening] if opening else [])
         readings = {
-            stream: _reading(signals[stream], names, synchronize, is_master=stream == leader)
+            stream: _stream_columns(signals[stream], names, synchronize, is_master=stream == leader)
             for stream, names in columns.items()
         }
         return cls(
@@ -226,7 +226,7 @@ class InputLayout:
         return levels
 
 
-def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
+def _stream_columns(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
     """Return what is read of a stream; where its repeated samples matter, all its channels are added to ``names``."""
     import pyarrow as pa
 

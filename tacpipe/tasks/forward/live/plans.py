@@ -53,7 +53,7 @@ def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
             f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT, ws:HOST:PORT or rig:STREAM."
         )
     if scheme == "udp":
-        place = _guarded(place, sender)
+        place = _restrict_address(place, sender)
     stream = RigStream(PLAN, "plan", rigs.build_sensor("plan", {}, "--plan"), Address(scheme, place))
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
@@ -67,7 +67,7 @@ def _check_sender(sender: str, plan: str) -> None:
         raise UsageError(f"--plan-from {excerpt(sender)} has no effect without --plan udp:HOST:PORT.")
 
 
-def _guarded(place: str, sender: str) -> str:
+def _restrict_address(place: str, sender: str) -> str:
     """Return the place of a UDP port that only this computer, or only the sender, can send plans to."""
     place, _, option = place.partition("?")
     if option and sender:

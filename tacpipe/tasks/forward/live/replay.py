@@ -47,13 +47,13 @@ def predict(
     with terminal.progress_bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
-                outputs[name], causes = _predicted(
+                outputs[name], causes = _predict_recording(
                     forecaster, model, recording, steps, quantiles, allow_look_ahead=allow_look_ahead
                 )
             except TacpipeError as error:
                 raise type(error)(f"{name}: {error}") from error
             if not outputs[name].streams[""].num_rows:
-                without.append(f"{name}: no forecast could be made at any grid point ({_described(causes)}).")
+                without.append(f"{name}: no forecast could be made at any grid point ({_describe_causes(causes)}).")
             unplanned += causes[Cause.NO_PLAN]
             row_count += outputs[name].streams[""].num_rows
             advance(note=name)
@@ -65,7 +65,7 @@ def predict(
     return Result(outputs, notes=without)
 
 
-def _predicted(
+def _predict_recording(
     forecaster: Forecaster,
     model: Model,
     recording: Recording,
@@ -145,7 +145,7 @@ def replayed(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridF
         yield from chain.advance(until_ns)
 
 
-def _described(causes: Mapping[Cause, int]) -> str:
+def _describe_causes(causes: Mapping[Cause, int]) -> str:
     """Return the causes why there is no forecast, and how often each was."""
     counted = [f"{count} {_name(cause)}" for cause, count in causes.items() if cause & BLOCKING]
     return ", ".join(counted) or "there is none"

@@ -90,7 +90,7 @@ class ForwardLive(LiveTask):
         config: ForwardConfig = model_files.tree(
             model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list}
         )
-        own_settings = _own(settings)
+        own_settings = _forward_settings(settings)
         if not settings.allow_look_ahead:
             with settings.naming("model"):
                 refuse_look_ahead(config, model.source.chain)
@@ -122,7 +122,7 @@ class ForwardLive(LiveTask):
         from tacpipe.tasks.forward.live.chain import LiveChain
         from tacpipe.tasks.forward.live.engine import ForecastEngine
 
-        own_settings = _own(settings)
+        own_settings = _forward_settings(settings)
         forecaster = Forecaster.load(model.files)
         open_chain = functools.partial(
             LiveChain.for_model,
@@ -161,7 +161,7 @@ class ForwardLive(LiveTask):
         return evaluation.evaluate(model, recordings)
 
 
-def _own(settings: Settings) -> ForwardSettings:
+def _forward_settings(settings: Settings) -> ForwardSettings:
     assert isinstance(settings.task, ForwardSettings)
     return settings.task
 

@@ -66,7 +66,7 @@ class ForwardReport(TaskReport):
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
-        steps, known_objects = _steps(context), _known(comparison.question)
+        steps, known_objects = _steps(context), _known_objects(comparison.question)
         unit = comparison.measure.unit
 
         @functools.cache
@@ -107,7 +107,7 @@ class ForwardReport(TaskReport):
         if not context.comparisons:
             return representations.representation_folds(context)
         return [
-            *_ahead(context),
+            *_skill_ahead_charts(context),
             *_channels(context),
             *_ablations(context),
             *skill.band_folds(context),
@@ -143,7 +143,7 @@ class ForwardReport(TaskReport):
         ]
         return [
             f"Settings: {settings}." if settings else "",
-            *_look_ahead(context),
+            *_look_ahead_notes(context),
             "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
             "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before "
             "it is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
@@ -167,7 +167,7 @@ FLOOR = -1.0  # skill at which figures end
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
 
 
-def _look_ahead(context: Context) -> list[str]:
+def _look_ahead_notes(context: Context) -> list[str]:
     """Return how far the rows that models were trained on look ahead, with their methods where others do not."""
     methods: dict[str, list[str]] = {}
     for method in context.methods:
@@ -181,10 +181,10 @@ def _look_ahead(context: Context) -> list[str]:
     ]
 
 
-def _ahead(context: Context) -> list[Fold]:
+def _skill_ahead_charts(context: Context) -> list[Fold]:
     """Return skill over the time ahead of the best methods, the paper's and the best baseline, a chart a part."""
     drawn, order = [], list[str]()
-    chosen = {comparison: _shown(context, comparison) for comparison in context.comparisons}
+    chosen = {comparison: _rows_to_show(context, comparison) for comparison in context.comparisons}
     for rows in chosen.values():
         order += [row.name for row in rows if row.name not in order]
     for comparison, rows in chosen.items():
@@ -194,7 +194,7 @@ def _ahead(context: Context) -> list[Fold]:
         x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
         lines, cut = [], []
         for row in rows:
-            interval = skill.skill_intervals(skill.sums_of_row(row, steps, _known(comparison.question)))
+            interval = skill.skill_intervals(skill.sums_of_row(row, steps, _known_objects(comparison.question)))
             mean, low, high = (getattr(interval, name)[:-1] for name in ("mean", "low", "high"))
             lines.append(Curve(row.name, x, mean, low, high, dashed=row.kind != "model"))
             cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
@@ -208,7 +208,7 @@ def _ahead(context: Context) -> list[Fold]:
     return fold("By time ahead", Charts(drawn)) if drawn else []
 
 
-def _shown(context: Context, comparison: Comparison) -> list[ComparisonRow]:
+def _rows_to_show(context: Context, comparison: Comparison) -> list[ComparisonRow]:
     rows = comparison.models[:LINES]
     paper_row = context.row(comparison, figures.paper_representative(context))
     rows += [paper_row] if paper_row and paper_row not in rows else []
@@ -227,7 +227,7 @@ def _channels(context: Context) -> list[Fold]:
         ]
         if not chosen:
             continue
-        known_objects = _known(comparison.question)
+        known_objects = _known_objects(comparison.question)
         rows: list[Sequence[str | Cell]] = []
         groups = chosen[0].method.runs[0].details.errors.groups
         for group in (name for name in groups if name not in ("both", "standard", "feature", "latent")):
@@ -261,7 +261,7 @@ def _channels(context: Context) -> list[Fold]:
 def _ablations(context: Context) -> list[Fold]:
     """Return what the plan and the timeline change: methods alike but for one of them."""
     steps = _steps(context)
-    parts = list(dict.fromkeys(_known(comparison.question) for comparison in context.comparisons))
+    parts = list(dict.fromkeys(_known_objects(comparison.question) for comparison in context.comparisons))
     tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
     note = SmallPrint(
         "Differences are paired: both are on the same recordings. An interval above 0 shows that the plan helps."
@@ -334,7 +334,7 @@ def _all_steps(context: Context) -> list[int]:
     return sorted(set.intersection(*(set(run.details.errors.steps) for run in context.runs)))
 
 
-def _known(question: Question) -> bool | None:
+def _known_objects(question: Question) -> bool | None:
     return next(
         (known_objects for known_objects, name in headline.PARTS.items() if name and question.part.startswith(name)),
         None,

@@ -132,7 +132,9 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
                 ]
                 for predictor in _ordered_predictors(part)[:2]
             ]
-            rows.append([f"{objects}, skill", *(_error_cell(_without_summary(part).get(step, {})) for step in steps)])
+            rows.append(
+                [f"{objects}, skill", *(_error_cell(_single_ratio_skill(part).get(step, {})) for step in steps)]
+            )
     return (
         [*tables, table("Known objects and unseen ones: mean absolute error, and skill", heads, rows)]
         if rows
@@ -160,7 +162,7 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
 def _describe_seen(metrics: ForwardMetrics) -> str:
     """Return the errors on recordings that the model was trained on, which prove nothing."""
     seen = metrics.parts.get("seen")
-    described = _without_summary(seen).get("mean", {}) if seen else {}
+    described = _single_ratio_skill(seen).get("mean", {}) if seen else {}
     if not seen or "mean" not in described:
         return ""
     count = counted(seen.counts["recordings"], "recordings")
@@ -168,7 +170,7 @@ def _describe_seen(metrics: ForwardMetrics) -> str:
     return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
 
 
-def _without_summary(part: ForwardScores) -> IntervalsByStep:
+def _single_ratio_skill(part: ForwardScores) -> IntervalsByStep:
     """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
     return part.skill.get(headline.GEOMETRIC, part.skill.get("mse_counts", {}))
 

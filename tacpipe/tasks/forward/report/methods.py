@@ -86,7 +86,7 @@ def read_error_sums(content: bytes) -> ErrorSums:
     table = table.filter(np.logical_not(table["seen"].to_numpy()))
     has_objects = not objects or table["object"].null_count < table.num_rows or not table.num_rows
     (predictors, predictor), (groups, group), (recordings, recording) = (
-        _coded(table[name]) for name in ("predictor", "group", "recording")
+        _encode_text(table[name]) for name in ("predictor", "group", "recording")
     )
     steps, step = np.unique(table["step"].to_numpy(), return_inverse=True)
     windows = np.zeros(len(recordings), dtype=np.int64)
@@ -123,7 +123,7 @@ def _object_names(table: pa.Table) -> dict[str, str]:
     return {recording: name for recording, name in pairs if name is not None}
 
 
-def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
+def _encode_text(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
     """Return the distinct values of a text column in the order in which they come, and the place of each row's."""
     encoded = column.combine_chunks().dictionary_encode()
     return tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64)

@@ -147,13 +147,13 @@ class MaterialEngine(Engine):
         if self._due_ns is not None:
             self.skipped += (now_ns - self._due_ns) // self.every_ns
         self._due_ns = now_ns + self.every_ns
-        return self._messages_until(now_ns + self._offset_ns - self.settle_ns, final=False)
+        return self._build_messages(now_ns + self._offset_ns - self.settle_ns, final=False)
 
     def finish(self) -> list[MaterialMessage]:
         """Return the remaining final messages of the ended recording."""
         if self._offset_ns is None:
             return []
-        messages = self._messages_until(0, final=True)
+        messages = self._build_messages(0, final=True)
         self._offset_ns = None
         return messages
 
@@ -162,7 +162,7 @@ class MaterialEngine(Engine):
         if self._offset_ns is not None and message.made_from_t_ns:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
-    def _messages_until(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
+    def _build_messages(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
         """Return the messages for all samples up to a time; a recording's final message uses all samples."""
         began_s = time.perf_counter()
         self._fetch(final=final)

@@ -98,7 +98,9 @@ class MaterialReport(TaskReport):
     def caveats(self, context: Context) -> list[str]:
         """Return the caveats of these numbers."""
         methods = context.methods
-        return [_basis(methods), _pooled(methods), scores.caution(methods), _not_run(methods)] if methods else []
+        return (
+            [_basis(methods), _describe_pooling(methods), scores.caution(methods), _not_run(methods)] if methods else []
+        )
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return additional columns of the table of runs."""
@@ -112,7 +114,7 @@ PAIRED = (
 )
 
 
-def _pooled(methods: Sequence[Method]) -> str:
+def _describe_pooling(methods: Sequence[Method]) -> str:
     """Return a description of the table of accuracies of these methods."""
     runs = [run for method in methods for run in method.details]
     published = all(method.published for method in methods)

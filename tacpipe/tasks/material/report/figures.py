@@ -247,7 +247,7 @@ def count_nearest_partners(
     """
     first_materials, second_materials = np.unique(first.materials), np.unique(second.materials)
     means = [
-        np.array([_latents_of(part)[part.materials == name].mean(axis=0) for name in names])
+        np.array([_part_latents(part)[part.materials == name].mean(axis=0) for name in names])
         for part, names in ((first, first_materials), (second, second_materials))
     ]
     distances = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other sensor)
@@ -266,7 +266,7 @@ def _latent_chart(method: Method) -> Chart | None:
     if rows is None:
         return None
     sensors, parts = rows
-    points = project_on_plane([_latents_of(part) for part in parts])
+    points = project_on_plane([_part_latents(part) for part in parts])
     partners = {
         int(material): int(partner) for material, partner in method.details[0].config.get("partners", {}).items()
     }
@@ -314,12 +314,12 @@ def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str]
     joint_run = next((run for run in with_latents if set(sensors) <= set(run.sensors)), None)
     runs_by_sensor = [joint_run or next(run for run in with_latents if sensor in run.sensors) for sensor in sensors]
     parts = [run.predictions.of(sensor) for run, sensor in zip(runs_by_sensor, sensors, strict=True)]
-    if len({_latents_of(part).shape[1] for part in parts}) > 1:
+    if len({_part_latents(part).shape[1] for part in parts}) > 1:
         return None
     return (sensors[0], sensors[1]), parts
 
 
-def _latents_of(part: SlidePredictions) -> AnyFloats:
+def _part_latents(part: SlidePredictions) -> AnyFloats:
     assert part.latents is not None
     return part.latents
 

@@ -218,9 +218,9 @@ class TouchEngine(Engine):
         if not self._waiting or self._offset_ns is None:
             return []
         t_ns, stream, text = self._waiting.popleft()
-        return [self._answered(t_ns + self._offset_ns, stream, parse_request(text))]
+        return [self._predict_message(t_ns + self._offset_ns, stream, parse_request(text))]
 
-    def _answered(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
+    def _predict_message(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
         began_s = time.perf_counter()
         header = (self.next_seq(), t_ns, int(record["request"]), self._criterion.text)
         try:

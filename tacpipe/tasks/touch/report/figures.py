@@ -102,7 +102,7 @@ def electrode_folds(method: Method) -> list[Fold]:
         return []
     figures = [part for known_objects in (True, False) if (part := _r2_chart(method, fingers, known_objects))]
     rows = method.details[0].predictions
-    pairs = [_true_and_predicted(rows, grasp, fingers) for grasp in choose_grasps(rows)]
+    pairs = [_electrode_chart(rows, grasp, fingers) for grasp in choose_grasps(rows)]
     return fold(
         "Electrodes",
         Charts(figures),
@@ -150,7 +150,7 @@ def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Ch
     return Chart(f"R² of each electrode, {headlines.PARTS[known_objects]}", draw_fingertips(rows))
 
 
-def _true_and_predicted(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequence[str]) -> Chart:
+def _electrode_chart(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequence[str]) -> Chart:
     """Return a chart of the true and predicted electrodes of one grasp."""
     tips: list[charts.DataRow] = []
     errors = []

@@ -304,7 +304,7 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
         for target in rows.targets:
             low, high = biotac_sp.RANGES[target]
             sums = {
-                name: _squared(target, rows.true[target], touch[target], rows.recordings.tolist())
+                name: _sums_of_squares(target, rows.true[target], touch[target], rows.recordings.tolist())
                 for name, touch in rows.predicted.items()
                 if target in touch
             }
@@ -329,7 +329,7 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
     )
 
 
-def _squared(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
+def _sums_of_squares(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
     """Return the sum of squares in fractions of the target's range and the number of values, by grasp."""
     true_fractions, predicted_fractions = (biotac_sp.normalise(target, values) for values in (true, predicted))
     squared = regression.squared_sums(true_fractions, predicted_fractions)

@@ -146,7 +146,7 @@ def score(
     parts = _rows(runs, target, known_objects, predictor)
     if not parts:
         return None
-    rows = _pooled(parts)
+    rows = _concatenate(parts)
     return Score(
         target,
         regression.rmse(rows.true, rows.predicted),
@@ -164,7 +164,7 @@ def score(
 def r2_by_electrode(runs: Sequence[GraspPredictions], target: str, known_objects: bool | None) -> AnyFloats | None:
     """Return the R² of each electrode (value,), pooled over runs; None if there are no predictions of the target."""
     parts = _rows(runs, target, known_objects, MODEL)
-    return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
+    return regression.r2_by_value(*_concatenate(parts)[:2]) if parts else None
 
 
 def _rows(
@@ -184,7 +184,7 @@ def _rows(
     return parts
 
 
-def _pooled(parts: Sequence[_TargetRows]) -> _TargetRows:
+def _concatenate(parts: Sequence[_TargetRows]) -> _TargetRows:
     return _TargetRows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -111,16 +111,16 @@ def _coverage_rows(rows: pd.DataFrame, known_objects: bool) -> list[Sequence[str
                 [
                     f"{headlines.PARTS[known_objects]}, {headlines.TARGETS[target]}: {NAMES[predictor]}",
                     f"{item.values:,}",
-                    _with_interval(item.coverage, 2),
+                    _interval_cell(item.coverage, 2),
                     number(100 * item.width / (high_count - low_count), 3),
                     number(item.pinball, 3),
-                    Cell(NONE) if predictor == CONSTANT else _with_interval([100 * part for part in item.gain], 0),
+                    Cell(NONE) if predictor == CONSTANT else _interval_cell([100 * part for part in item.gain], 0),
                 ]
             )
     return rows_shown
 
 
-def _with_interval(values: Sequence[float], digits: int) -> Cell:
+def _interval_cell(values: Sequence[float], digits: int) -> Cell:
     """Return a cell with a number and its interval below, if defined."""
     mean, low, high = values
     below = "" if np.isnan(low) else f"{blocks.fixed(low, digits)} to {blocks.fixed(high, digits)}"
