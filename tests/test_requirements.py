@@ -53,7 +53,7 @@ def without(quantity: str) -> FakeShard:
 
 def read(shard: Any, actions: str) -> tracks.Track:
     codec = tracks.codec_of(shard.content, {}, shard.name)
-    return tracks.track(shard, codec, tracks.pose_of(shard, actions))
+    return tracks.track(shard, codec, tracks.select_pose(shard, actions))
 
 
 @pytest.mark.parametrize("quantity", [channels.quantity for channels in FORWARD.channels])

@@ -270,9 +270,9 @@ def _first_name(row: engine.ComparisonRow) -> str:
 def _gain(row: engine.ComparisonRow, measure: str) -> list[str]:
     if not row.baseline:
         return [headline.NONE, headline.NONE]
-    low, high = (headline.signed(value, measure) for value in (row.gain.low, row.gain.high))
+    low, high = (headline.format_gain(value, measure) for value in (row.gain.low, row.gain.high))
     interval = headline.NONE if math.isnan(row.gain.low) else f"{low} to {high}"
-    return [headline.signed(row.gain.mean, measure), interval]
+    return [headline.format_gain(row.gain.mean, measure), interval]
 
 
 def _style(row: engine.ComparisonRow) -> str:

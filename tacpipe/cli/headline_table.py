@@ -41,7 +41,10 @@ def table(headlines: Sequence[Headline]) -> TerminalTable:
     groups = []
     for entry in headlines:
         styles = {headline.BETTER: "green", headline.WORSE: "red"}
-        gain = [headline.signed(entry.gain, entry.measure) if entry.best else headline.NONE, headline.bounds(entry)]
+        gain = [
+            headline.format_gain(entry.gain, entry.measure) if entry.best else headline.NONE,
+            headline.bounds(entry),
+        ]
         cells = [entry.method, *map(headline.number, entry.model.values), gain[0], gain[1] or headline.NONE]
         rows = [TerminalRow([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
         if entry.best:

@@ -151,7 +151,7 @@ def _summary(value: ModelOverview) -> str:
     """Return architecture, task, epochs and the best epoch on one line."""
     parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
     if value["epochs"]:
-        parts.append(headline.counted(value["epochs"], "epochs"))
+        parts.append(headline.format_count(value["epochs"], "epochs"))
     if value["validation"]:
         parts.append(f"validation: {flat(value['validation'])}")
     return "; ".join(parts)
@@ -250,7 +250,7 @@ def _describe_training(trained: TrainingCounts) -> list[str]:
         for role, counts in trained["roles"].items()
     ]
     count = trained["recordings"]
-    return [*lines, *([headline.counted(count, "recordings") + " of training and validation"] if count else [])]
+    return [*lines, *([headline.format_count(count, "recordings") + " of training and validation"] if count else [])]
 
 
 def _input_rows(inputs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
-from tacpipe.metrics.headline import counted
+from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
@@ -200,14 +200,16 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
     if any("rate_hz" in figures for figures in every_stream):
         lines.append(RATES)
     if unread := sum("columns" not in figures for figures in every_stream):
-        lines.append(f"{counted(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full")
+        lines.append(
+            f"{format_count(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full"
+        )
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
     lines += spool_folders.describe_incomplete(value["attributes"], value["recordings"])
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
     lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(
-        f"{counted(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
+        f"{format_count(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
         f"made by {value['stage']} [{value['digest'][:12]}]"
     )
     return lines
@@ -261,7 +263,7 @@ def _labels(attributes: Mapping[str, Mapping[str, Attribute]], full: bool) -> li
     if truth and not full:
         names = [name for name in names if name not in truth]
         lines.append(
-            f"{_TRUTH}*: {counted(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
+            f"{_TRUTH}*: {format_count(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
         )
     lines += [f"{label}: {values_by_label[label]}" for label in names]
     return lines

@@ -16,7 +16,7 @@ from tacpipe.datasets.intervals import all_intervals
 from tacpipe.errors import UsageError
 from tacpipe.io import Json
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics.headline import counted
+from tacpipe.metrics.headline import format_count
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
 
@@ -328,7 +328,7 @@ def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
         parts = [f"{plain(figures['codec'])}, {figures['width_px']} x {figures['height_px']} pixels"]
         parts += [f"{plain(figures['pixel_format'])}"] * bool(figures["pixel_format"])
         parts.append("no common rate" if rate is None else f"{rate:g} frames/s")
-        parts.append("missing frames unknown" if missing is None else f"{counted(missing, 'missing frames')}")
+        parts.append("missing frames unknown" if missing is None else f"{format_count(missing, 'missing frames')}")
         lines.append(f"  {shown(stream) or '-'}: {', '.join(parts)}")
     return "\n".join(["video", *lines]) if lines else ""
 
@@ -359,7 +359,9 @@ def _gaps_text(recording: RecordingOverview, full: bool) -> str:
         total_s = sum(gap.stop_s - gap.start_s for gap in longest)
         share = f" ({total_s / recording.duration_s:.1%})" if recording.duration_s else ""
         places = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
-        lines.append(f"{plain(stream)}: {counted(len(places), 'gaps')}, {total_s:.3f} s{share}: {_first(places, full)}")
+        lines.append(
+            f"{plain(stream)}: {format_count(len(places), 'gaps')}, {total_s:.3f} s{share}: {_first(places, full)}"
+        )
     return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
 
 

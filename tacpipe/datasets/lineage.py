@@ -13,7 +13,7 @@ from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import InputDataset, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics.headline import counted
+from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
 from tacpipe.printable import listed
@@ -303,7 +303,7 @@ def _lines(node: LineageNode | LostNode, depth: int, described: set[str], argume
         return [f"{place}  as above"]
     described.add(node["manifest"])
     content = (
-        f"{counted(node['recordings'], 'recordings')}, {counted(node['rows'], 'rows')}"
+        f"{format_count(node['recordings'], 'recordings')}, {format_count(node['rows'], 'rows')}"
         if node["recordings"]
         else _files(node)
     )
@@ -319,7 +319,7 @@ def _lines(node: LineageNode | LostNode, depth: int, described: set[str], argume
         first = next(iter(sorted(node["sources"])))
         name, digest = next(iter(sorted(node["sources"][first].items())))
         lines.append(
-            f"{pad}  from {counted(len(files), 'raw files')} of {counted(len(node['sources']), 'recordings')}, as "
+            f"{pad}  from {format_count(len(files), 'raw files')} of {format_count(len(node['sources']), 'recordings')}, as "
             f"{first}/{name}  [{digest[:12]}]"
         )
     if node["labels"]:

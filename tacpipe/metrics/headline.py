@@ -83,7 +83,7 @@ class Headline:
     def interval(self) -> str:
         """The description of the interval."""
         return (
-            f"95 % interval over {counted(self.clusters, self.cluster)}"
+            f"95 % interval over {format_count(self.clusters, self.cluster)}"
             f"{f' and {self.seeds} seeds' if self.seeds > 1 else ''}"
             f"{f', the best of {self.methods} methods' if self.methods > 1 else ''}"
         )
@@ -128,8 +128,8 @@ def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
 def explain_no_verdict(clusters: int, cluster: str, effective: float) -> str:
     """Return why there is no verdict, as a clause."""
     if clusters >= MIN_CLUSTERS and round(effective, 6) < MIN_CLUSTERS:
-        return f"{counted(clusters, cluster)} count as {effective:.1f} equal ones, too few for a verdict"
-    return f"{counted(clusters, cluster)} {'is' if clusters == 1 else 'are'} too few for a verdict"
+        return f"{format_count(clusters, cluster)} count as {effective:.1f} equal ones, too few for a verdict"
+    return f"{format_count(clusters, cluster)} {'is' if clusters == 1 else 'are'} too few for a verdict"
 
 
 def verdict(headlines: Sequence[Headline]) -> str:
@@ -147,7 +147,7 @@ def clause(headline: Headline) -> str:
     """Return the predicate of the method in a sentence: "is better than ridge, the best of 3 baselines: skill …"."""
     best = headline.best
     if best is None:
-        return f"was evaluated without a baseline, on {counted(headline.clusters, headline.cluster)}"
+        return f"was evaluated without a baseline, on {format_count(headline.clusters, headline.cluster)}"
     name = f"{best.name}, the best of {len(headline.baselines)} baselines" if len(headline.baselines) > 1 else best.name
     gain = f"{amount(headline)}"
     if headline.verdict == NO_VERDICT:
@@ -163,7 +163,7 @@ def clause(headline: Headline) -> str:
 
 def amount(headline: Headline) -> str:
     """Return the gain with its name: "skill +0.119", "+3.5 points"."""
-    gain = signed(headline.gain, headline.measure)
+    gain = format_gain(headline.gain, headline.measure)
     return f"{gain} points" if headline.measure == "points" else f"{headline.measure} {gain}"
 
 
@@ -171,10 +171,10 @@ def bounds(headline: Headline) -> str:
     """Return the interval of the gain as text; empty if undefined."""
     if math.isnan(headline.low):
         return ""
-    return f"{signed(headline.low, headline.measure)} to {signed(headline.high, headline.measure)}"
+    return f"{format_gain(headline.low, headline.measure)} to {format_gain(headline.high, headline.measure)}"
 
 
-def signed(value: float, measure: str = "skill") -> str:
+def format_gain(value: float, measure: str = "skill") -> str:
     """Format a gain with its sign."""
     if math.isnan(value):
         return "not defined"
@@ -189,7 +189,7 @@ def number(value: float) -> str:
     return (f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}").replace("-", "−")
 
 
-def counted(count: int, plural: str) -> str:
+def format_count(count: int, plural: str) -> str:
     """Format a count with its noun."""
     return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
 
@@ -203,8 +203,10 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
     rows = []
     for headline in headlines:
         best = headline.best
-        gain = [signed(headline.gain, headline.measure) if best else NONE, bounds(headline) or NONE]
-        n = counted(headline.clusters, headline.cluster) + (f", {headline.seeds} seeds" if headline.seeds > 1 else "")
+        gain = [format_gain(headline.gain, headline.measure) if best else NONE, bounds(headline) or NONE]
+        n = format_count(headline.clusters, headline.cluster) + (
+            f", {headline.seeds} seeds" if headline.seeds > 1 else ""
+        )
         rows.append([headline.where, headline.method, *map(number, headline.model.values), *gain, n])
         if best:
             verdicts = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
@@ -232,7 +234,9 @@ def caption(headlines: Sequence[Headline]) -> str:
 
 def _omission_note(headlines: Sequence[Headline]) -> str:
     count = sum(headline.left_out for headline in headlines)
-    return f" Left out: {counted(count, 'recordings')} without an error of {headlines[0].reference}." if count else ""
+    return (
+        f" Left out: {format_count(count, 'recordings')} without an error of {headlines[0].reference}." if count else ""
+    )
 
 
 def _capitalize(words: str) -> str:

@@ -222,13 +222,13 @@ def _verb(comparison: Comparison, row: ComparisonRow) -> str:
 
 def _amount(comparison: Comparison, row: ComparisonRow, called: str = "") -> str:
     """Return a phrase with a gain, its interval and its basis."""
-    ends = [headline.signed(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
+    ends = [headline.format_gain(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
     interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
     return f"{_format_gain(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
 
 
 def _format_gain(comparison: Comparison, row: ComparisonRow) -> str:
-    gained = headline.signed(row.gain.mean, comparison.measure.name)
+    gained = headline.format_gain(row.gain.mean, comparison.measure.name)
     return f"{gained} points" if comparison.measure.name == "points" else f"{comparison.measure.name} {gained}"
 
 

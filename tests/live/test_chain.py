@@ -271,7 +271,7 @@ def test_the_recorded_motion_as_a_plan_gives_the_forecasts_of_evaluate_at_any_ra
     recording = swinging(3, 30)
     forecaster = Forecaster.load(files)
     track = forecaster.track(rigs.segmented(recording))  # type: ignore[arg-type]
-    assert np.abs(track.arm - track.planned(np.arange(120)))[1:, 7:10].max() > 0.05
+    assert np.abs(track.arm - track.planned_arm(np.arange(120)))[1:, 7:10].max() > 0.05
     fed = rigs.chain((files, [rigs.step("synchronize"), rigs.step("segment.contacts")]), recording)
     for name, table in recording.tables.items():
         fed.push(name, table)

@@ -129,7 +129,7 @@ def test_the_plan_is_what_the_set_point_did_last_taken_to_continue(
     model: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[Any] = []
-    used = causal.without
+    used = causal.extrapolate_arm
 
     def without(*arguments: Any) -> Any:
         calls.append(arguments)

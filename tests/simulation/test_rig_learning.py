@@ -23,7 +23,7 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
-from tacpipe.tasks.forward.predictors import predicted
+from tacpipe.tasks.forward.predictors import iterate_predictions
 from tests.fake_recordings import FakeRecording, FakeShard, column, dataset
 from tests.stage_params import fitting
 
@@ -102,7 +102,7 @@ def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     starts = track.starts(forecaster.context, forecaster.horizon)
     chosen = starts if everywhere else starts[aloft(shard, starts)]
-    parts = list(predicted(forecaster, track, chosen))
+    parts = list(iterate_predictions(forecaster, track, chosen))
     return {
         name: np.concatenate(
             [np.square(batch.predictions[name].count - batch.truth.count).mean(axis=2) for batch in parts]
@@ -202,7 +202,7 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     """Return the pull of the object over the pressure of the fingers, in counts, and the true friction in the same unit."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     ahead = np.full_like(track.tactile, np.nan)
-    for batch in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+    for batch in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
         ahead[batch.now] = batch.predictions[MODEL].count[:, -1]
     felt = pull_over_pressure(track.tactile[:])
     pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
@@ -268,7 +268,7 @@ def altered(shard: FakeShard, change: dict[str, AnyFloats]) -> FakeShard:
 def predicted_counts(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, AnyFloats]:
     """Return the rows at which predictions are made, and the predicted counts (window, step, channel)."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-    parts = list(predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
+    parts = list(iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
     counts = np.concatenate([batch.predictions[MODEL].count for batch in parts])
     return np.concatenate([batch.now for batch in parts]), counts
 
@@ -309,7 +309,7 @@ def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     for index in range(9, 14):
         shard = loaded(index)
         track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-        for batch in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        for batch in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             for name, errors_of_name in squared.items():
                 errors_of_name.append(
                     np.square(batch.predictions[name].count - batch.truth.count)[..., first_skin].mean(axis=2)

@@ -59,7 +59,7 @@ class Arm:
         row = np.concatenate([placed, moved]).astype(np.float32)[None]
         if not self._decided and np.isfinite(row).all():
             self._opposite, self._decided = tracks.is_opposite(row, self._reference), True
-        aligned: Float32s = (tracks.negated(row) if self._opposite else row)[0]
+        aligned: Float32s = (tracks.negate_quaternions(row) if self._opposite else row)[0]
         return aligned
 
     def _continuous(self, quaternion: Floats) -> Floats:
@@ -161,7 +161,7 @@ class Rolling:
     def predict(self, plan: AnyFloats) -> Float32s:
         """Return predicted levels above rest (horizon, channel) for the arm's planned rows (horizon, 13)."""
         features = self._forecaster.single.features(self._windows(plan))
-        levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
+        levels = self._forecaster.decode_counts(features, self._levels[None, -1], self._latent[None, -1])
         predicted: Float32s = levels[0].astype(np.float32)
         return predicted
 
@@ -212,7 +212,7 @@ def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s
     return np.hstack([placed, moved])[1:].astype(np.float32)
 
 
-def without(t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
+def extrapolate_arm(t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
     """Return the arm's rows (step, 13) at ``ahead_ns`` (step,) for a hand that keeps moving and turning as at ``t_ns``.
 
     ``now`` (13,) is the arm at ``t_ns``.

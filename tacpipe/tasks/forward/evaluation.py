@@ -32,7 +32,7 @@ from tacpipe.tasks.forward.headline import (
     unit_of_model,
 )
 from tacpipe.tasks.forward.metrics import Trial
-from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, predicted
+from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, iterate_predictions
 from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.slips import SlipAlarms
@@ -260,9 +260,9 @@ def _predictions(
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     none = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, none))
-    for windows in predicted(forecaster, track, starts):
+    for windows in iterate_predictions(forecaster, track, starts):
         trial.windows += len(windows.now)
-        doing = situations.of_windows(track, windows.now, forecaster.horizon)
+        doing = situations.window_situations(track, windows.now, forecaster.horizon)
         if not trial.seen:
             by_situation.count(trial.name, doing)
         present = track.tactile[windows.now]

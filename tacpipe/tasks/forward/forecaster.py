@@ -25,7 +25,7 @@ from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
 from tacpipe.tasks.forward import networks, tracks
-from tacpipe.tasks.forward.networks import acted
+from tacpipe.tasks.forward.networks import with_actions
 from tacpipe.tasks.forward.params import ForwardConfig, Params
 from tacpipe.tasks.forward.quantiles import FILE as QUANTILES
 from tacpipe.tasks.forward.quantiles import ForecastQuantiles, window_features
@@ -277,7 +277,7 @@ class Forecaster:
         read = ForecastWindows(
             *(torch.from_numpy(np.ascontiguousarray(array.swapaxes(0, 1))) for array in (latent, arm, finger))
         )
-        return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
+        return self.decode_counts(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
         """Raise an error for windows (window, context, channel) whose levels are far from rest.
@@ -297,11 +297,11 @@ class Forecaster:
     @torch.no_grad()
     def features(self, windows: ForecastWindows) -> AnyFloats:
         """Return the predicted features (window, horizon, feature) in the codec's unit."""
-        predicted: Tensor = self.model(acted(windows, self.actions))
+        predicted: Tensor = self.model(with_actions(windows, self.actions))
         features: AnyFloats = predicted.transpose(0, 1).numpy()
         return features
 
-    def decoded(self, features: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
+    def decode_counts(self, features: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return counts above rest (window, horizon, channel) for predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) belong to the last input row. A model that
@@ -309,10 +309,10 @@ class Forecaster:
         """
         levels = codecs.decode_ahead(self.codec, features, last)
         if self.predicts_change and self.lossy:
-            return self.anchored(levels, last, last_feature)
+            return self.anchor_levels(levels, last, last_feature)
         return levels.astype(np.float64, copy=False)
 
-    def anchored(self, levels: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
+    def anchor_levels(self, levels: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return decoded levels (window, horizon, channel) shifted by the codec's error in the last row."""
         moved: AnyFloats = levels + (last - self.codec.decode(last_feature))[:, None]
         return moved
@@ -356,7 +356,7 @@ class Forecaster:
         if not has_velocities:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
             rows = np.hstack([rows, kinematics.difference_velocity(t_ns, rows[:, :3], rows[:, 3:])])
-        return tracks.aligned(rows, self.orientation)
+        return tracks.align_quaternions(rows, self.orientation)
 
 
 def _pad_pose(rows: AnyFloats, columns: int) -> AnyFloats:

@@ -64,10 +64,10 @@ def legitimate(predictor: str) -> bool:
     return not predictor.startswith((MODEL, "codec"))
 
 
-def shown(steps: Sequence[int]) -> tuple[int, ...]:
+def headline_steps(steps: Sequence[int]) -> tuple[int, ...]:
     """Return the steps of a model that a headline includes.
 
-    >>> shown(range(1, 11)), shown((1, 2, 3)), shown((2, 4))
+    >>> headline_steps(range(1, 11)), headline_steps((1, 2, 3)), headline_steps((2, 4))
     ((1, 3, 5, 10), (1, 3), (4,))
     """
     return tuple(step for step in STEPS if step in steps) or (max(steps),)
@@ -237,7 +237,7 @@ class Parts:
     values: AnyFloats  # (...), number of windows times number of channels
 
     @classmethod
-    def of_sums(cls, sums: AnyFloats) -> Parts:
+    def from_sums(cls, sums: AnyFloats) -> Parts:
         """Create the parts from the output of `sums` (..., part)."""
         steps = (sums.shape[-1] - 1) // 5
         squared, persistence, absolute, logs, counted = (sums[..., at * steps : (at + 1) * steps] for at in range(5))
@@ -300,10 +300,10 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
     ahead = [f"t+{step}" for step in steps]
 
     def error(sums: AnyFloats) -> AnyFloats:
-        return 1 - Parts.of_sums(sums).mean_skill
+        return 1 - Parts.from_sums(sums).mean_skill
 
     def values(sums: AnyFloats) -> tuple[float, ...]:
-        parts = Parts.of_sums(sums)
+        parts = Parts.from_sums(sums)
         mae = parts.absolute / parts.values if parts.values else np.full(len(steps), np.nan)
         return (*map(float, mae), float(parts.squared_skill), float(parts.mean_skill))
 
@@ -322,6 +322,6 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         lambda errors: 1 - errors,
         "skill over persistence",
         rises=True,
-        weight=lambda draws: Parts.of_sums(draws).counted.sum(axis=1),
+        weight=lambda draws: Parts.from_sums(draws).counted.sum(axis=1),
         reference=BASELINE,
     )

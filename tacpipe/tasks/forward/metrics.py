@@ -149,7 +149,7 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
     Recordings without labelled objects are evaluated together.
     """
     fresh = [trial for trial in trials if not trial.seen and trial.windows]
-    steps = headlines.shown(range(1, horizon + 1))
+    steps = headlines.headline_steps(range(1, horizon + 1))
     at = [step - 1 for step in steps]
 
     def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:

@@ -66,7 +66,7 @@ class Rows:
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
         """Return the mean loss of the windows with these indices."""
         picked, ahead = self.pick(self.starts[indices.to(self.starts.device)])
-        lost: Tensor = model.loss(acted(picked, self.actions), ahead)  # type: ignore[operator]
+        lost: Tensor = model.loss(with_actions(picked, self.actions), ahead)  # type: ignore[operator]
         return lost
 
     def recording_of(self, starts: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def rows_of_tracks(
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
     offsets = np.cumsum([0] + [len(track.t_ns) for track in tracks])
 
-    def stacked(parts: Sequence[AnyFloats | Levels], width: tuple[int, ...]) -> Tensor:
+    def stack_parts(parts: Sequence[AnyFloats | Levels], width: tuple[int, ...]) -> Tensor:
         if len(parts) == 1 and mapped is None:
             return torch.from_numpy(np.ascontiguousarray(parts[0][:], dtype=np.float32)).to(device)
         shape = (int(offsets[-1]), *width)
@@ -122,12 +122,12 @@ def rows_of_tracks(
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
     begins = [start + offset for start, offset in zip(starts, offsets, strict=False)]
-    touch = stacked([track.latent for track in tracks], features)
-    arm = stacked([track.arm for track in tracks], (windows_of.ARM,))
-    finger = stacked([track.finger for track in tracks], ())
+    touch = stack_parts([track.latent for track in tracks], features)
+    arm = stack_parts([track.arm for track in tracks], (windows_of.ARM,))
+    finger = stack_parts([track.finger for track in tracks], ())
     plan_velocity = None
     if any(track.plan_velocity is not None for track in tracks):
-        plan_velocity = stacked(
+        plan_velocity = stack_parts(
             [
                 track.arm[:, windows_of.POSE :] if track.plan_velocity is None else track.plan_velocity
                 for track in tracks
@@ -138,7 +138,7 @@ def rows_of_tracks(
     return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped, plan_velocity)
 
 
-def acted(windows: ForecastWindows, actions: str) -> ForecastWindows:
+def with_actions(windows: ForecastWindows, actions: str) -> ForecastWindows:
     """Return the windows with the plan that a model trained with ``actions`` reads.
 
     With ``shuffled``, a negative control, torch's generator permutes the plans among the windows.
@@ -242,7 +242,7 @@ class _Parts(nn.Module):
         self.network, self.actions = forecaster.model, forecaster.actions
 
     def forward(self, touch: Tensor, arm: Tensor, finger: Tensor) -> Tensor:
-        predicted: Tensor = self.network(acted(ForecastWindows(touch, arm, finger), self.actions))
+        predicted: Tensor = self.network(with_actions(ForecastWindows(touch, arm, finger), self.actions))
         return predicted
 
 

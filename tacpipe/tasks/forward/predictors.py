@@ -60,7 +60,7 @@ class WindowForecast:
 
 def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[WindowForecast]:
     """Yield the model's predictions for the windows of ``track`` that start at ``starts``, in batches."""
-    track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
+    track = replace(track, arm=tracks.align_quaternions(track.arm, forecaster.orientation))
     for first in range(0, len(starts), CHUNK):
         yield _forecast(forecaster, track, starts[first : first + CHUNK])
 
@@ -69,17 +69,17 @@ def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowFor
     """Return the model's predictions for the windows that start at ``starts``, in order."""
     context, horizon = forecaster.context, forecaster.horizon
     past, future = (starts[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
-    block = track.between(int(starts[0]), int(starts[-1]) + context + horizon)
+    block = track.rows_between(int(starts[0]), int(starts[-1]) + context + horizon)
     block_rows = rows_of_tracks([block], [starts - starts[0]], context, horizon)
     windows = block_rows.pick(block_rows.starts)[0]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # evaluate a control with the same shuffled plans each time
         features = forecaster.features(windows)
-    count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
+    count = forecaster.decode_counts(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
     return WindowForecast(windows, past, future, features, count)
 
 
-def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
+def iterate_predictions(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
     """Yield all predictors' predictions for the windows of ``track`` that start at ``starts``, in batches."""
     for forecast in forecasts(forecaster, track, starts):
         truth = Prediction(track.latent[forecast.future], track.tactile[forecast.future])
@@ -144,7 +144,7 @@ def _model_predictions(
     yield MODEL, Prediction(forecast.features, forecast.count)
     yield BASELINE, Prediction(_repeat_over_steps(unchanged, horizon), _repeat_over_steps(last, horizon))
     if forecaster.lossy and not forecaster.predicts_change:
-        yield "model_anchored", Prediction(None, forecaster.anchored(forecast.count, last, last_feature))
+        yield "model_anchored", Prediction(None, forecaster.anchor_levels(forecast.count, last, last_feature))
 
 
 def _codec_predictions(
@@ -159,7 +159,7 @@ def _codec_predictions(
     yield "codec", Prediction(ahead, decoded)
     if forecaster.lossy:
         yield "codec_persistence", Prediction(None, _repeat_over_steps(codec.decode(last_feature), forecaster.horizon))
-        yield "codec_anchored", Prediction(None, forecaster.anchored(decoded, last, last_feature))
+        yield "codec_anchored", Prediction(None, forecaster.anchor_levels(decoded, last, last_feature))
 
 
 def _repeat_over_steps(values: AnyFloats, horizon: int) -> AnyFloats:

@@ -73,7 +73,7 @@ def situation_numbers(motion: Motion) -> Int64s:
     return np.select(conditions, range(len(conditions)), len(SITUATIONS) - 1).astype(np.int64)
 
 
-def of_windows(track: Track, now: Int64s, horizon: int) -> Int64s:
+def window_situations(track: Track, now: Int64s, horizon: int) -> Int64s:
     """Return the situation of a recording's windows with the last input rows ``now`` (window,)."""
     if not len(now):
         return np.zeros(0, np.int64)

@@ -63,11 +63,11 @@ class Levels:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyFloats:
         return self[:].astype(dtype or self.dtype, copy=False)
 
-    def of_type(self, dtype: type[np.floating[Any]]) -> Levels:
+    def astype(self, dtype: type[np.floating[Any]]) -> Levels:
         """Return the same levels in another precision."""
         return Levels(self.stored, self.rest_counts, dtype)
 
-    def between(self, first: int, last: int) -> Levels:
+    def rows_between(self, first: int, last: int) -> Levels:
         """Return the levels of the rows from ``first`` to ``last``, exclusive."""
         return Levels(self.stored[first:last], self.rest_counts, self.dtype)
 
@@ -149,11 +149,11 @@ class Track:
         """Return the first row of each window of ``context + horizon`` rows (window,)."""
         return window_starts(self.groups, self.usable, context, horizon, stride)
 
-    def between(self, first: int, last: int) -> Track:
+    def rows_between(self, first: int, last: int) -> Track:
         """Return the rows from ``first`` to ``last``, exclusive."""
 
         def part_of(values: AnyFloats | Levels) -> AnyFloats | Levels:
-            return values.between(first, last) if isinstance(values, Levels) else values[first:last]
+            return values.rows_between(first, last) if isinstance(values, Levels) else values[first:last]
 
         cut = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
@@ -171,7 +171,7 @@ class Track:
             latent = mapped.kept(self.latent)
         elif isinstance(self.tactile, Levels) and self.latent.stored is self.tactile.stored:
             assert isinstance(tactile, Levels)
-            latent = tactile.of_type(self.latent.dtype)
+            latent = tactile.astype(self.latent.dtype)
         else:
             latent = self.latent.put_aside(mapped)
         names = ("t_ns", "contact", "groups", "usable", "arm", "finger", "plan_velocity")
@@ -180,7 +180,7 @@ class Track:
         }
         return replace(self, tactile=tactile, latent=latent, **arrays)
 
-    def planned(self, rows: Int64s) -> AnyFloats:
+    def planned_arm(self, rows: Int64s) -> AnyFloats:
         """Return the arm at ``rows`` (…) as a plan contains it, (…, 13), with velocities from `plan_velocity`."""
         arm = self.arm[rows]
         if self.plan_velocity is not None:
@@ -246,7 +246,7 @@ def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
     return tactile.matrix(table, names)
 
 
-def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
+def select_pose(shard: Recording, actions: str, arm: str = "") -> Pose:
     """Return the arm columns that a model reads as motion, or an empty pose if there is no arm and none is needed.
 
     ``actions`` and ``arm`` are the params with these names. Raises `TacpipeError` with the recording's name if a plan
@@ -277,7 +277,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.DEFAULT_POSE
         counts_above_rest = above_rest(table, codec.channels)
         finite = counts_above_rest.finite()
         if codec.kind == "raw":
-            latent: AnyFloats | Levels = counts_above_rest.of_type(np.float32)
+            latent: AnyFloats | Levels = counts_above_rest.astype(np.float32)
         else:
             read = inputs(table, codec.latents)
             finite &= np.isfinite(read).all(axis=1)
@@ -387,13 +387,13 @@ def whole_numbers(table: pa.Table | Columns, name: str) -> Int64s:
     return np.asarray(table.column(name).to_numpy(), dtype=np.int64)
 
 
-def aligned(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
+def align_quaternions(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
     """Return the arm's rows (time, 13) with the common sign of quaternions that is nearest to ``reference`` (4,).
 
     A quaternion and its negative are the same rotation. The sign is continuous within a recording, but arbitrary
     between recordings, and a model would interpret it as a different pose.
     """
-    return negated(arm) if is_opposite(arm, reference) else arm
+    return negate_quaternions(arm) if is_opposite(arm, reference) else arm
 
 
 def is_opposite(arm: AnyFloats, reference: AnyFloats) -> bool:
@@ -402,7 +402,7 @@ def is_opposite(arm: AnyFloats, reference: AnyFloats) -> bool:
     return bool(len(finite) and finite[0] @ reference < 0)
 
 
-def negated(arm: AnyFloats) -> AnyFloats:
+def negate_quaternions(arm: AnyFloats) -> AnyFloats:
     """Return the arm's rows (time, 13) with negated quaternions."""
     return np.hstack([arm[:, : TURNED.start], -arm[:, TURNED], arm[:, TURNED.stop :]])
 

@@ -42,7 +42,7 @@ from tacpipe.tasks.forward.forecaster import (
     layout,
 )
 from tacpipe.tasks.forward.headline import look_ahead_notes
-from tacpipe.tasks.forward.networks import Rows, acted, rows_of_tracks
+from tacpipe.tasks.forward.networks import Rows, rows_of_tracks, with_actions
 from tacpipe.tasks.forward.params import (
     AlarmLevels,
     CodecDescription,
@@ -52,7 +52,7 @@ from tacpipe.tasks.forward.params import (
     ModelInputs,
     Params,
 )
-from tacpipe.tasks.forward.predictors import predicted
+from tacpipe.tasks.forward.predictors import iterate_predictions
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
@@ -87,7 +87,7 @@ def train(
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     first = next(iter(training.recordings.values()))
     codec = tracks.codec_of(first.table(), training.files, first.name)
-    pose = tracks.pose_of(first, params.actions, params.arm)
+    pose = tracks.select_pose(first, params.actions, params.arm)
     unit = headline.unit_of_channels(first.table().schema, codec.channels)
     start = Forecaster.load(init) if init else None
     changes = codec.representation == INCREMENTS
@@ -184,7 +184,7 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     windows, ahead = watched.pick(starts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(params.seed)  # plans may be shuffled
-        windows = ForecastWindows(*(part.cpu() for part in acted(windows, watched.actions)))
+        windows = ForecastWindows(*(part.cpu() for part in with_actions(windows, watched.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
     return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
 
@@ -235,7 +235,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> AlarmLevels:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
         loads.begin(track)
-        for windows in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        for windows in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add(windows)
             del windows  # frees the memory for the next windows
     return loads.calibrated()
@@ -253,7 +253,7 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
 
 def _align_quaternions(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
     """Return a track whose quaternions have the sign of ``reference``; negated ones are stored in ``mapped``."""
-    arm = tracks.aligned(track.arm, reference)
+    arm = tracks.align_quaternions(track.arm, reference)
     return track if arm is track.arm else dataclasses.replace(track, arm=mapped.kept(arm))
 
 

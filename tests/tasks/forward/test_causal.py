@@ -28,7 +28,7 @@ def test_the_arm_row_by_row_is_that_of_the_whole_recording_to_the_last_bit() -> 
         rows = np.array(
             [arm.row(int(t_ns), pose_row[:3], pose_row[3:]) for t_ns, pose_row in zip(T_NS, pose, strict=True)]
         )
-        assert rows.tobytes() == np.ascontiguousarray(tracks.aligned(track.arm, reference)).tobytes()
+        assert rows.tobytes() == np.ascontiguousarray(tracks.align_quaternions(track.arm, reference)).tobytes()
 
 
 def test_velocities_come_from_joints_until_the_hand_leaves_the_last_link() -> None:
@@ -79,7 +79,7 @@ def test_a_plan_that_begins_later_is_reached_from_where_the_hand_is_and_one_that
 def test_without_a_plan_the_hand_moves_and_turns_on_as_it_does(turning: float) -> None:
     start = Rotation.from_euler("xyz", [0.4, -0.2, 0.9])
     now = np.array([0.1, 0.2, 0.3, *start.as_quat(), 0.5, 0.0, -1.0, 0.0, turning, 0.0])
-    rows = causal.without(7, 7 + AHEAD_NS, now)
+    rows = causal.extrapolate_arm(7, 7 + AHEAD_NS, now)
     after_s = AHEAD_NS / 1e9
     np.testing.assert_allclose(rows[:, :3], now[:3] + after_s[:, None] * now[7:10], atol=1e-6)
     expected = Rotation.from_rotvec(after_s[:, None] * [0, turning, 0]) * start

@@ -36,8 +36,8 @@ def test_every_index_gives_the_bits_that_an_array_gives(kind: pa.DataType, bytes
     windows = np.arange(6)[:, None] + np.arange(4)
     for at in (slice(None), slice(3, 9), windows, np.arange(ROWS) > 7, (slice(None), [1, 0]), (windows[:, 0], 1)):
         assert np.array_equal(lazy[at], expected[at]) and lazy[at].dtype == np.float64
-        assert np.array_equal(lazy.of_type(np.float32)[at], expected[at].astype(np.float32))
-    assert np.array_equal(lazy.between(4, 20)[windows], expected[4:20][windows])
+        assert np.array_equal(lazy.astype(np.float32)[at], expected[at].astype(np.float32))
+    assert np.array_equal(lazy.rows_between(4, 20)[windows], expected[4:20][windows])
     assert np.array_equal(np.asarray(lazy), expected) and lazy.shape == expected.shape
 
 

@@ -50,7 +50,7 @@ def test_the_evaluation_of_a_longer_recording_takes_hardly_more_besides_its_trac
 def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:
     forecaster = Forecaster.load(trained(tmp_path))
     track = tracks.track(motion(0, rows=200), forecaster.codec)  # type: ignore[arg-type]
-    (batch,) = predictors.predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
+    (batch,) = predictors.iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
     stored = dict(batch.predictions.items())
     assert list(stored) == list(batch.predictions) and len(stored) == len(batch.predictions) > 5
     for name, prediction in stored.items():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.forward.networks import ACTIONS, Rows, acted, rows_of_tracks
+from tacpipe.tasks.forward.networks import ACTIONS, Rows, rows_of_tracks, with_actions
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import CONTEXT, HORIZON, LENGTH, track
 
@@ -47,13 +47,13 @@ def test_no_recordings_and_no_windows_make_no_rows() -> None:
 
 def test_a_model_is_told_the_plan_that_its_actions_say() -> None:
     windows = joined().pick(joined().starts)[0]
-    assert acted(windows, "planned") is windows
-    arm = acted(windows, "none").arm
+    assert with_actions(windows, "planned") is windows
+    arm = with_actions(windows, "none").arm
     assert torch.equal(arm[CONTEXT:], arm[CONTEXT - 1].expand(HORIZON, -1, -1))
     torch.manual_seed(0)
-    first = acted(windows, "shuffled").arm
+    first = with_actions(windows, "shuffled").arm
     torch.manual_seed(0)
-    assert torch.equal(acted(windows, "shuffled").arm, first)
+    assert torch.equal(with_actions(windows, "shuffled").arm, first)
     assert torch.equal(first[:CONTEXT], windows.arm[:CONTEXT])
     assert not torch.allclose(first[CONTEXT:], windows.arm[CONTEXT:], atol=1e-3)
 

@@ -60,12 +60,12 @@ def test_windows_of_a_recording_are_named_by_their_last_row_and_those_to_come() 
     tactile[20:] = 40.0
     changed: Any = dataclasses.replace(track, arm=arm, contact=contact, finger=finger, tactile=tactile)
     now = np.array([3, 8, 12, 17, 25, 37, 45, 57])
-    names = [SITUATIONS[at] for at in situations.of_windows(changed, now, HORIZON)]
+    names = [SITUATIONS[at] for at in situations.window_situations(changed, now, HORIZON)]
     assert names == [
         *("no contact", "closing", "holding still", "slipping"),
         *("holding still", "holding in motion", "holding in motion", "releasing"),
     ]
-    assert situations.of_windows(changed, now[:0], HORIZON).tolist() == []
+    assert situations.window_situations(changed, now[:0], HORIZON).tolist() == []
 
 
 def test_errors_and_skill_are_those_of_numpy_over_the_windows_of_a_situation() -> None:

@@ -98,10 +98,10 @@ def test_quaternions_that_flip_their_sign_are_one_pose() -> None:
     flipped = pose.copy()
     flipped[::3, 3:] *= -1
     arms = [track(table(TACTILE, hand_pose)).arm for hand_pose in (pose, flipped)]
-    aligned = [tracks.aligned(arm, pose[0, 3:]) for arm in arms]
+    aligned = [tracks.align_quaternions(arm, pose[0, 3:]) for arm in arms]
     assert np.allclose(aligned[0], aligned[1])
     assert np.allclose(aligned[0][:, :7], pose, atol=1e-6)
-    opposite = tracks.aligned(arms[0], -pose[0, 3:])
+    opposite = tracks.align_quaternions(arms[0], -pose[0, 3:])
     assert np.allclose(opposite[:, 3:7], -pose[:, 3:], atol=1e-6)
     assert np.array_equal(opposite[:, 7:], arms[0][:, 7:])
 
@@ -121,10 +121,10 @@ def test_a_plan_has_the_velocities_of_its_poses_also_where_those_of_the_past_are
     jointed, jointless = track(table(JOINTED, pose, extra=joints)), track(table(JOINTED, pose))
     rows = np.array([[3, 4], [20, 21]])
     steps = (pose[rows, :3] - pose[rows - 1, :3]) / 0.02
-    assert np.allclose(jointed.planned(rows)[..., 7:10], steps, atol=1e-5)
-    assert np.array_equal(jointed.planned(rows), jointless.planned(rows))
-    assert np.array_equal(jointed.between(3, 30).planned(rows[:1] - 3), jointed.planned(rows[:1]))
-    assert not np.allclose(jointed.planned(rows)[..., 7:], jointed.arm[rows][..., 7:], atol=1e-3)
+    assert np.allclose(jointed.planned_arm(rows)[..., 7:10], steps, atol=1e-5)
+    assert np.array_equal(jointed.planned_arm(rows), jointless.planned_arm(rows))
+    assert np.array_equal(jointed.rows_between(3, 30).planned_arm(rows[:1] - 3), jointed.planned_arm(rows[:1]))
+    assert not np.allclose(jointed.planned_arm(rows)[..., 7:], jointed.arm[rows][..., 7:], atol=1e-3)
 
 
 @pytest.mark.parametrize("broken", ["another arm", "no speeds", "no joints"])

@@ -21,7 +21,7 @@ from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.predictors import Predicted, predicted
+from tacpipe.tasks.forward.predictors import Predicted, iterate_predictions
 from tests.fake_recordings import FakeShard, dataset
 from tests.stage_params import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, motion, table
@@ -69,7 +69,7 @@ def predicted_windows(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track,
     """Return a recording, the first rows of its windows, and the predictions for all of them."""
     recorded = tracks.track(shard, forecaster.codec)
     starts = recorded.starts(forecaster.context, forecaster.horizon)
-    (windows,) = predicted(forecaster, recorded, starts)
+    (windows,) = iterate_predictions(forecaster, recorded, starts)
     return recorded, starts, windows
 
 

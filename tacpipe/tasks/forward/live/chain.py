@@ -372,11 +372,11 @@ class LiveChain:
         if self._targets is not None:
             aimed = self._targets.state(t_ns)
             cause = Cause.NO_PLAN if aimed is None else Cause.NONE
-            return causal.without(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
+            return causal.extrapolate_arm(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
         while len(self._plans) > 1 and self._plans[1][0] <= t_ns:
             self._plans.popleft()
         if not self._plans or self._plans[0][0] > t_ns:
-            return causal.without(t_ns, ahead_ns, now), Cause.NO_PLAN
+            return causal.extrapolate_arm(t_ns, ahead_ns, now), Cause.NO_PLAN
         rows = np.concatenate(self._plans[0][1])
         plan = PosePlan(rows[:, 0].view(np.int64), rows[:, 1:])
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE

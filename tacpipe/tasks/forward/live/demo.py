@@ -242,7 +242,7 @@ def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
         name: leads(t_ns, alarm[f"{name}_state"].to_numpy(), events, horizon_ns, period_ns) for name in ("slip", "load")
     }
     terminal.note(f"\n{len(events)} slips of the simulation; horizon {horizon_ns / 1e6:.0f} ms; {len(t_ns)} rows")
-    worth = [described(name, lead) for name, lead in leads_by_alarm.items()]
+    worth = [describe_lead(name, lead) for name, lead in leads_by_alarm.items()]
     for line in worth:
         terminal.note(line)
     known_ms = latency["latency_ms"].dropna()
@@ -254,10 +254,10 @@ def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
     return draw(output / "live.png", recording, layout, truth_ns, slips, events, horizon_ns, worth[0])
 
 
-def described(name: str, lead: Leads) -> str:
+def describe_lead(name: str, lead: Leads) -> str:
     """Return what an alarm was worth in words.
 
-    >>> described("slip", Leads(4, (120.0, 80.0), 1, 0.005))
+    >>> describe_lead("slip", Leads(4, (120.0, 80.0), 1, 0.005))
     'slip alarm: 2 of 4 slips led, by 100 ms in the median; 1 false alarm in 18 s'
     """
     median = f", by {np.median(lead.leads_ms):.0f} ms in the median" if lead.leads_ms else ""

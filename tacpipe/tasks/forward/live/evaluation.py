@@ -59,7 +59,7 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     """
     check(model.digest, recordings)
     forecaster = Forecaster.load(model.files)
-    steps = headlines.shown(range(1, forecaster.horizon + 1))
+    steps = headlines.headline_steps(range(1, forecaster.horizon + 1))
     offline = {}
     sessions: dict[str, Session] = {}
     for name, recording in sorted(recordings.recordings.items()):
@@ -113,8 +113,8 @@ def _session(
     tables = streams_as_recorded(recording)
     levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
     session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
-    chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
-    forecasts = list(replay.replayed(chain, tables))
+    chain = replay.build_chain(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
+    forecasts = list(replay.iterate_forecasts(chain, tables))
     with_values = [forecast for forecast in forecasts if forecast.count is not None]
     made_ns = np.array([forecast.t_ns for forecast in with_values], np.int64)
     same, equal = measures.equality(

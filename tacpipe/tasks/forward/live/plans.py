@@ -43,7 +43,7 @@ def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
     """
     if sender:
         _check_sender(sender, plan)
-    if plan == MEASURED or targets_of(rig, plan):
+    if plan == MEASURED or target_stream(rig, plan):
         return rig
     if PLAN in rig.streams:
         raise UsageError(f"The rig file has a stream {PLAN} already; leave --plan out, and its plans are read.")
@@ -91,7 +91,7 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def targets_of(rig: Rig, plan: str) -> str:
+def target_stream(rig: Rig, plan: str) -> str:
     """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` if there is none."""
     scheme, _, stream = plan.partition(":")
     if scheme != RIG:

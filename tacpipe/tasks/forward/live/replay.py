@@ -76,11 +76,11 @@ def _predict_recording(
 ) -> tuple[RecordingOutput, Counter[Cause]]:
     """Return the predictions of a recording, and how many grid points each cause had."""
     tables = streams_as_recorded(recording)
-    chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
+    chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
     places = [step - 1 for step in steps]
-    for forecast in replayed(chain, tables):
+    for forecast in iterate_forecasts(chain, tables):
         causes.update(forecast.cause)
         if forecast.count is not None:
             t_ns.append(forecast.t_ns)
@@ -104,7 +104,7 @@ def _predict_recording(
     return RecordingOutput(table, {"causal": True, **described}), causes
 
 
-def chain_of(
+def build_chain(
     forecaster: Forecaster,
     steps: Sequence[Step],
     recording: Recording,
@@ -126,7 +126,7 @@ def chain_of(
     )
 
 
-def replayed(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
+def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
     """Yield the forecasts of a recording's streams, which are given to ``chain`` as they arrived, some at a time."""
     stamps = {
         name: tables[name].column("t_ns").to_numpy()

@@ -129,7 +129,7 @@ class ForwardLive(LiveTask):
             forecaster,
             model.source.chain,
             master=rig.master,
-            plan_from=plans.targets_of(rig, own_settings.plan),
+            plan_from=plans.target_stream(rig, own_settings.plan),
             quantiles=own_settings.quantiles,
             allow_look_ahead=settings.allow_look_ahead,
         )

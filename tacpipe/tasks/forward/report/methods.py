@@ -262,7 +262,7 @@ def name_with_codec(predictor: str, codec: str) -> str:
 
 def shown_steps(runs: Sequence[ForwardResult]) -> tuple[int, ...]:
     """Return the steps to report on, those that all runs predict."""
-    return headline.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
+    return headline.headline_steps(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
 def sums_by_recording(

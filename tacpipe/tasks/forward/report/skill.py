@@ -53,7 +53,7 @@ def sums_of_method(
 
 def at_steps(draws: AnyFloats) -> AnyFloats:
     """Return the skill over persistence at each step and over all, from sums (draw, part) to (draw, step + 1)."""
-    parts = Parts.of_sums(draws)
+    parts = Parts.from_sums(draws)
     return np.hstack([parts.skill, parts.mean_skill[:, None]])
 
 
@@ -63,7 +63,7 @@ def skill_intervals(sums: Sums) -> Interval:
 
 
 def _total(sums: Sums) -> Parts:
-    return Parts.of_sums(np.sum(list(sums.values()), axis=0))
+    return Parts.from_sums(np.sum(list(sums.values()), axis=0))
 
 
 def mean_absolute(sums: Sums) -> list[float]:
