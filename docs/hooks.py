@@ -1,4 +1,4 @@
-"""Pages that come from the program itself: the command line, the params of every stage, Python, decisions, result tables.
+"""Generate documentation pages: the command line, params of stages, Python, decisions and result tables.
 
 mkdocs calls ``on_files`` and ``on_page_markdown``; tests call the functions that return pages.
 """
@@ -15,13 +15,13 @@ from typing import Any
 
 DOCS = Path(__file__).parent
 BUILT_IN = ("tacpipe.", "tacpipe_stages.")
-FIRST = ("open", "load", "run", "Dataset", "Recording")  # names at the top of the page on Python
+ENTRY_POINTS = ("open", "load", "run", "Dataset", "Recording")  # listed at the top of the page on Python
 MODELS = (
     "tacpipe.tasks.forward.prediction.ForwardModel",
     "tacpipe.tasks.material.model.MaterialModel",
     "tacpipe.tasks.touch.model.TouchModel",
 )
-BASE_CLASSES = {  # each with the page that has a complete example
+BASE_CLASSES = {  # base class -> page with a complete example
     "tacpipe.tasks.task.Task": "task",
     "tacpipe.tasks.forward.params.ForwardModelParams": "model",
     "tacpipe.tasks.material.params.NetworkParams": "model",
@@ -35,7 +35,7 @@ TABLE = re.compile(r"^\[\[results: (\w+)\]\]$", re.MULTILINE)
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the generated pages to those that lie in ``docs/``."""
+    """Add the generated pages to those in ``docs/``."""
     from mkdocs.structure.files import File
 
     for path, text in pages().items():
@@ -47,7 +47,7 @@ def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
     """Insert the tables of results at ``[[results: NAME]]``, and leave decisions out of the search index."""
     if page is not None and page.file.src_uri.startswith("decisions/"):
         page.meta["search"] = {"exclude": True}
-    return TABLE.sub(lambda found: result_table(found.group(1)), markdown)
+    return TABLE.sub(lambda match: result_table(match.group(1)), markdown)
 
 
 def pages() -> dict[str, str]:
@@ -63,7 +63,7 @@ def pages() -> dict[str, str]:
 
 
 def live_messages() -> str:
-    """Return the page of the messages of live sessions, from the declaration of each task."""
+    """Return the page on messages of live sessions, from the declaration of each task."""
     from tacpipe.live import messages
     from tacpipe.plugins import registry
 
@@ -72,22 +72,22 @@ def live_messages() -> str:
 
 
 def stage_names() -> list[str]:
-    """Return the names of the stages that tacpipe brings."""
+    """Return the names of the built-in stages."""
     from tacpipe.plugins import registry
 
     return [name for name, target in registry.stages().items() if target.startswith(BUILT_IN)]
 
 
 def command_line() -> str:
-    """Return the page that lists all commands, with a link to the page of each."""
+    """Return the page that lists all commands with links to their pages."""
     from tacpipe.cli import help as plain_help
 
     overview = help_of([])
     summaries = dict(re.findall(r"^  ([a-z]+) {2,}(.+)$", overview, re.MULTILINE))
     parts = [
         "# Command line\n",
-        "Each page has the help of one command, as `tacpipe COMMAND --help` prints it. `-h` prints the common options. "
-        "[Options that commands share](options.md) has them in one table.\n",
+        "Each page shows the help of one command, as printed by `tacpipe COMMAND --help`. `-h` prints "
+        "only the common options. [Shared options](options.md) lists the options of several commands.\n",
     ]
     for title, names in plain_help.SECTIONS.items():
         parts += [f"## {title}\n", "| command | purpose |", "| --- | --- |"]
@@ -97,7 +97,7 @@ def command_line() -> str:
 
 
 def command_families() -> dict[str, list[list[str]]]:
-    """Return the words of each command, and of the commands that a group holds, by the first word."""
+    """Return the words of each command, grouped by the first word."""
     families: dict[str, list[list[str]]] = {}
     for words in command_names():
         families.setdefault(words[0], []).append(words)
@@ -105,7 +105,7 @@ def command_families() -> dict[str, list[list[str]]]:
 
 
 def command_page(name: str) -> str:
-    """Return the page of a command or of a group of commands, with the help as the program prints it."""
+    """Return the page with the help of a command or of a group of commands."""
     stages = stage_names()
     parts = []
     for words in command_families()[name]:
@@ -117,22 +117,22 @@ def command_page(name: str) -> str:
 
 
 def command_names() -> list[list[str]]:
-    """Return the words of every command, those of groups behind their group."""
+    """Return the words of every command; the commands of a group follow the group."""
     from tacpipe.cli import commands
     from tacpipe.plugins import registry
 
-    found: list[list[str]] = []
+    names: list[list[str]] = []
     groups: dict[str, list[str]] = {}
     for name in stage_names():
         group, _, method = name.partition(".")
         groups.setdefault(group, []).append(method)
     for group in [name for name in registry.commands() if name in groups]:
-        found.append([group])
-        found += [[group, method] for method in groups[group] if method]
+        names.append([group])
+        names += [[group, method] for method in groups[group] if method]
     for name in commands.NAMES:
-        found.append([name])
-        found += [[name, verb] for verb in _verbs(name)]
-    return found
+        names.append([name])
+        names += [[name, verb] for verb in _verbs(name)]
+    return names
 
 
 def _verbs(name: str) -> list[str]:
@@ -141,14 +141,14 @@ def _verbs(name: str) -> list[str]:
 
 
 def help_of(words: list[str]) -> str:
-    """Return what ``tacpipe WORDS --help`` prints, 100 columns wide."""
+    """Return the output of ``tacpipe WORDS --help``, 100 columns wide."""
     import typer
 
     from tacpipe.cli import help as plain_help
     from tacpipe.cli import main
 
     arguments = [*words, "--help"]
-    before, columns = sys.argv, os.environ.get("COLUMNS")
+    saved_argv, columns = sys.argv, os.environ.get("COLUMNS")
     sys.argv, os.environ["COLUMNS"] = ["tacpipe", *arguments], "102"
     try:
         program = main.app(arguments)
@@ -160,7 +160,7 @@ def help_of(words: list[str]) -> str:
             context = command.make_context(word, [], parent=context, resilient_parsing=True)
         text: str = command.get_help(context)
     finally:
-        sys.argv = before
+        sys.argv = saved_argv
         if columns is None:
             del os.environ["COLUMNS"]
         else:
@@ -169,20 +169,20 @@ def help_of(words: list[str]) -> str:
 
 
 def params() -> str:
-    """Return the page of the params of every stage, with meaning, values and default."""
+    """Return the page on the params of all stages, with meaning, values and default."""
     from tacpipe.plugins import registry
 
     parts = [
         "# Params of every stage\n",
-        "Each is an option (`--learning-rate 0.001`), a line of `params.yaml` (`learning_rate: 0.001`) and a `--set` "
-        "(`--set learning_rate=0.001`). All params of a stage are part of its key. The tables come from the dataclasses.\n",
+        "A param can be set with an option (`--learning-rate 0.001`), a line of `params.yaml` (`learning_rate: 0.001`) or "
+        "`--set learning_rate=0.001`. All params of a stage are part of its key.\n",
     ]
     for name in stage_names():
         stage = registry.load(name)
         rows = param_rows(stage)
         parts.append(f"## {name.replace('.', ' ')}\n\n{registry.summary(name)}\n")
         if not rows:
-            parts.append("It has no params.\n")
+            parts.append("No params.\n")
             continue
         parts.append("| param | values | default | meaning |\n| --- | --- | --- | --- |")
         parts += [f"| {' | '.join(row)} |" for row in rows]
@@ -191,18 +191,18 @@ def params() -> str:
 
 
 def param_rows(stage: Any) -> list[list[str]]:
-    """Return name, values, default and meaning of each param of a stage, as Markdown."""
+    """Return Markdown cells with name, values, default and meaning of each param of a stage."""
     from tacpipe.plugins import fields
-    from tacpipe.plugins import params as params_of
+    from tacpipe.plugins import params as stage_params
 
-    comments = params_of.comments(stage)
+    comments = stage_params.comments(stage)
     rows = []
-    for name, wanted in params_of.fields(stage).items():
-        default = " or ".join(f"`{value}`" if value != "" else "empty" for value in params_of.defaults(stage, name))
+    for name, field in stage_params.fields(stage).items():
+        default = " or ".join(f"`{value}`" if value != "" else "empty" for value in stage_params.defaults(stage, name))
         text = comments.get(name, "")
-        if owners := params_of.having(stage, name):
-            text = f"{text}; only with {params_of.tag(stage)} {', '.join(map(str, owners))}".lstrip("; ")
-        rows.append([f"`{name}`", _cell(fields.describe(wanted)), default, _cell(text)])
+        if owners := stage_params.having(stage, name):
+            text = f"{text}; only with {stage_params.tag(stage)} {', '.join(map(str, owners))}".lstrip("; ")
+        rows.append([f"`{name}`", _cell(fields.describe(field)), default, _cell(text)])
     return rows
 
 
@@ -211,18 +211,18 @@ def _cell(text: str) -> str:
 
 
 def python() -> str:
-    """Return the page of the Python interface: entry points first, then models, base classes of plug-ins and errors."""
+    """Return the page on the Python interface: entry points, models, base classes of plug-ins, then errors."""
     import tacpipe
 
     parts = [
         "# Python\n",
-        "The public names of `tacpipe`, errors last, and the constraints for params. "
+        "This page lists the public names of `tacpipe` and the constraints for params. "
         "[From Python](../python.md) explains them with examples.\n",
     ]
     public = [name for name in tacpipe.__all__ if not name.startswith("__")]
     errors = [name for name in public if name.endswith(("Error", "Warning"))]
-    others = sorted({*public} - {*FIRST, *errors}, key=str.lower)
-    parts += [_entry(_path(name)) for name in FIRST]
+    others = sorted({*public} - {*ENTRY_POINTS, *errors}, key=str.lower)
+    parts += [_entry(_path(name)) for name in ENTRY_POINTS]
     parts.append("## Models\n\n`tacpipe.load` returns one of these classes.\n")
     parts += [_entry(path, 3) for path in MODELS]
     parts.append(
@@ -245,17 +245,17 @@ def _entry(path: str, level: int = 2) -> str:
 
 
 def _path(name: str) -> str:
-    """Return where a public name is defined, for mkdocstrings."""
+    """Return the path of the definition of a public name, for mkdocstrings."""
     tacpipe: Any = importlib.import_module("tacpipe")
-    found = getattr(tacpipe, name)
-    module = getattr(found, "__module__", None)
-    defined = getattr(found, "__qualname__", name)
-    return f"{module}.{defined}" if module and module.startswith("tacpipe") else f"tacpipe.{name}"
+    value = getattr(tacpipe, name)
+    module = getattr(value, "__module__", None)
+    qualified_name = getattr(value, "__qualname__", name)
+    return f"{module}.{qualified_name}" if module and module.startswith("tacpipe") else f"tacpipe.{name}"
 
 
 def decisions() -> str:
     """Return the list of decisions, oldest first."""
-    lines = ["# Decisions\n", "Decisions that needed an argument or a measurement, one page each.\n"]
+    lines = ["# Decisions\n", "Each page explains one design decision, with its alternatives and measurements.\n"]
     for page in sorted((DOCS / "decisions").glob("[0-9]*.md")):
         if page.stem.startswith("0000"):
             continue

@@ -1,8 +1,8 @@
-"""Simulate how often intervals hold the truth: ``python docs/intervals.py``, about five minutes on one core.
+"""Simulate the coverage of intervals: ``python docs/intervals.py``, about five minutes on one core.
 
-Draws recordings whose true skill is set, computes the interval of the gain with the program's own code, and counts how often
-it holds the true gain, and how often the best of several equal methods is called better. Prints the tables of
-``docs/explanation/intervals.md``. An argument is the number of repetitions.
+The script draws recordings with a given true skill and computes the interval of the gain with the code of tacpipe. It counts
+how often the interval contains the true gain, and how often the best of several equal methods is called better. It prints
+the tables of ``docs/benchmarks/intervals.md``. The optional argument is the number of repetitions.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from tacpipe.tasks.touch import headline as touch
 REPEATS, RESAMPLES = 1000, 500
 SD = {"normal": 0.15, "heavy": 0.1}  # scale of the logarithm of a recording's ratio of errors
 SIZES = {"normal": 0.5, "heavy": 1.2}  # standard deviation of the logarithm of a recording's error
-FREEDOM, MOST = 3, 10  # degrees of freedom of Student's t that draws heavy tails, and the largest value
-OBJECTS = (6, 6, 6, 6, 6, 6, 6, 5, 5)  # recordings of each: 52
+DEGREES_OF_FREEDOM = 3  # parameter of Student's t for heavy tails
+CLIP = 10  # largest absolute value of a draw
+OBJECTS = (6, 6, 6, 6, 6, 6, 6, 5, 5)  # recordings per object, 52 in all
 OUTLINE = {"geometric": "geometric mean of ratios (`forward`)", "pooled": "ratio of pooled RMSE (`touch`)"}
 
 
 @dataclass(frozen=True)
 class Case:
-    """How recordings are drawn."""
+    """Distribution of the recordings."""
 
-    measure: str  # of `OUTLINE`
+    measure: str  # a key of `OUTLINE`
     tails: str
     recordings: int
     seeds: int = 1
     folds: int = 0
-    object_sd: float = -1.0  # of the logarithm of the ratio of an object; negative where objects are not distinguished
+    object_sd: float = -1.0  # standard deviation of objects' log ratios; negative if objects are not distinguished
 
     @property
     def name(self) -> str:
-        """The case in words."""
+        """Description for the table."""
         parts = [f"{self.seeds} seeds" if self.seeds > 1 else "", f"{self.folds} folds" if self.folds else ""]
         if self.object_sd >= 0:
             parts.append(f"{len(OBJECTS)} objects {'that differ' if self.object_sd else 'that are alike'}")
@@ -54,13 +55,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often intervals hold the truth."""
+    """Share of the intervals that contain the true gain."""
 
     case: Case
-    verdicts: float  # share of repetitions with `MIN_CLUSTERS` effective clusters or more, which have a verdict
-    coverage: float  # share of these whose interval holds the truth; NaN without any
-    percentile: float  # the same of all repetitions by the percentile bootstrap over recordings, seeds drawn too
-    studentized: float  # the same by the studentized bootstrap of the influence of clusters
+    verdicts: float  # share of repetitions with a verdict, which needs at least `MIN_CLUSTERS` effective clusters
+    coverage: float  # share of the verdicts whose interval contains the true gain; NaN without verdicts
+    percentile: float  # coverage of the percentile bootstrap over recordings and seeds, in all repetitions
+    studentized: float  # coverage of the studentized bootstrap over the influence of clusters, in all repetitions
 
 
 CASES = (
@@ -73,19 +74,19 @@ CASES = (
 
 def log_ratios(rng: np.random.Generator, tails: str, shape: tuple[int, ...]) -> Floats:
     """Return logarithms of ratios of errors, normal or with heavy tails."""
-    drawn = rng.standard_normal(shape) if tails == "normal" else rng.standard_t(FREEDOM, shape)
-    logs: Floats = SD[tails] * np.clip(drawn, -MOST, MOST)
+    drawn = rng.standard_normal(shape) if tails == "normal" else rng.standard_t(DEGREES_OF_FREEDOM, shape)
+    logs: Floats = SD[tails] * np.clip(drawn, -CLIP, CLIP)
     return logs
 
 
 def true_gain(case: Case) -> float:
-    """Return the gain of an endless number of recordings."""
+    """Return the gain in the limit of infinitely many recordings."""
     if case.measure == "geometric":
         return 0.0
     if case.tails == "normal":
         return float(1 - np.exp(SD["normal"] ** 2 / 4))
-    tail = 2 * student.sf(MOST, FREEDOM) * np.cosh(SD["heavy"] * MOST)
-    mean = tail + quad(lambda x: np.exp(SD["heavy"] * x) * student.pdf(x, FREEDOM), -MOST, MOST)[0]
+    tail = 2 * student.sf(CLIP, DEGREES_OF_FREEDOM) * np.cosh(SD["heavy"] * CLIP)
+    mean = tail + quad(lambda x: np.exp(SD["heavy"] * x) * student.pdf(x, DEGREES_OF_FREEDOM), -CLIP, CLIP)[0]
     return float(1 - np.sqrt(mean))
 
 
@@ -95,68 +96,71 @@ def draw(
     """Return the sums of a model and of persistence by seed and recording, and the object of each recording."""
     n = case.recordings
     logs = log_ratios(rng, case.tails, (n,))[None] + np.zeros((case.seeds, 1))
-    if case.seeds > 1:  # which differ by a third as much as recordings do, and as much on each recording
+    if case.seeds > 1:  # seeds differ a third as much as recordings, both overall and on each recording
         logs = logs + SD["normal"] / 3 * (rng.standard_normal((case.seeds, 1)) + rng.standard_normal((case.seeds, n)))
     clusters = None
     if case.object_sd >= 0:
-        which = np.repeat(np.arange(len(OBJECTS)), OBJECTS)
-        logs = logs + case.object_sd * rng.standard_normal(len(OBJECTS))[which]
-        clusters = {f"r{at:02d}": f"o{kind}" for at, kind in enumerate(which)}
+        object_index = np.repeat(np.arange(len(OBJECTS)), OBJECTS)
+        logs = logs + case.object_sd * rng.standard_normal(len(OBJECTS))[object_index]
+        clusters = {f"r{recording:02d}": f"o{index}" for recording, index in enumerate(object_index)}
     size, ratio = np.exp(SIZES[case.tails] * rng.standard_normal(n)), np.exp(logs)
-    model, still = dict[Any, AnyFloats](), dict[Any, AnyFloats]()
+    model, persistence = dict[Any, AnyFloats](), dict[Any, AnyFloats]()
     for seed in range(case.seeds):
-        for at in range(n):
-            key = (at % case.folds if case.folds else seed, f"r{at:02d}")  # each fold has a seed of its own
-            base, error = np.array([size[at]]), np.array([size[at] * ratio[seed, at]])
+        for recording in range(n):
+            run = recording % case.folds if case.folds else seed  # each fold has its own seed
+            key = (run, f"r{recording:02d}")
+            base, error = np.array([size[recording]]), np.array([size[recording] * ratio[seed, recording]])
             if case.measure == "geometric":
                 model[key] = forward.sums((error**2, error), (base**2, base), 1.0)
-                still[key] = forward.sums((base**2, base), (base**2, base), 1.0)
+                persistence[key] = forward.sums((base**2, base), (base**2, base), 1.0)
             else:
-                model[key], still[key] = np.array([error[0], 1.0]), np.array([base[0], 1.0])
-    return model, still, clusters
+                model[key], persistence[key] = np.array([error[0], 1.0]), np.array([base[0], 1.0])
+    return model, persistence, clusters
 
 
-def measure_of(case: Case) -> Measure:
-    """Return the measure of a task."""
+def task_measure(case: Case) -> Measure:
+    """Return the measure of the task in a case."""
     return forward.measure((1,)) if case.measure == "geometric" else touch.measure(100.0, "grasps")
 
 
 def simulate(case: Case, repeats: int = REPEATS) -> Coverage:
-    """Return how often the interval of a case holds the truth."""
-    rng, measure, truth = np.random.default_rng(case.recordings), measure_of(case), true_gain(case)
-    holds = np.zeros((repeats, 3), bool)  # the interval of the program, percentile and studentized bootstrap
-    enough = np.zeros(repeats, bool)
+    """Return the coverage of the intervals in a case."""
+    rng, measure, gain_truth = np.random.default_rng(case.recordings), task_measure(case), true_gain(case)
+    covered = np.zeros((repeats, 3), bool)  # (repeat, method): tacpipe, percentile and studentized bootstrap
+    has_verdict = np.zeros(repeats, bool)
     for repeat in range(repeats):
-        model, still, clusters = draw(rng, case)
-        pair = pairing.pair(measure, model, still, clusters)
+        model, persistence, clusters = draw(rng, case)
+        pair = pairing.pair(measure, model, persistence, clusters)
         assert pair is not None
         gain = pairing.gain(measure, [pair])
-        enough[repeat] = min(gain.clusters, round(gain.effective, 6)) >= MIN_CLUSTERS
-        ends = (gain.low, gain.high), percentile(measure, model, still), studentized(pair)
-        holds[repeat] = [low <= truth <= high for low, high in ends]
-    coverage = float(holds[enough, 0].mean()) if enough.any() else float("nan")
-    return Coverage(case, float(enough.mean()), coverage, *(float(share) for share in holds[:, 1:].mean(axis=0)))
+        has_verdict[repeat] = min(gain.clusters, round(gain.effective, 6)) >= MIN_CLUSTERS
+        ends = (gain.low, gain.high), percentile(measure, model, persistence), studentized(pair)
+        covered[repeat] = [low <= gain_truth <= high for low, high in ends]
+    coverage = float(covered[has_verdict, 0].mean()) if has_verdict.any() else float("nan")
+    return Coverage(case, float(has_verdict.mean()), coverage, *map(float, covered[:, 1:].mean(axis=0)))
 
 
-def percentile(measure: Measure, model: Mapping[Any, AnyFloats], still: Mapping[Any, AnyFloats]) -> tuple[float, float]:
+def percentile(
+    measure: Measure, model: Mapping[Any, AnyFloats], persistence: Mapping[Any, AnyFloats]
+) -> tuple[float, float]:
     """Return the middle 95 % of gains over resampled recordings and seeds."""
     seeds, names = sorted({seed for seed, _ in model}), sorted({name for _, name in model})
     width = len(next(iter(model.values())))
     sums = np.zeros((len(seeds), len(names), 2 * width))
-    for (seed, name), one in model.items():
-        sums[seeds.index(seed), names.index(name)] = np.concatenate([one, still[seed, name]])
+    for (seed, name), errors in model.items():
+        sums[seeds.index(seed), names.index(name)] = np.concatenate([errors, persistence[seed, name]])
     rng = np.random.default_rng(0)
-    weights, drawn = (
+    weights, seed_weights = (
         rng.multinomial(count, np.full(count, 1 / count), RESAMPLES) for count in (len(names), len(seeds))
     )
-    totals = np.einsum("ds,sdp->dp", drawn.astype(float), np.stack([weights @ one for one in sums]))
+    totals = np.einsum("ds,sdp->dp", seed_weights.astype(float), np.stack([weights @ errors for errors in sums]))
     gains = measure.gain(measure.error(totals[:, :width]), measure.error(totals[:, width:]))
     low, high = np.nanquantile(gains, [0.025, 0.975])
     return float(low), float(high)
 
 
 def studentized(pair: pairing.Pair) -> tuple[float, float]:
-    """Return the ends of the studentized bootstrap of one seed, from how much each cluster moves the gain."""
+    """Return the interval of the studentized bootstrap for one seed, from each cluster's influence on the gain."""
     values = pair.jackknife.influence[:, 0] * (len(pair.names) - 1)
     count = len(values)
     weights = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), RESAMPLES)
@@ -168,9 +172,9 @@ def studentized(pair: pairing.Pair) -> tuple[float, float]:
 
 
 def called_better(methods: int, recordings: int, repeats: int = REPEATS) -> tuple[float, float]:
-    """Return how often the best of equal methods is called better than a baseline that is equal too.
+    """Return the share of verdicts "better" for the best of several methods that equal the baseline.
 
-    The first share is by the interval of the best method alone, the second by the one that accounts for the choice.
+    The first share uses the interval of the best method only. The second one accounts for the choice of the best method.
     """
     rng, measure = np.random.default_rng(methods), forward.measure((1,))
     better = np.zeros((repeats, 2), bool)
@@ -179,36 +183,40 @@ def called_better(methods: int, recordings: int, repeats: int = REPEATS) -> tupl
         pairs = []
         for _ in range(methods):
             errors = np.exp(log_ratios(rng, "normal", (recordings,)))
-            sums = [{(0, f"r{at}"): forward.sums(2 * (value[at : at + 1],), 2 * (np.ones(1),), 1.0)
-                     for at in range(recordings)} for value in (errors, np.exp(base))]  # fmt: skip
-            pairs += [one for one in [pairing.pair(measure, sums[0], sums[1])] if one]
-        pairs.sort(key=lambda one: -float(one.jackknife.mean[0]))
+            sums = [{(0, f"r{n}"): forward.sums(2 * (value[n : n + 1],), 2 * (np.ones(1),), 1.0)
+                     for n in range(recordings)} for value in (errors, np.exp(base))]  # fmt: skip
+            pairs += [pair for pair in [pairing.pair(measure, sums[0], sums[1])] if pair]
+        pairs.sort(key=lambda pair: -float(pair.jackknife.mean[0]))
         better[repeat] = [pairing.gain(measure, pairs[:1], rivals).low > 0 for rivals in ((), pairs[1:])]
-    alone, chosen = better.mean(axis=0)
-    return float(alone), float(chosen)
+    single, corrected = better.mean(axis=0)
+    return float(single), float(corrected)
 
 
-class HeldRates(NamedTuple):
-    """How often intervals of a rate hold the truth; NaN where the program gives no interval."""
+class RateCoverage(NamedTuple):
+    """Coverage of intervals of a rate; NaN if tacpipe returns no interval."""
 
-    same_materials: float  # Wilson over slides, of the rate on new slides of the same materials
-    over_slides: float  # Wilson over slides, of the rate on new materials
-    over_materials: float  # the interval over materials, of the rate on new materials
+    same_materials: float  # Wilson over slides, for new slides of the same materials
+    over_slides: float  # Wilson over slides, for new materials
+    over_materials: float  # interval over materials, for new materials
 
 
-def rates(materials: int, slides: int = 16, repeats: int = REPEATS) -> HeldRates:
-    """Return how often intervals over slides (Wilson) and over materials hold the rate where materials differ."""
-    rng, truth = np.random.default_rng(materials), 0.2
-    holds = np.zeros((repeats, 3), bool)
-    whole = np.full((materials, 1), float(slides))
+def rate_coverage(materials: int, slides: int = 16, repeats: int = REPEATS) -> RateCoverage:
+    """Return the coverage of intervals over slides (Wilson) and over materials if the materials differ."""
+    rng, mean_rate = np.random.default_rng(materials), 0.2
+    covered = np.zeros((repeats, 3), bool)
+    totals = np.full((materials, 1), float(slides))
     for repeat in range(repeats):
-        of_material = rng.beta(1.0, 4.0, materials)
-        accepted = rng.binomial(slides, of_material)
+        material_rates = rng.beta(1.0, 4.0, materials)
+        accepted = rng.binomial(slides, material_rates)
         low, high = wilson(int(accepted.sum()), materials * slides)
-        found = intervals.share_interval(accepted[:, None].astype(float), whole).first
-        holds[repeat] = low <= of_material.mean() <= high, low <= truth <= high, found.low <= truth <= found.high
-    same, over_slides, over_materials = (float(share) for share in holds.mean(axis=0))
-    return HeldRates(same, over_slides, over_materials if materials >= MIN_CLUSTERS else float("nan"))
+        estimate = intervals.share_interval(accepted[:, None].astype(float), totals).first
+        covered[repeat] = (
+            low <= material_rates.mean() <= high,
+            low <= mean_rate <= high,
+            estimate.low <= mean_rate <= estimate.high,
+        )
+    same, over_slides, over_materials = (float(share) for share in covered.mean(axis=0))
+    return RateCoverage(same, over_slides, over_materials if materials >= MIN_CLUSTERS else float("nan"))
 
 
 def lines(repeats: int = REPEATS) -> Iterator[str]:
@@ -216,27 +224,27 @@ def lines(repeats: int = REPEATS) -> Iterator[str]:
     yield "| measure | recordings | n | with a verdict | coverage | percentile bootstrap | studentized bootstrap |"
     yield "| --- | --- | --- | --- | --- | --- | --- |"
     for case in CASES:
-        found = simulate(case, repeats)
-        student_t = f"{found.studentized:.3f}" if case.seeds == 1 else ""
+        result = simulate(case, repeats)
+        student_t = f"{result.studentized:.3f}" if case.seeds == 1 else ""
         yield (
             f"| {OUTLINE[case.measure]} | {case.tails} tails, {case.name} | {case.recordings} "
-            f"| {100 * found.verdicts:.0f} % | "
-            f"{'no verdict' if np.isnan(found.coverage) else f'{found.coverage:.3f}'} | "
-            f"{found.percentile:.3f} | {student_t} |"
+            f"| {100 * result.verdicts:.0f} % | "
+            f"{'no verdict' if np.isnan(result.coverage) else f'{result.coverage:.3f}'} | "
+            f"{result.percentile:.3f} | {student_t} |"
         )
     yield ""
-    yield "| equal methods | n | best called better: its interval alone | with the choice |"
+    yield "| equal methods | n | best called better, from its own interval | with correction for the choice |"
     yield "| --- | --- | --- | --- |"
     for methods in (1, 3, 6, 12):
-        alone, chosen = called_better(methods, 20, repeats)
-        yield f"| {methods} | 20 | {100 * alone:.1f} % | {100 * chosen:.1f} % |"
+        single, corrected = called_better(methods, 20, repeats)
+        yield f"| {methods} | 20 | {100 * single:.1f} % | {100 * corrected:.1f} % |"
     yield ""
     yield "| materials, 16 slides each | same materials: Wilson over slides | new materials: Wilson | over materials |"
     yield "| --- | --- | --- | --- |"
     for materials in (4, 10, 20, 40):
-        same, slides, by_material = rates(materials, repeats=repeats)
-        shown = "no interval" if np.isnan(by_material) else f"{by_material:.3f}"
-        yield f"| {materials} | {same:.3f} | {slides:.3f} | {shown} |"
+        same, slides, by_material = rate_coverage(materials, repeats=repeats)
+        cell = "no interval" if np.isnan(by_material) else f"{by_material:.3f}"
+        yield f"| {materials} | {same:.3f} | {slides:.3f} | {cell} |"
 
 
 if __name__ == "__main__":

@@ -15,15 +15,15 @@ from typing import Any
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
-TITLES = {  # of each table: what its value is, and the column that groups its rows
+TITLES = {  # table -> title of its chart, and the column that groups its rows
     "forward": ("Skill over persistence, known objects, with 95 % interval", "objects"),
-    "material": ("Slides named right, %, with 95 % interval", "sensor"),
+    "material": ("Accuracy on slides, %, with 95 % interval", "sensor"),
     "touch": ("Skill over the constant, known objects, with 95 % interval", "target"),
 }
 VALUES = ("skill", "accuracy_percent")
 BLUE, GREY = "#1f6feb", "#6e7781"
-WIDTH, HEIGHT = 1280, 800  # of the first screen, pixels
-FLOOR = -1.0  # rows of lower skill stand in the table alone: they would press the others together
+WIDTH, HEIGHT = 1280, 800  # size of the first screen, pixels
+FLOOR = -1.0  # Rows of lower skill are only in the table, because they would compress the others
 
 
 def rows(name: str) -> list[dict[str, str]]:
@@ -33,23 +33,23 @@ def rows(name: str) -> list[dict[str, str]]:
 
 
 def value_of(row: dict[str, str]) -> float:
-    """Return the value that a row of results states."""
+    """Return the value of a row of results."""
     return float(next(row[name] for name in VALUES if name in row))
 
 
 def chart(name: str) -> None:
-    """Draw one table as a dot and an interval a row."""
+    """Draw one table, with a dot and an interval per row."""
     from matplotlib.figure import Figure
 
     title, group = TITLES[name]
     table = [row for row in rows(name) if value_of(row) >= FLOOR]
     figure = Figure(figsize=(7.5, 0.36 * len(table) + 0.9), layout="constrained")
     axes: Any = figure.add_subplot()
-    for place, row in enumerate(table):
+    for y, row in enumerate(table):
         baseline = any(word in row["method"] for word in ("baseline", "persistence", "constant", "chance"))
         colour = GREY if baseline else BLUE
-        axes.plot([float(row["low"]), float(row["high"])], [place, place], color=colour, linewidth=2)
-        axes.plot(value_of(row), place, "o", color=colour, markersize=6)
+        axes.plot([float(row["low"]), float(row["high"])], [y, y], color=colour, linewidth=2)
+        axes.plot(value_of(row), y, "o", color=colour, markersize=6)
     labels = [
         f"{row['method']} · {row[group]}" if row[group] not in ("both", "known") else row["method"] for row in table
     ]
@@ -65,29 +65,29 @@ def chart(name: str) -> None:
 def first_screen(page: Path) -> None:
     """Take a picture of the first screen of a report.
 
-    Raises `FileNotFoundError` where there is no Chromium.
+    Raises `FileNotFoundError` if Chromium is not installed.
     """
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         raise FileNotFoundError("chromium is not installed; on Debian: sudo apt-get install chromium")
     with tempfile.TemporaryDirectory() as folder:
-        shot = Path(folder) / "report.png"
+        screenshot = Path(folder) / "report.png"
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{HEIGHT}"]
-        flags.append("--virtual-time-budget=10000")  # ms of the page's clock: charts are drawn when it is loaded
+        flags.append("--virtual-time-budget=10000")  # ms of virtual time, in which the page draws its charts
         subprocess.run(
-            [browser, *flags, f"--screenshot={shot}", page.resolve().as_uri()],
+            [browser, *flags, f"--screenscreenshot={screenshot}", page.resolve().as_uri()],
             check=True,
             capture_output=True,
             timeout=300,
         )
         from PIL import Image
 
-        with Image.open(shot) as image:
+        with Image.open(screenshot) as image:
             image.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(IMAGES / "report.png", optimize=True)
 
 
 def main() -> None:
-    """Draw all pictures; the first screen only where a report is named."""
+    """Draw all charts, and the first screen of each report in the arguments."""
     IMAGES.mkdir(exist_ok=True)
     for name in TITLES:
         chart(name)

@@ -1,11 +1,11 @@
 """Compute the result pages of a release: `make result-pages DATA=FOLDER`.
 
-Runs DVC's chain of each task on the published recordings in ``DATA``, in ``.cache/result-pages``, and copies the pages to
-``dist/results``, and writes the tables of ``docs/results`` from the same results. An interrupted run resumes: DVC skips
-finished stages, and tacpipe what it has computed within one.
+The script runs the DVC pipeline of each task on the published recordings in ``DATA``, in ``.cache/result-pages``. It copies
+the pages to ``dist/results`` and writes the tables of ``docs/results`` from the same results. An interrupted run can be
+resumed: DVC skips finished stages, and tacpipe reuses stored results of an unfinished one.
 
-``python docs/result_pages.py DATA --reduced [TASK...]`` runs the same commands with one fold, one epoch and the first method
-of each list, in minutes, to see that they work. Its pages are in ``dist/reduced``; the tables stay as they are.
+``python docs/result_pages.py DATA --reduced [TASK...]`` tests the same commands in minutes, with one fold, one epoch and the
+first method of each list. It writes pages to ``dist/reduced`` and does not change the tables.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 CONSTANT = "constant"  # predictor of touch
-SETS = {  # of a task: the folders that its set has in DATA
+SETS = {  # task -> folders of its published set in DATA
     "forward": ("xela_flat_pick_move",),
     "material": ("biotac_slide_20_50", "roboskin_slide_20_50"),
     "touch": ("vision2tactile",),
 }
-HEADS = {  # of a table: what distinguishes its rows beside the method, and the value
+HEADS = {  # task -> columns of its table: the group of a row, and the value
     "forward": ("objects", "skill"),
     "material": ("sensor", "accuracy_percent"),
     "touch": ("target", "skill"),
 }
-DIGITS = {"material": 1}  # after the point, else 3
-ROWS = 7  # of a table
+DIGITS = {"material": 1}  # decimal places; 3 for other tasks
+ROWS = 7  # rows of a table
 
 
 def table(comparisons: Sequence[Comparison]) -> str:
-    """Return the main rows of the first part of one task as CSV.
+    """Return the main results of one task as CSV.
 
-    Of ``forward`` all models and the best baselines; of the other tasks the best model, the paper's network and the best
-    baseline of each sensor or of each target of the thumb, and what guessing reaches.
+    The table of ``forward`` has all models and the best baselines. The tables of the other tasks have, for each sensor or
+    each target of the thumb, the best model, the paper's network and the best baseline, and one row for chance.
     """
     task = comparisons[0].task
     first = [comparison for comparison in comparisons if comparison.question.place == 0]
@@ -58,22 +58,22 @@ def table(comparisons: Sequence[Comparison]) -> str:
         part = comparison.question.target or comparison.question.part.removesuffix(" objects")
         entries = all_entries(comparison) if task == "forward" else main_entries(comparison)
         entries.sort(key=lambda entry: entry[1][0], reverse=True)
-        for method, values, count in entries:
-            writer.writerow([method, part, *(f"{value:.{DIGITS.get(task, 3)}f}" for value in values), count])
-    most = max(comparison.rows[0].recordings for comparison in first)
+        for method, values, recordings in entries:
+            writer.writerow([method, part, *(f"{value:.{DIGITS.get(task, 3)}f}" for value in values), recordings])
+    count = max(comparison.rows[0].recordings for comparison in first)
     if task == "material":
         materials = len(first[0].rows[0].method.details[0].config["classes"])
-        writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, most])
+        writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, count])
     if task == "touch":
-        writer.writerow(["constant", "both", 0, 0, 0, most])
+        writer.writerow(["constant", "both", 0, 0, 0, count])
     return text.getvalue()
 
 
-Entry = tuple[str, tuple[float, float, float], int]  # name of a method; value, low and high; recordings
+Entry = tuple[str, tuple[float, float, float], int]  # method; value, low and high; number of recordings
 
 
 def all_entries(comparison: Comparison) -> list[Entry]:
-    """Return all models, and then baselines, the best first, until there are `ROWS`."""
+    """Return all models, then baselines up to `ROWS` rows, the best ones first."""
     best = comparison.best_baseline
     entries = [entry(label(row), row, comparison) for row in comparison.models]
     baselines = comparison.of("baseline")[: max(ROWS - len(entries), 1)]
@@ -83,20 +83,20 @@ def all_entries(comparison: Comparison) -> list[Entry]:
 
 
 def main_entries(comparison: Comparison) -> list[Entry]:
-    """Return the best model, the best one of the paper's networks, and the best baseline."""
-    chosen = {label(row): row for row in comparison.models[:1]}
+    """Return the best model, the best of the paper's networks, and the best baseline."""
+    main_rows = {label(row): row for row in comparison.models[:1]}
     papers = [row for row in comparison.models if schedule(row)[1]]
-    chosen |= {label(row): row for row in papers[:1]}
+    main_rows |= {label(row): row for row in papers[:1]}
     best = comparison.best_baseline
-    if best and best.predictor != CONSTANT:  # which has a row of its own
-        chosen[f"{best.name} (best baseline)"] = best
-    return [entry(name, row, comparison) for name, row in chosen.items()]
+    if best and best.predictor != CONSTANT:  # The constant has its own row
+        main_rows[f"{best.name} (best baseline)"] = best
+    return [entry(name, row, comparison) for name, row in main_rows.items()]
 
 
 def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
-    """Return a row with the value that its table states: skill over the constant for touch, else the score of its task.
+    """Return a row of the table: skill over the constant for touch, otherwise the score of the task.
 
-    The interval of an accuracy is Wilson's, as in `tacpipe evaluate`, so that no end is above 100 %.
+    The interval of an accuracy is Wilson's, as in `tacpipe evaluate`, so it never exceeds 100 %.
     """
     from tacpipe.comparison import engine
     from tacpipe.metrics.intervals import wilson
@@ -112,7 +112,7 @@ def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
 
 
 def label(row: ComparisonRow) -> str:
-    """Return a method's name, whether it is a paper's network, and its epochs where they are fewer than they could be."""
+    """Return a method's label: its name, "paper's network" if it is one, and its epochs if they are reduced."""
     shortened, paper = schedule(row)
     name = row.name.replace(f" ({shortened})", "").replace(f" · {shortened}", "") if shortened else row.name
     if paper:
@@ -121,13 +121,13 @@ def label(row: ComparisonRow) -> str:
 
 
 def schedule(row: ComparisonRow) -> tuple[str, bool]:
-    """Return a model's epochs as "10 of 16 epochs" where the full schedule has more, and whether that is a paper's."""
-    from tacpipe.plugins import params as params_of
+    """Return reduced epochs as "10 of 16 epochs", or an empty string, and whether the full schedule is a paper's."""
+    from tacpipe.plugins import params as stage_params
     from tacpipe.plugins import registry
 
     result = row.method.details[0]
-    kind = params_of.kind_of(registry.load(result.STAGE), result.given)
-    presets = params_of.presets_of(kind)
+    kind = stage_params.kind_of(registry.load(result.STAGE), result.given)
+    presets = stage_params.presets_of(kind)
     full = presets["paper"].get("epochs") if "paper" in presets else getattr(kind, "epochs", None)
     epochs = result.params.get("epochs")
     return f"{epochs:,} of {full:,} epochs" if epochs and full and epochs < full else "", "paper" in presets
@@ -145,7 +145,7 @@ def write_table(task: str, results: Path) -> Path:
 
 
 def published(params: dict[str, Any], data: Path) -> dict[str, Any]:
-    """Return the params of all tasks for the published recordings in ``data``, as ``params.yaml`` describes them."""
+    """Return the params of all tasks for the published recordings in ``data``, following the comments of ``params.yaml``."""
     folder = {name: data / name for names in SETS.values() for name in names}
     forward, material, touch = (dict(params[task]) for task in SETS)
     forward["recordings"] = f"ingest xela-flat {folder['xela_flat_pick_move']} --replace"
@@ -162,7 +162,7 @@ def published(params: dict[str, Any], data: Path) -> dict[str, Any]:
 
 
 def reduced(block: Any) -> Any:
-    """Return params with one epoch wherever epochs are given, and with the first entry of each list of runs.
+    """Return params with one epoch and only the first entry of each list of runs.
 
     >>> reduced({"folds": [0, 1], "methods": {"gru": {"epochs": 10}}, "split": {"folds": 5}})
     {'folds': [0], 'methods': {'gru': {'epochs': 1}}, 'split': {'folds': 5}}
@@ -175,7 +175,7 @@ def reduced(block: Any) -> Any:
 
 
 def _by_authors(block: Any) -> Any:
-    """Return params whose k-fold splits are the authors' own."""
+    """Return params with the authors' splits instead of k-fold splits."""
     if not isinstance(block, dict):
         return block
     if block.get("scheme") == "kfold":
@@ -184,7 +184,7 @@ def _by_authors(block: Any) -> Any:
 
 
 def _estimated(block: Any) -> Any:
-    """Return params whose wrist is estimated wherever it is given."""
+    """Return params with an estimated instead of a recorded wrist."""
     if not isinstance(block, dict):
         return block
     return {
@@ -193,21 +193,21 @@ def _estimated(block: Any) -> Any:
     }
 
 
-def main(data: Path, tasks: list[str], *, less: bool = False) -> None:
-    """Compute the pages of ``tasks``, with ``less`` from `reduced` params; raises `SystemExit` where a set is missing."""
+def main(data: Path, tasks: list[str], *, use_reduced: bool = False) -> None:
+    """Compute the pages of ``tasks``, with `reduced` params if requested. Raises `SystemExit` if a set is missing."""
     missing = [name for task in tasks for name in SETS[task] if not (data / name).is_dir()]
     if missing:
         raise SystemExit(
             f"{data} has no folder {', '.join(missing)}; data/README.md lists where the sets are published."
         )
-    work = ROOT / ".cache" / ("reduced-pages" if less else "result-pages")
-    out = ROOT / "dist" / ("reduced" if less else "results")
+    work = ROOT / ".cache" / ("reduced-pages" if use_reduced else "result-pages")
+    out = ROOT / "dist" / ("reduced" if use_reduced else "results")
     (work / "docs" / "tasks").mkdir(parents=True, exist_ok=True)
     out.mkdir(parents=True, exist_ok=True)
     for name in ("dvc.yaml", "docs/tasks/horizons.json"):
         shutil.copy(ROOT / name, work / name)
     params = published(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8")), data.resolve())
-    if less:
+    if use_reduced:
         params = reduced(params)
     (work / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False), encoding="utf-8")
     programs = Path(sys.executable).parent
@@ -218,10 +218,10 @@ def main(data: Path, tasks: list[str], *, less: bool = False) -> None:
         subprocess.run([dvc, "repro", task], cwd=work, env=environment, check=True)
         shutil.copy(work / "results" / f"{task}.html", out)
         print(out / f"{task}.html")
-        if not less:
+        if not use_reduced:
             print(write_table(task, work / "results" / task))
 
 
 if __name__ == "__main__":
-    given = [one for one in sys.argv[2:] if one != "--reduced"]
-    main(Path(sys.argv[1]), given or list(SETS), less="--reduced" in sys.argv)
+    tasks = [argument for argument in sys.argv[2:] if argument != "--reduced"]
+    main(Path(sys.argv[1]), tasks or list(SETS), use_reduced="--reduced" in sys.argv)

@@ -1,6 +1,6 @@
 """Take the pictures of the viewer in the docs: `make viewer-pictures`, under a virtual screen.
 
-It simulates recordings, trains quickly, and has Rerun's viewer draw them in software, as on a computer without a GPU.
+The script simulates recordings, trains quickly, and draws them with Rerun's viewer, without a GPU.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 IMAGES = Path(__file__).parent / "images"
 SIZE, PORT, SCREEN = "1440x900", 9955, ":78"
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 COMMANDS = (
     "simulate forward --trials 6 --duration-s 8 -o data/recordings",
     "synchronize data/recordings -o data/synced",
@@ -37,7 +37,7 @@ COMMANDS = (
     "train material data/slides --split data/slides-split -o models/material",
     "evaluate models/material data/slides -o results/material",
 )
-PICTURES = {  # the recordings of each, and the time at the cursor
+PICTURES = {  # picture -> command of the viewer, and the time at the cursor (s)
     "view-forward": ("view data/slips trial-00[0-4]", 5.1),
     "view-forecast": ("view data/slips trial-000 --predictions data/predictions", 1.4),
     "view-material": ("view data/slides trial-001 --predictions results/material", 0.9),
@@ -46,7 +46,7 @@ PICTURES = {  # the recordings of each, and the time at the cursor
 
 
 def run(command: str, folder: Path) -> None:
-    """Run a command of tacpipe in a folder."""
+    """Run a tacpipe command in a folder."""
     subprocess.run(
         [sys.executable, "-m", "tacpipe", *command.split()], cwd=folder, check=True, stdout=subprocess.DEVNULL
     )
@@ -54,7 +54,7 @@ def run(command: str, folder: Path) -> None:
 
 @contextlib.contextmanager
 def screen() -> Iterator[None]:
-    """Have a virtual screen while in the block, with graphics in software."""
+    """Run a virtual screen with software graphics during the block."""
     os.environ |= {"DISPLAY": SCREEN, "LIBGL_ALWAYS_SOFTWARE": "1", "WINIT_X11_SCALE_FACTOR": "1"}
     with subprocess.Popen(["Xvfb", SCREEN, "-screen", "0", f"{SIZE}x24"], stderr=subprocess.DEVNULL) as server:
         try:
@@ -64,45 +64,45 @@ def screen() -> Iterator[None]:
 
 
 def picture(files: Sequence[Path], at_s: float | None, output: Path) -> None:
-    """Have the viewer open files, set the cursor and take a picture of its window."""
+    """Open files in the viewer, set the cursor, and write a picture of its window."""
     from tacpipe.viewer import session
 
     command = [session.program(), *map(str, files), "--port", str(PORT), "--window-size", SIZE]
     with subprocess.Popen(command, env=session.environment(), stderr=subprocess.DEVNULL) as viewer:
         try:
-            client = connected()
+            client = connect()
             time.sleep(10)
             if at_s is not None:
                 client.set_time("time", duration=at_s, play_state="paused")
             time.sleep(8)
             client.save_screenshot(str(output))
-            until_s = time.monotonic() + PATIENCE_S
-            while not output.exists() and time.monotonic() < until_s:
+            deadline_s = time.monotonic() + TIMEOUT_S
+            while not output.exists() and time.monotonic() < deadline_s:
                 time.sleep(0.2)
             time.sleep(2)
         finally:
             viewer.terminate()
 
 
-def connected() -> Any:
-    """Return a client of the viewer, once it has opened a recording."""
+def connect() -> Any:
+    """Return a client of the viewer, after the viewer has opened a recording."""
     from rerun.experimental import ViewerClient
 
-    until_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while True:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
             client.get_state()
         except Exception:
-            if time.monotonic() > until_s:
+            if time.monotonic() > deadline_s:
                 raise
             time.sleep(0.5)
         else:
             return client
 
 
-def small(file: Path) -> None:
-    """Write a picture again with 128 colours, a third of its size."""
+def reduce_colours(file: Path) -> None:
+    """Reduce a picture to 128 colours, which takes a third of the bytes."""
     from PIL import Image
 
     with Image.open(file) as image:
@@ -111,8 +111,8 @@ def small(file: Path) -> None:
 
 def main() -> None:
     """Take all pictures."""
-    with tempfile.TemporaryDirectory() as place, screen():
-        folder = Path(place)
+    with tempfile.TemporaryDirectory() as workspace, screen():
+        folder = Path(workspace)
         (folder / ".tacpipe").mkdir()
         for command in COMMANDS:
             run(command, folder)
@@ -122,8 +122,8 @@ def main() -> None:
             run(f"{command} --save {name}", folder)
             picture(sorted((folder / name).iterdir()), at_s, folder / f"{name}.png")
             (IMAGES / f"{name}.png").write_bytes((folder / f"{name}.png").read_bytes())
-            small(IMAGES / f"{name}.png")
-        small(IMAGES / "plot.png")
+            reduce_colours(IMAGES / f"{name}.png")
+        reduce_colours(IMAGES / "plot.png")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The learning curve of `make learning-curve`: what is pooled, and the table it becomes."""
+"""Test the pooling and the table of `make learning-curve`."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_commands_train_smaller_sets_for_more_epochs_on_the_same_split(
     monkeypatch.setattr(learning_curve, "WORK", tmp_path)
     monkeypatch.setattr(learning_curve, "run", run)
     monkeypatch.setattr(learning_curve, "sums", lambda _: {"a": np.ones((2, 4)), "b": np.ones((2, 4))})
-    points = [learning_curve.measured(tmp_path / "data", size, 1, ["--hidden", "8"]) for size in (8, 0)]
+    points = [learning_curve.measure(tmp_path / "data", size, 1, ["--hidden", "8"]) for size in (8, 0)]
     assert [point.trained for point in points] == [8, 45]
     assert [words[0] for words in commands] == ["split", "train", "evaluate"] * 2
     assert [words[words.index("--epochs") + 1] for words in commands if words[0] == "train"] == ["30", "6"]
