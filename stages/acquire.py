@@ -29,6 +29,7 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording.pictures import serve_pictures
     from tacpipe.recording.recorder import Recorder, complete_rig
     from tacpipe.recording.watch import RigView
 
@@ -43,7 +44,12 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
     directory.check_output(store, plan.output)
     appending.refuse_existing_names(plan.output, plan.names)
     recorder = Recorder(complete_rig(rig))
-    with EndRequest() as is_over, recorder.open(), RigView(recorder.watches, quiet=quiet).open() as view:
+    with (
+        EndRequest() as is_over,
+        recorder.open(),
+        serve_pictures(recorder.watches, plan.pictures),
+        RigView(recorder.watches, quiet=quiet).open() as view,
+    ):
         recorder.await_first(is_over)
         recorded, lost = trials.run(recorder, store, plan, view, is_over)
     for recording in recorded if not quiet else ():

@@ -64,6 +64,9 @@ def add(program: typer.Typer, help_text: str) -> None:
             bool,
             typer.Option("--keep-spool", help="Keep the raw bytes of the links; the path of the spool is printed."),
         ] = False,
+        pictures: Annotated[
+            int | None, typer.Option("--pictures", help="Port at which a browser on this computer shows the cameras.")
+        ] = None,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
@@ -100,6 +103,7 @@ def add(program: typer.Typer, help_text: str) -> None:
             trials > 1 if tare is None else tare,
             keep_spool,
             trials_of.attributes(label or [], note),
+            pictures,
         )
         recorded, lost = commands.record(parsed_rig, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))

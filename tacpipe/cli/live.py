@@ -55,6 +55,9 @@ def add(program: typer.Typer, summary: str) -> None:
         name: Annotated[
             str | None, typer.Option(help="Name of the recording; the time of its start by default.")
         ] = None,
+        pictures: Annotated[
+            int | None, typer.Option("--pictures", help="Port at which a browser on this computer shows the cameras.")
+        ] = None,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
         **options: Any,
@@ -66,7 +69,7 @@ def add(program: typer.Typer, summary: str) -> None:
             raise UsageError("--duration-s must be above 0.")
         texts = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
         session = preparation.prepare(rigs.read(rig), str(rig), texts)
-        _run(session, output, name, duration, label or [], quiet=quiet, as_json=as_json)
+        _run(session, output, name, duration, label or [], pictures, quiet=quiet, as_json=as_json)
 
     signature = inspect.signature(live, eval_str=True)
     kinds = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.VAR_KEYWORD
@@ -123,6 +126,7 @@ def _run(
     name: str | None,
     duration_s: float | None,
     labels: list[str],
+    pictures: int | None,
     *,
     quiet: bool,
     as_json: bool,
@@ -132,6 +136,7 @@ def _run(
     from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
     from tacpipe.recording import appending, trials
+    from tacpipe.recording.pictures import serve_pictures
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.watch import RigView
     from tacpipe.store import location
@@ -151,6 +156,7 @@ def _run(
         EndRequest() as is_over,
         session.run_model(recorder, prepared.options, is_over) as supervisor,
         recorder.open(),
+        serve_pictures(recorder.watches, pictures),
         RigView(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(is_over)

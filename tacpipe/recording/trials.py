@@ -42,6 +42,7 @@ class RecordingPlan:
     tare: bool = False
     keep_spool: bool = False
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    pictures: int | None = None  # port at which a browser sees the cameras
 
     @property
     def has_end(self) -> bool:

@@ -46,6 +46,7 @@ class Watch:
         self.samples = 0
         self.error = ""  # the last error of its driver
         self.newest: Floats | None = None  # (channel,)
+        self.newest_packet: bytes | None = None  # the newest frame of a camera
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to identify the device if they contain no frame
         self.last_ns: int | None = None  # arrival of the newest sample
         self._reader = LinkReader(stream.sensor)
@@ -93,6 +94,8 @@ class Watch:
         self.last_ns = int(batch.t_ns[-1])
         self._recent.append((batch.t_ns, batch.t_device_ns))
         self._drop_old(self.last_ns)
+        packets = [block[-1, 0] for block in batch.values if block.dtype.kind == "O"]
+        self.newest_packet = next((packet for packet in packets if isinstance(packet, bytes)), self.newest_packet)
         numbers = [block[-1].astype(np.float64) for block in batch.values if block.dtype.kind in "iufb"]
         self.newest = np.concatenate(numbers) if numbers else None
         if self.rest_level is None and self.newest is not None:
