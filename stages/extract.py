@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Fitted, Result, Workspace
+    from tacpipe.video.channels import FrameChannels
     from tacpipe.video.stream import VideoFormat
 
 T = TypeVar("T")
-COLOURS = ("red", "green", "blue")
 ENCODED_FRAMES = 32  # frames per batch of the encoder
 HELD_OUT = 0.15  # fraction of the training recordings used for early stopping
 MAX_CELLS = 10_000  # maximum number of grid cells, each with three columns
@@ -65,6 +65,7 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
 
     Example: tacpipe extract difference data/gels -o data/difference
     """
+    from tacpipe.video.channels import DifferenceChannels
 
     def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
         if params.rows > video_format.height_px or params.columns > video_format.width_px:
@@ -72,7 +73,8 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
                 f"{place}: frames have {video_format.width_px} x {video_format.height_px} pixels, and the grid "
                 f"{params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
             )
-        return _stream(columns, _difference_fields(params), _differences(columns, video_format, params))
+        channels = DifferenceChannels(params.rows, params.columns, params.reference_frames)
+        return _stream(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
 
@@ -106,9 +108,11 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
 
     Example: tacpipe extract markers data/gels -o data/markers
     """
+    from tacpipe.video.channels import MarkerChannels
 
     def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
-        return _stream(columns, _marker_fields(params), _displacements(place, columns, video_format, params))
+        channels = MarkerChannels(params.rows, params.columns, params.pitch_mm, place)
+        return _stream(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
 
@@ -244,9 +248,10 @@ def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int
     """Return a lazy stream with the clocks of ``columns`` and the ``values``, pairs of row number and values (field,)."""
     import pyarrow as pa
 
+    from tacpipe.video.channels import CLOCKS
     from tacpipe.video.stream import BATCH_ROWS
 
-    clock_names = [name for name in ("t_ns", "t_device_ns", "seq") if name in columns.column_names]
+    clock_names = [name for name in CLOCKS if name in columns.column_names]
     clocks = columns.read(clock_names)
     schema = pa.schema([*clocks.schema, *fields])
 
@@ -261,41 +266,14 @@ def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int
     return pa.RecordBatchReader.from_batches(schema, batches())
 
 
-def _differences(columns: Columns, video_format: VideoFormat, params: Params) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield each frame's row number and brightness differences (cell and colour,)."""
-    from tacpipe.video.decoding import cell_means, decode_frames, read_batches
-
-    reference_sum, reference_count = np.zeros((params.rows, params.columns, len(COLOURS))), 0
-    for row, image in decode_frames(video_format, read_batches(columns)):
-        means = cell_means(image, params.rows, params.columns)
-        if reference_count < params.reference_frames:
-            reference_sum, reference_count = reference_sum + means, reference_count + 1
-        yield row, (means - reference_sum / reference_count).ravel()
-
-
-def _displacements(
-    place: str, columns: Columns, video_format: VideoFormat, params: MarkerParams
+def _channel_values(
+    columns: Columns, video_format: VideoFormat, channels: FrameChannels
 ) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield each frame's row number and marker displacements (marker and axis,), with the fraction of detected markers."""
+    """Yield each frame's row number and channels (field,)."""
     from tacpipe.video.decoding import decode_frames, read_batches
-    from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
 
-    use_one_thread()  # a stage uses one core per recording
-    tracker: MarkerTracker | None = None
-    for row, image in decode_frames(video_format, read_batches(columns), grey=True):
-        if tracker is None:
-            grid = find_grid(image, params.rows, params.columns)
-            if grid is None:
-                raise TacpipeError(
-                    f"{place}: no grid of dark markers is seen in the first frame. Use `tacpipe extract difference` for a "
-                    f"gel without markers."
-                )
-            tracker = MarkerTracker(grid, image)
-            scale = params.pitch_mm / grid.pitch_px if params.pitch_mm else 1.0
-        positions_px, is_detected = tracker.step(image)
-        exists = ~np.isnan(tracker.grid.positions_px[:, 0])
-        moved = scale * (positions_px - tracker.grid.positions_px)  # (marker, xy)
-        yield row, np.append(moved.ravel(), is_detected[exists].mean())
+    for row, image in decode_frames(video_format, read_batches(columns), grey=channels.grey):
+        yield row, channels.values(image)
 
 
 def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[int, T]]]:
@@ -383,42 +361,3 @@ def _sha256(path: str) -> str:
         raise UsageError(
             f"The weights {path} cannot be read: {error.strerror}. Give a file of this computer."
         ) from error
-
-
-def _difference_fields(params: Params) -> list[pa.Field]:
-    """Return the fields ``taxel0101_red`` …, named by row and column from 1 and colour, as float32 grey levels."""
-    import pyarrow as pa
-
-    return [
-        pa.field(
-            f"taxel{row:02d}{column:02d}_{colour}",
-            pa.float32(),
-            metadata={"unit": "count", **_cell_metadata(row, column, params.columns), "component": colour},
-        )
-        for row in range(1, params.rows + 1)
-        for column in range(1, params.columns + 1)
-        for colour in COLOURS
-    ]
-
-
-def _marker_fields(params: MarkerParams) -> list[pa.Field]:
-    """Return the fields ``taxel0101_x``, ``taxel0101_y`` …, float32 px or mm, and ``detected_ratio``."""
-    import pyarrow as pa
-
-    unit = "mm" if params.pitch_mm else "px"
-    displacements = [
-        pa.field(
-            f"taxel{row:02d}{column:02d}_{axis}",
-            pa.float32(),
-            metadata={"unit": unit, **_cell_metadata(row, column, params.columns), "axis": axis},
-        )
-        for row in range(1, params.rows + 1)
-        for column in range(1, params.columns + 1)
-        for axis in ("x", "y")
-    ]
-    return [*displacements, pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})]
-
-
-def _cell_metadata(row: int, column: int, columns: int) -> dict[str, str]:
-    """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
-    return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}

@@ -48,6 +48,10 @@ def view(
     predictions: Annotated[
         Path | None, typer.Option("--predictions", help="Output of `tacpipe predict` or `tacpipe evaluate`.")
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option("--video", help="Dataset with the cameras of these recordings; markers are drawn in its frames."),
+    ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, help="Maximum number of recordings, by name.")] = LIMIT,
     all_rows: Annotated[
         bool,
@@ -77,7 +81,7 @@ def view(
     with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.explain_missing("tacpipe view"):
         from tacpipe.viewer import session
 
-        drawn = _collect_contents(recordings, _predictions(predictions))
+        drawn = _collect_contents(recordings, _opened(predictions), _opened(video))
         files = session.write(drawn, Path(folder), str(dataset), with_list=len(recordings) > 1, all_rows=all_rows)
         if save is not None:
             _save(files, save)
@@ -133,7 +137,9 @@ def _select_recordings(
     return opened.select(*names, split=split, role=role, fold=fold, labels=required_labels)
 
 
-def _collect_contents(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[DrawnContents]:
+def _collect_contents(
+    recordings: Sequence[Recording], predictions: Dataset | None, videos: Dataset | None
+) -> Iterator[DrawnContents]:
     """Yield the contents of each recording. Raises `UsageError` for a recording with nothing to draw."""
     from tacpipe.viewer import contents
 
@@ -143,7 +149,11 @@ def _collect_contents(recordings: Sequence[Recording], predictions: Dataset | No
             table, row = predicted(predictions, recording.name)
             if table is None and row is None:
                 terminal.note(f"There are no predictions of {recording.name} in {predictions.path}.")
-        recording_contents = contents.collect(recording, table, row, chain=recording.alone.source.chain)
+        video = None if videos is None else videos.recordings.get(recording.name)
+        if videos is not None and video is None:
+            terminal.note(f"There is no video of {recording.name} in {videos.path}.")
+        chain = recording.alone.source.chain
+        recording_contents = contents.collect(recording, table, row, chain=chain, video=video)
         if recording_contents.is_empty:
             raise UsageError(
                 f"Recording {recording.name} has no stream with times and no cloud, so there is nothing to draw; "
@@ -152,7 +162,7 @@ def _collect_contents(recordings: Sequence[Recording], predictions: Dataset | No
         yield recording_contents
 
 
-def _predictions(path: Path | None) -> Dataset | None:
+def _opened(path: Path | None) -> Dataset | None:
     import tacpipe
 
     return None if path is None else tacpipe.open(path)

@@ -27,6 +27,7 @@ from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
 from tacpipe.video.decoding import jpeg_images, read_frames
 from tacpipe.video.stream import BATCH_ROWS, PACKET, read_format
+from tacpipe.viewer.markers import MarkerTrack, track_markers
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -95,6 +96,7 @@ class DrawnContents:
     )  # values that a model predicted for the full recording
     classification: Classification | None = None  # class that a model predicted for the full recording
     strips: list[FrameStrip] = field(default_factory=list)
+    markers: list[MarkerTrack] = field(default_factory=list)
 
     @cached_property
     def ends_ns(self) -> tuple[int, int]:
@@ -142,15 +144,31 @@ def collect(
     row: pa.Table | None = None,
     *,
     chain: Sequence[Step] = (),
+    video: Recording | None = None,
 ) -> DrawnContents:
     """Return the contents of a recording to draw.
 
     ``predictions`` is its table in a dataset of predictions or results; ``row`` is its row, if such a dataset has one
-    row per recording. If the ``chain`` of its dataset segmented contacts, their padding is a separate span.
+    row per recording. If the ``chain`` of its dataset segmented contacts, their padding is a separate span. ``video`` is
+    the same recording with the frames of cameras, in which markers are drawn.
     """
     tables = {stream: recording.table(stream) for stream in recording.streams}
     contents = _collect_tables(recording.name, recording.attributes, tables, predictions, row)
+    if video is not None:
+        contents = _with_video(contents, split_tables(tables), video, chain)
     return _split_contacts(contents, chain)
+
+
+def _with_video(
+    contents: DrawnContents, streams: Mapping[str, pa.Table], video: Recording, chain: Sequence[Step]
+) -> DrawnContents:
+    """Return the contents with the frames of ``video``, and the markers in them."""
+    cameras = [name for name in video.streams if read_format(video.columns(name)) is not None]
+    frames = [frames for name in cameras for frames in _frames(name, video.table(name))]
+    tracks = [track_markers(name, table, video, chain) for name, table in streams.items() if name in cameras]
+    return replace(
+        contents, frames=[*contents.frames, *frames], markers=[track for track in tracks if track is not None]
+    )
 
 
 def for_picture(recording: Recording, *, chain: Sequence[Step] = ()) -> DrawnContents:
@@ -399,6 +417,8 @@ def to_markdown(contents: DrawnContents) -> str:
         "",
         "**Maps of taxels**: colour is the distance from rest, an arrow the shear along x and y.",
     ]
+    if contents.markers:
+        lines += ["**Cameras**: points are markers, arrows three times their displacement since the first frame."]
     lines += ["**Touch**: the mean of these distances over the taxels of a finger."]
     return "\n".join(lines)
 

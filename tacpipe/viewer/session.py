@@ -353,10 +353,11 @@ def _space_views(contents: DrawnContents) -> tuple[Any, float]:
     import rerun.blueprint as rrb
 
     views: list[Any] = [_space_view(contents)] if contents.paths or contents.clouds else []
-    views += [
+    cameras = [
         rrb.Spatial2DView(origin=_origin(stream.CAMERAS, camera.stream), name=camera.stream)
         for camera in contents.frames
     ]
+    views += [rrb.Horizontal(*cameras, name="Cameras")] if len(cameras) > 1 else cameras
     views.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
     return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
 

@@ -18,6 +18,7 @@ from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import PADDING, Span, merge_lanes
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer.contents import DrawnContents, Frames, Points, to_markdown
+from tacpipe.viewer.markers import MarkerTrack
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -34,6 +35,7 @@ POINTS = 4000  # points of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # bins and height of the carpet, in pixels
 BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in rows
 BAR = "#5a6572"
+ARROW_GAIN = 3.0  # drawn length of a marker's arrow, in displacements
 EVENT_WIDTH = 1 / 200  # drawn length of an event, as a fraction of the recording
 RAMP = 24  # steps of a colour scale
 
@@ -63,6 +65,8 @@ class RerunStream:
         self._clouds(contents.clouds)
         for frames in contents.frames:
             self._frames(frames)
+        for track in contents.markers:
+            self._markers(track)
         if contents.classification is not None:
             self._scores(contents.classification)
         self._static((ABOUT,), _rerun().TextDocument(to_markdown(contents), media_type="text/markdown"))
@@ -284,6 +288,22 @@ class RerunStream:
         parts = (CAMERAS, frames.stream)
         self._static(parts, rr.EncodedImage.from_fields(media_type=frames.media_type))
         self._columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
+
+    def _markers(self, track: MarkerTrack) -> None:
+        """Write the markers of a gel over its frames, with arrows from rest, `ARROW_GAIN` times the displacement."""
+        rr = _rerun()
+        seen = ~np.isnan(track.positions_px).any(axis=2)  # (time, marker)
+        counts = seen.sum(axis=1)
+        rest = np.broadcast_to(track.rest_px, track.positions_px.shape)
+        origins, positions = rest[seen].astype(np.float32), track.positions_px[seen].astype(np.float32)
+        vectors = ARROW_GAIN * (positions - origins)
+        points, arrows = (CAMERAS, track.stream, "markers"), (CAMERAS, track.stream, "displacement")
+        colour = drawing.rgb(drawing.DISTINCT[0])
+        self._static(points, rr.Points2D.from_fields(radii=rr.Radius.ui_points(3), colors=[(255, 255, 255)]))
+        self._columns(points, track.t_ns, rr.Points2D.columns(positions=positions).partition(counts))
+        self._static(arrows, rr.Arrows2D.from_fields(radii=rr.Radius.ui_points(1.5), colors=[colour]))
+        columns = rr.Arrows2D.columns(origins=origins, vectors=vectors).partition(counts)
+        self._columns(arrows, track.t_ns, columns)
 
     def _scores(self, prediction: Classification) -> None:
         """Write a bar of the length of the score for each class; the model's class is bright, and the label is marked."""

@@ -1,0 +1,178 @@
+"""Compute tactile channels from frames one after another: changes of brightness, and displacements of markers.
+
+A row depends on the frames up to it only, so a recording and a live session give the same values.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.video.decoding import GREY, cell_means, open_decoder
+from tacpipe.video.encoding import RGB
+from tacpipe.video.stream import PACKET, VideoFormat
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import AnyFloats, Bytes, Float32s
+    from tacpipe.video.markers import MarkerTracker
+
+COLOURS = ("red", "green", "blue")
+CLOCKS = ("t_ns", "t_device_ns", "seq")  # columns that a stream of channels has from its stream of frames
+
+
+class FrameChannels(Protocol):
+    """The channels of one stream of frames."""
+
+    @property
+    def grey(self) -> bool:
+        """Whether images are grey (height, width) instead of (height, width, rgb)."""
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields of the channels."""
+
+    def values(self, image: Bytes) -> AnyFloats:
+        """Return the channels of the next frame (field,), NaN for missing values."""
+
+
+class DifferenceChannels:
+    """The mean brightness of each cell of a grid and colour, minus that of the first frames."""
+
+    grey = False
+
+    def __init__(self, rows: int, columns: int, reference_frames: int) -> None:
+        self._rows, self._columns, self._reference_frames = rows, columns, reference_frames
+        self._reference_sum, self._reference_count = np.zeros((rows, columns, len(COLOURS))), 0
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields ``taxel0101_red`` …, named by row and column from 1 and colour, as float32 grey levels."""
+        import pyarrow as pa
+
+        return [
+            pa.field(
+                f"taxel{row:02d}{column:02d}_{colour}",
+                pa.float32(),
+                metadata={"unit": "count", **_place(row, column, self._columns), "component": colour},
+            )
+            for row in range(1, self._rows + 1)
+            for column in range(1, self._columns + 1)
+            for colour in COLOURS
+        ]
+
+    def values(self, image: Bytes) -> AnyFloats:
+        """Return the brightness differences of the next frame (cell and colour,)."""
+        means = cell_means(image, self._rows, self._columns)
+        if self._reference_count < self._reference_frames:
+            self._reference_sum, self._reference_count = self._reference_sum + means, self._reference_count + 1
+        return (means - self._reference_sum / self._reference_count).ravel()
+
+
+class MarkerChannels:
+    """The displacement of each marker since the first frame, and the fraction of detected markers.
+
+    ``place`` names the stream in errors. Raises `TacpipeError` if the first frame shows no grid of markers.
+    """
+
+    grey = True
+
+    def __init__(self, rows: int, columns: int, pitch_mm: float, place: str) -> None:
+        self._rows, self._columns, self._pitch_mm, self._place = rows, columns, pitch_mm, place
+        self._tracker: MarkerTracker | None = None
+        self._scale = 1.0
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields ``taxel0101_x``, ``taxel0101_y`` …, float32 px or mm, and ``detected_ratio``."""
+        import pyarrow as pa
+
+        unit = "mm" if self._pitch_mm else "px"
+        displacements = [
+            pa.field(
+                f"taxel{row:02d}{column:02d}_{axis}",
+                pa.float32(),
+                metadata={"unit": unit, **_place(row, column, self._columns), "axis": axis},
+            )
+            for row in range(1, self._rows + 1)
+            for column in range(1, self._columns + 1)
+            for axis in ("x", "y")
+        ]
+        quality = pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})
+        return [*displacements, quality]
+
+    def values(self, image: Bytes) -> AnyFloats:
+        """Return the displacements in the next frame (marker and axis,), and the fraction of detected markers."""
+        from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
+
+        if self._tracker is None:
+            use_one_thread()  # a stage uses one core per recording
+            grid = find_grid(image, self._rows, self._columns)
+            if grid is None:
+                raise TacpipeError(
+                    f"{self._place}: no grid of dark markers is seen in the first frame. Use `tacpipe extract "
+                    f"difference` for a gel without markers."
+                )
+            self._tracker = MarkerTracker(grid, image)
+            self._scale = self._pitch_mm / grid.pitch_px if self._pitch_mm else 1.0
+        positions_px, is_detected = self._tracker.step(image)
+        grid = self._tracker.grid
+        exists = ~np.isnan(grid.positions_px[:, 0])
+        moved = self._scale * (positions_px - grid.positions_px)  # (marker, xy)
+        return np.append(moved.ravel(), is_detected[exists].mean())
+
+
+def _place(row: int, column: int, columns: int) -> dict[str, str]:
+    """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
+    return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}
+
+
+class IntraDecoder:
+    """Decodes the packets of a live camera, each of which is a complete image."""
+
+    def __init__(self, video_format: VideoFormat, *, grey: bool) -> None:
+        self._format, self._context = video_format, open_decoder(video_format)
+        self._pixels = GREY if grey else RGB
+
+    def decode(self, packet: bytes) -> Bytes | None:
+        """Return the image of a packet, or None for a damaged one."""
+        import av
+
+        try:
+            frames: list[Any] = self._context.decode(av.Packet(packet))
+        except (av.error.FFmpegError, ValueError):
+            return None
+        if not frames or (frames[0].width, frames[0].height) != (self._format.width_px, self._format.height_px):
+            return None
+        image: Bytes = frames[0].to_ndarray(format=self._pixels)
+        return image
+
+
+class LiveChannels:
+    """The channels of a live camera: takes batches of frames, and returns tables of channels."""
+
+    def __init__(self, channels: FrameChannels, schema: pa.Schema, video_format: VideoFormat) -> None:
+        self._channels, self.schema = channels, channels_schema(schema, channels)
+        self._decoder = IntraDecoder(video_format, grey=channels.grey)
+
+    def push(self, frames: pa.Table) -> pa.Table:
+        """Return the rows of the frames that can be decoded, with their clocks."""
+        import pyarrow as pa
+
+        rows: list[int] = []
+        values: list[AnyFloats] = []
+        for row, packet in enumerate(frames.column(PACKET).to_pylist()):
+            image = self._decoder.decode(packet) if packet else None
+            if image is not None:
+                rows.append(row)
+                values.append(self._channels.values(image))
+        clocks = [frames.column(name).take(rows) for name in self.schema.names if name in CLOCKS]
+        matrix: Float32s = np.array(values, np.float32).reshape(len(rows), len(self.schema) - len(clocks))
+        return pa.table([*clocks, *map(pa.array, np.ascontiguousarray(matrix.T))], schema=self.schema)
+
+
+def channels_schema(frames: pa.Schema, channels: FrameChannels) -> pa.Schema:
+    """Return the schema of the channels of a stream of frames, with its clocks."""
+    import pyarrow as pa
+
+    return pa.schema([*(frames.field(name) for name in CLOCKS if name in frames.names), *channels.fields()])

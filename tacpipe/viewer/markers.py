@@ -1,0 +1,74 @@
+"""Place the markers of a gel in the frames of its camera, from the displacements that `extract markers` wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import Floats, Times
+from tacpipe.traces.curves import TIME, described
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Recording
+    from tacpipe.store.records import Step
+
+STAGE = "extract.markers"
+AXES = ("x", "y")
+UNITS = ("px", "mm")
+
+
+@dataclass(frozen=True)
+class MarkerTrack:
+    """The markers of one gel over time, in pixels of its frames."""
+
+    stream: str
+    t_ns: Times  # (time,)
+    rest_px: Floats  # (marker, xy), NaN for a marker that was not detected
+    positions_px: Floats  # (time, marker, xy), NaN for a hidden marker
+
+
+def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequence[Step]) -> MarkerTrack | None:
+    """Return the markers of a stream of displacements in the frames of the stream of the same name of ``video``.
+
+    Returns None if the stream holds no displacements of markers, or if ``video`` has no such frames. The markers at
+    rest are found in the first frame, as `extract markers` finds them.
+    """
+    from tacpipe.video.decoding import read_frames
+    from tacpipe.video.markers import find_grid
+    from tacpipe.video.stream import read_format
+
+    places = _places(table)
+    if not places or TIME not in table.column_names or stream not in video.streams:
+        return None
+    frames = video.columns(stream)
+    if read_format(frames) is None or not frames.num_rows:
+        return None
+    rows, columns = (max(place[axis] for place in places) for axis in (0, 1))
+    grid = find_grid(read_frames(frames, [0], grey=True)[0], rows, columns)
+    if grid is None:
+        return None
+    displacements = np.full((table.num_rows, rows * columns, 2), np.nan)
+    for (row, column, axis), name in places.items():
+        values = table.column(name).to_numpy().astype(np.float64)
+        displacements[:, (row - 1) * columns + column - 1, axis] = values
+    pitch_mm = next((step["params"].get("pitch_mm") for step in chain if step["stage"] == STAGE), None)
+    if isinstance(pitch_mm, int | float) and pitch_mm:
+        displacements *= grid.pitch_px / pitch_mm
+    return MarkerTrack(stream, table.column(TIME).to_numpy(), grid.positions_px, grid.positions_px + displacements)
+
+
+def _places(table: pa.Table) -> Mapping[tuple[int, int, int], str]:
+    """Return the columns of displacements by row and column of the marker, from 1, and axis, from 0."""
+    places: dict[tuple[int, int, int], str] = {}
+    for field in table.schema:
+        about = described(field)
+        if about.get("quantity") == "tactile" and about.get("unit") in UNITS and about.get("axis") in AXES:
+            if not {"row", "column"} <= set(about):
+                return {}
+            places[int(about["row"]), int(about["column"]), AXES.index(about["axis"])] = field.name
+    return places
